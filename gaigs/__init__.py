@@ -1,0 +1,18 @@
+"""Wireless channels predicted with 3-D Gaussian splatting.
+
+>>> model = gaigs.load("runs/room/best.ckpt")
+>>> spectra = model.predict([[1.0, 2.0, 1.5]])
+"""
+
+from gaigs.registry import register, registries
+
+__all__ = ["load", "register", "registries"]
+
+
+def __getattr__(name: str):
+    # torch is heavy: it is imported when something is loaded, not when a component is registered.
+    if name == "load":
+        from gaigs.checkpoint import load
+
+        return load
+    raise AttributeError(f"module 'gaigs' has no attribute {name!r}")

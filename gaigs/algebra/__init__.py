@@ -1,0 +1,228 @@
+"""Clifford (geometric) algebras of any signature, on batches of multivectors."""
+
+import functools
+import itertools
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Algebra:
+    """The Clifford algebra G(p, q, r): of n = p + q + r basis vectors p square to +1, q to -1 and r to 0.
+
+    A multivector is the last axis of a tensor, ``k = 2**n`` numbers, one a basis blade. Basis vectors stand in the
+    order null, positive, negative; blades by grade, then in the order of a dictionary. They count from e0 if there is
+    a null vector, else from e1, so that
+
+    - G(3,0,1), ``PROJECTIVE``: e0² = 0, e1² = e2² = e3² = 1, components
+      ``1, e0, e1, e2, e3, e01, e02, e03, e12, e13, e23, e012, e013, e023, e123, e0123``;
+    - G(3,1,0), ``SPACETIME``: e1² = e2² = e3² = 1, e4² = -1, components
+      ``1, e1, e2, e3, e4, e12, e13, e14, e23, e24, e34, e123, e124, e134, e234, e1234``.
+
+    Tables are made once for each signature, device and dtype; every operation follows those of its input.
+
+    Raises:
+        ValueError: A count is negative, or all are zero.
+
+    Source: GAI-GS, "Geometric Algebra"; Roelfs & De Keninck, Graded Symmetry Groups, 2023.
+    """
+
+    p: int
+    q: int = 0
+    r: int = 0
+
+    def __post_init__(self):
+        if min(self.p, self.q, self.r) < 0 or self.dimension == 0:
+            raise ValueError(
+                f"a signature (p, q, r) must count at least one basis vector and none negative, got "
+                f"({self.p}, {self.q}, {self.r}); Algebra(3, 0, 1) is the projective one"
+            )
+
+    @property
+    def dimension(self) -> int:
+        """Number n of basis vectors."""
+        return self.p + self.q + self.r
+
+    @property
+    def size(self) -> int:
+        """Number 2**n of components of a multivector."""
+        return 2**self.dimension
+
+    @property
+    def blades(self) -> tuple[str, ...]:
+        """Names of the components in their order: "1", "e0", ..., "e0123"."""
+        first = 0 if self.r else 1
+        return ("1", *("e" + "".join(str(v + first) for v in blade) for blade in _vectors(self.dimension)[1:]))
+
+    @property
+    def grades(self) -> tuple[int, ...]:
+        """Number of vectors in every blade."""
+        return tuple(len(blade) for blade in _vectors(self.dimension))
+
+    @property
+    def homogeneous(self) -> int:
+        """Position of the blade of all vectors that are not null: e123, a projective point's homogeneous coordinate."""
+        return _vectors(self.dimension).index(tuple(range(self.r, self.dimension)))
+
+    def product(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
+        """Geometric product x y; of vectors, x y = x · y + x ∧ y."""
+        return self._multiply("product", x, y)
+
+    def wedge(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
+        """Outer product x ∧ y; in the projective algebra what two elements share, such as the line of two planes."""
+        return self._multiply("wedge", x, y)
+
+    def join(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
+        """Regressive product x ∨ y, the dual of the duals' wedge; of projective points, the line through them.
+
+        A mirror changes its sign besides mirroring it: join(ux, uy) = -u join(x, y) for an odd versor u.
+        """
+        return self._multiply("join", x, y)
+
+    def product_and_join(
+        self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
+    ) -> tuple[Float[Tensor, "*batch k"], Float[Tensor, "*batch k"]]:
+        """``product`` and ``join`` of the same multivectors, in little more than the time of one."""
+        return self._multiply("product_and_join", x, y).chunk(2, -1)
+
+    def inner(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch"]:
+        """Invariant inner product, the scalar part of reverse(x) y; blades with a null vector do not count."""
+        return (x * y * self.table("metric", x)).sum(-1)
+
+    def reverse(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
+        """The vectors of every blade in opposite order."""
+        return x * self.table("reverse", x)
+
+    def involute(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
+        """Grade involution: every vector negated, so odd grades change sign."""
+        return x * self.table("involute", x)
+
+    def grade(self, x: Float[Tensor, "*batch k"], grade: int) -> Float[Tensor, "*batch k"]:
+        """Projection to one grade.
+
+        Raises:
+            ValueError: The algebra has no such grade.
+        """
+        if not 0 <= grade <= self.dimension:
+            raise ValueError(f"{self} has grades 0 to {self.dimension}, got {grade}")
+        return x * self.table("grades", x)[grade]
+
+    def dual(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
+        """Right complement: blade ∧ dual(blade) is the pseudoscalar; it needs no metric, so null vectors do no harm."""
+        return x @ self.table("dual", x)
+
+    def undual(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
+        """The inverse of ``dual``."""
+        return x @ self.table("dual", x).mT
+
+    def sandwich(self, versor: Float[Tensor, "*#batch k"], x: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
+        """What a versor makes of x: u x u⁻¹ for an even u, u involute(x) u⁻¹ for an odd one.
+
+        A vector u thus mirrors in the hyperplane orthogonal to it, and products of vectors rotate and translate.
+
+        Raises:
+            ValueError: A versor has no inverse: its square u reverse(u) is zero.
+        """
+        square = self.inner(versor, versor)[..., None]
+        if not (square != 0).all():
+            raise ValueError("a versor must be a product of vectors that are not null, got one whose square is zero")
+        # Even and odd parts of x apart, because involute(u) carries the sign of an odd versor and leaves an even one.
+        odd = (x - self.involute(x)) / 2
+        moved = self.product(versor, x - odd) + self.product(self.involute(versor), odd)
+        return self.product(moved, self.reverse(versor)) / square
+
+    def table(self, name: str, like: Tensor) -> Tensor:
+        """A constant of the algebra on the device and in the dtype of ``like``.
+
+        ``product``, ``wedge``, ``join`` (k*k, k): row i*k + j holds blade i times blade j. ``metric``, ``reverse``,
+        ``involute`` (k,): a factor a blade. ``grades`` (n+1, k): 1 where a blade has the grade. ``dual`` (k, k).
+        ``ideal`` (k,): for blades of points at infinity (r = 1) the metric of their vectors that are not null, else 0.
+        ``null_wedges`` (2**r, k, k): matrix of the wedge with each blade of null vectors (the first is 1).
+        ``linear_maps`` (2**r, k): number of the equivariant linear map (``layers.EquivariantLinear``) that leads from
+        each of these wedges to a component.
+        """
+        return _table(self, name, like.dtype, like.device)
+
+    def _multiply(self, name: str, x: Tensor, y: Tensor) -> Tensor:
+        # All k² products of components, then one matrix multiplication, with the components first in memory so that
+        # both run along the batch: a third faster on a CPU, both ways, than gathering the table's non-zero terms.
+        x, y = torch.broadcast_tensors(x, y)
+        batch = x.shape[:-1]
+        rows, columns = (factor.movedim(-1, 0).reshape(self.size, batch.numel()) for factor in (x, y))
+        result = self.table(name, x).mT @ (rows[:, None] * columns).flatten(0, 1)
+        return result.reshape(len(result), *batch).movedim(0, -1)
+
+
+PROJECTIVE = Algebra(3, 0, 1)
+"""Projective geometric algebra of space, GATr's: planes are vectors, lines bivectors, points trivectors."""
+
+SPACETIME = Algebra(3, 1, 0)
+"""Space-time algebra with the metric (+, +, +, -): events are vectors e1, e2, e3 (space) and e4 (time)."""
+
+
+@functools.cache
+def _vectors(dimension: int) -> tuple[tuple[int, ...], ...]:
+    """Basis vectors of every blade, blades in their order."""
+    return tuple(b for grade in range(dimension + 1) for b in itertools.combinations(range(dimension), grade))
+
+
+@functools.cache
+def _tables(algebra: Algebra) -> dict[str, Tensor]:
+    """The constants of a signature, float64 on the CPU."""
+    blades = _vectors(algebra.dimension)
+    position = {frozenset(blade): index for index, blade in enumerate(blades)}
+    squares = [0.0] * algebra.r + [1.0] * algebra.p + [-1.0] * algebra.q
+    square = lambda vectors: math.prod(squares[vector] for vector in vectors)
+    size = algebra.size
+
+    product = torch.zeros(size, size, size, dtype=torch.float64)
+    disjoint = torch.zeros(size, size, 1, dtype=torch.float64)
+    for (i, a), (j, b) in itertools.product(enumerate(blades), repeat=2):
+        common = set(a) & set(b)
+        exchanges = sum(v > w for v in a for w in b)  # bring the vectors of a and b into order
+        product[i, j, position[frozenset(a) ^ frozenset(b)]] = (-1.0) ** exchanges * square(common)
+        disjoint[i, j] = not common
+    wedge = product * disjoint
+    dual = wedge[:, :, -1]  # signed complement: blade i times blade j is the pseudoscalar
+    join = torch.einsum("ia,jb,abc,kc->ijk", dual, dual, wedge, dual)
+
+    count = torch.tensor(algebra.grades)
+    grades = (count == torch.arange(algebra.dimension + 1)[:, None]).double()
+    metric = [square(blade) for blade in blades]
+    # Points at infinity: the blades of a point's grade that hold the one null vector, with the metric of the others.
+    infinite = [algebra.r == 1 and len(blade) == algebra.dimension - 1 and 0 in blade for blade in blades]
+    ideal = [square(blade[1:]) if at_infinity else 0.0 for blade, at_infinity in zip(blades, infinite, strict=True)]
+    reverse = (-1.0) ** (count * (count - 1) // 2).double()
+    # Mirrors and motions leave null vectors as they are, so wedging one of their blades to a grade is equivariant, and
+    # so is taking the grade alone (the blade 1). Every such map is numbered, by blade and then by grade.
+    null_blades = [i for i, blade in enumerate(blades) if all(vector < algebra.r for vector in blade)]
+    first, maps = 0, []
+    for i in null_blades:
+        highest = algebra.dimension - algebra.grades[i]
+        maps.append(first + (count - algebra.grades[i]).clamp(0, highest))
+        first += highest + 1
+    return {
+        "product": product.flatten(0, 1),
+        "wedge": wedge.flatten(0, 1),
+        "join": join.flatten(0, 1),
+        "product_and_join": torch.cat((product, join), -1).flatten(0, 1),
+        "metric": torch.tensor(metric, dtype=torch.float64),
+        "ideal": torch.tensor(ideal, dtype=torch.float64),
+        "reverse": reverse,
+        "involute": (-1.0) ** count.double(),
+        "grades": grades,
+        "dual": dual,
+        "null_wedges": wedge[null_blades].mT,
+        "linear_maps": torch.stack(maps),
+    }
+
+
+@functools.cache
+def _table(algebra: Algebra, name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
+    # A tensor first made in inference mode (Lightning's validation) could not be saved for a later backward pass.
+    with torch.inference_mode(False):
+        return _tables(algebra)[name].to(device, dtype)

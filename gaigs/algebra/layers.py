@@ -1,0 +1,258 @@
+"""Layers that commute with every motion of space: the Geometric Algebra Transformer (GATr) for any signature.
+
+Tokens carry two kinds of channels, ``multivectors`` (b, tokens, channels, k) and ``scalars`` (b, tokens, channels). A
+layer f is equivariant: f(u x) = u f(x) where u acts by ``Algebra.sandwich``, for rotations, translations and mirrors,
+or the Lorentz group in space-time; scalars stay as they are. Nothing depends on the order of the tokens.
+
+Source: Brehmer et al., Geometric Algebra Transformer, 2023; Spinner et al., Lorentz-Equivariant Geometric Algebra
+Transformers, 2024, for signatures with negative squares.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gaigs.algebra import Algebra
+
+NORM_FLOOR = 0.01
+"""Added to the squared size in the norm: components with e0 have no size, and light-like ones cancel, so tokens may be
+large where their size is zero. They grow tenfold at most, and the gradient at zero is finite. GATr's value."""
+
+HOMOGENEOUS_FLOOR = 1e-3
+"""Added to h² where a trivector is divided by its e123 component h: a direction has h = 0. GATr's value."""
+
+
+class EquivariantLinear(nn.Module):
+    """The most general equivariant linear map, learnt for every pair of channels.
+
+    It is a sum of basis maps: the projection to each of the n + 1 grades and, with a null vector e0, e0 times each
+    grade but the highest: nine maps for the projective algebra, five for space-time. Multiplying by the pseudoscalar is
+    none of them, because a mirror would change its sign. Scalars mix with the multivectors' component 1, which takes
+    the bias.
+
+    Args:
+        algebra: Signature of the multivectors.
+        multivectors: Channels in and out.
+        scalars: Channels in and out.
+
+    Source: GATr, proposition 2.
+    """
+
+    def __init__(self, algebra: Algebra, multivectors: tuple[int, int], scalars: tuple[int, int]):
+        super().__init__()
+        self.algebra = algebra
+        self.register_buffer("maps", algebra.table("linear_maps", torch.empty(0)).long(), persistent=False)
+        self.weight = nn.Parameter(torch.empty(int(self.maps.max()) + 1, multivectors[0], multivectors[1]))
+        self.from_scalars = nn.Linear(scalars[0], multivectors[1])
+        self.to_scalars = nn.Linear(multivectors[0] + scalars[0], scalars[1])
+        # Components keep their variance: one of 1 / (channels in) a weight, as in a layer of plain numbers.
+        bound = (3 / (multivectors[0] + scalars[0])) ** 0.5
+        for weight in (self.weight, self.from_scalars.weight, self.to_scalars.weight):
+            nn.init.uniform_(weight, -bound, bound)
+        for layer in (self.from_scalars, self.to_scalars):
+            nn.init.zeros_(layer.bias)
+
+    def forward(
+        self, multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
+    ) -> tuple[Float[Tensor, "*batch c_out k"], Float[Tensor, "*batch s_out"]]:
+        # One matrix a component, (k, tokens, channels): on a CPU three times as fast as one matrix over channels and
+        # components, which is nine tenths zeros. The result keeps that order in memory: only the first layer copies.
+        x = multivectors.movedim(-1, 0).flatten(1, -2)
+        weights = self.weight[self.maps]
+        null_wedges = self.algebra.table("null_wedges", x)
+        result = functional.pad(self.from_scalars(scalars).flatten(0, -2)[None], (0, 0, 0, 0, 0, len(x) - 1))
+        result = torch.baddbmm(result, x, weights[0])
+        for wedge, weight in zip(null_wedges[1:], weights[1:], strict=True):
+            result = torch.baddbmm(result, (wedge @ x.flatten(1)).view_as(x), weight)
+        result = result.unflatten(1, multivectors.shape[:-2]).movedim(0, -1)
+        return result, self.to_scalars(torch.cat((multivectors[..., 0], scalars), -1))
+
+
+class GeometricBilinear(nn.Module):
+    """Products of learnt pairs of channels: the geometric product and the join of each.
+
+    Geometric products of points make no lines or planes through them; joins do. A mirror changes a join's sign, so
+    joins are multiplied by the e123 component of a reference, whose sign it changes too. Without a null vector products
+    alone reach every grade, so there are twice as many pairs and no joins.
+
+    Raises:
+        ValueError: The multivectors are odd in number and half of them would have to be joins.
+
+    Source: GATr, "Geometric bilinears"; Spinner et al., 2024, without joins.
+    """
+
+    def __init__(self, algebra: Algebra, multivectors: int, scalars: int):
+        super().__init__()
+        if algebra.r and multivectors % 2:
+            raise ValueError(f"half of the multivectors are joins, so their number must be even, got {multivectors}")
+        self.algebra = algebra
+        factors = multivectors if algebra.r else 2 * multivectors
+        self.factors = EquivariantLinear(algebra, (multivectors, factors), (scalars, scalars))
+        self.output = EquivariantLinear(algebra, (multivectors, multivectors), (scalars, scalars))
+
+    def forward(
+        self,
+        multivectors: Float[Tensor, "*batch tokens c k"],
+        scalars: Float[Tensor, "*batch tokens s"],
+        reference: Float[Tensor, "*#batch k"],
+    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
+        factors, scalars = self.factors(multivectors, scalars)
+        left, right = factors.chunk(2, -2)
+        if not self.algebra.r:
+            return self.output(self.algebra.product(left, right), scalars)
+        products, joins = self.algebra.product_and_join(left, right)
+        orientation = reference[..., self.algebra.homogeneous, None, None, None]
+        return self.output(torch.cat((products, orientation * joins), -2), scalars)
+
+
+class GeometricAttention(nn.Module):
+    """Multi-head attention of all tokens to all tokens, by invariants of their multivectors and scalars.
+
+    The logit of a query and a key is their inner product plus the product of their scalars. The inner product does not
+    see the components with e0 and hence not where a projective point lies. There the logit also holds minus the squared
+    distance of two points, -w(g) w(h) |g y - h x|² for trivectors whose e123 is g or h and whose other components are x
+    or y, with w(h) = h / (h² + floor).
+
+    Args:
+        algebra: Signature of the multivectors.
+        multivectors: Channels; a multiple of ``heads``.
+        scalars: Channels; a multiple of ``heads``.
+        heads: Attention maps, each of an equal share of the channels.
+
+    Raises:
+        ValueError: The heads cannot share the channels equally.
+
+    Source: GATr, "Geometric attention" and, for the distances, appendix "Distance-aware dot-product attention".
+    """
+
+    def __init__(self, algebra: Algebra, multivectors: int, scalars: int, heads: int):
+        super().__init__()
+        if multivectors % heads or scalars % heads:
+            raise ValueError(
+                f"{heads} heads must share the channels equally, got {multivectors} multivectors and {scalars} "
+                f"scalars; make both multiples of {heads}"
+            )
+        self.algebra = algebra
+        self.heads = heads
+        self.project = EquivariantLinear(algebra, (multivectors, 3 * multivectors), (scalars, 3 * scalars))
+        self.output = EquivariantLinear(algebra, (multivectors, multivectors), (scalars, scalars))
+        metric, ideal = (algebra.table(name, torch.empty(0)) for name in ("metric", "ideal"))
+        seen, ideal_blades = metric.nonzero().flatten(), ideal.nonzero().flatten()
+        # Logits are a bilinear form of the features; the distance's is -g² y·y - h² x·x + 2 g h x·y.
+        form = torch.diag(metric[seen])
+        if len(ideal_blades):
+            distance = torch.tensor([[0.0, -1.0], [-1.0, 0.0]])
+            form = torch.block_diag(form, distance, torch.diag(2 * ideal[ideal_blades]))
+        self.parts = (len(seen), len(ideal_blades))
+        self.register_buffer("blades", torch.cat((seen, ideal_blades)), persistent=False)
+        self.register_buffer("ideal", ideal[ideal_blades], persistent=False)
+        self.register_buffer("form", form, persistent=False)
+
+    def features(self, multivectors: Float[Tensor, "*batch c k"]) -> Float[Tensor, "*batch c f"]:
+        """What logits are made of: the components that the inner product sees, and w(h) (x·x, h², h x) of points."""
+        seen, x = multivectors.index_select(-1, self.blades).split(self.parts, -1)
+        if not x.shape[-1]:
+            return seen
+        h = seen[..., -1:]  # the homogeneous coordinate is the last blade without e0
+        weight = h / (h.square() + HOMOGENEOUS_FLOOR)
+        size = (x.square() * self.ideal).sum(-1, keepdim=True)
+        return torch.cat((seen, weight * torch.cat((size, h.square(), h * x), -1)), -1)
+
+    def forward(
+        self, multivectors: Float[Tensor, "*batch tokens c k"], scalars: Float[Tensor, "*batch tokens s"]
+    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
+        multivectors, scalars = self.project(multivectors, scalars)
+        # Query, key and value first, then heads before tokens.
+        multivectors = multivectors.unflatten(-2, (3, self.heads, -1)).movedim((-4, -3), (0, -4))
+        scalars = scalars.unflatten(-1, (3, self.heads, -1)).movedim((-3, -2), (0, -3))
+        query_key, value = multivectors.split((2, 1))
+        query, key = self.features(query_key)
+        channels = zip((query @ self.form, key, value[0]), scalars, strict=True)
+        query, key, value = (torch.cat((x.flatten(-2), s), -1) for x, s in channels)
+        mixed = functional.scaled_dot_product_attention(query, key, value).movedim(-3, -2)
+        width = scalars.shape[-1]
+        multivectors, scalars = mixed.split((mixed.shape[-1] - width, width), -1)
+        multivectors = multivectors.unflatten(-1, (-1, self.algebra.size)).flatten(-3, -2)
+        return self.output(multivectors, scalars.flatten(-2))
+
+
+def equivariant_norm(
+    algebra: Algebra, multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
+) -> tuple[Float[Tensor, "*batch c k"], Float[Tensor, "*batch s"]]:
+    """Layer normalisation: a token's multivectors by their mean size, its scalars by mean and variance.
+
+    The squared size of a multivector is the sum over its grades of |inner(x, x)|, which no motion changes and which in
+    a signature of both signs cannot cancel between the grades.
+
+    Source: GATr, "Layer normalization"; de Haan, Cohen & Brehmer, Euclidean, Projective, Conformal, 2023, for the sum
+    over grades.
+    """
+    by_grade = (algebra.table("grades", multivectors) * algebra.table("metric", multivectors)).mT
+    size = (multivectors.square() @ by_grade).abs().sum(-1).mean(-1)
+    multivectors = multivectors * torch.rsqrt(size + NORM_FLOOR)[..., None, None]
+    return multivectors, functional.layer_norm(scalars, scalars.shape[-1:])
+
+
+def gated_gelu(
+    multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
+) -> tuple[Float[Tensor, "*batch c k"], Float[Tensor, "*batch s"]]:
+    """Every multivector times the GELU of its component 1; scalars through a plain GELU.
+
+    Source: GATr, "Scalar-gated nonlinearities".
+    """
+    return functional.gelu(multivectors[..., :1]) * multivectors, functional.gelu(scalars)
+
+
+class GATrBlock(nn.Module):
+    """A transformer block: attention, then products and a gated GELU, each on normalised tokens and added to them.
+
+    Args:
+        algebra: Signature of the multivectors.
+        multivectors: Channels; a multiple of ``heads``.
+        scalars: Channels; a multiple of ``heads``.
+        heads: Attention maps, each of an equal share of the channels.
+
+    Source: GATr, figure 1.
+    """
+
+    def __init__(self, algebra: Algebra, multivectors: int, scalars: int, heads: int = 4):
+        super().__init__()
+        self.algebra = algebra
+        self.attention = GeometricAttention(algebra, multivectors, scalars, heads)
+        self.bilinear = GeometricBilinear(algebra, multivectors, scalars)
+        self.linear = EquivariantLinear(algebra, (multivectors, multivectors), (scalars, scalars))
+
+    def forward(
+        self,
+        multivectors: Float[Tensor, "*batch tokens c k"],
+        scalars: Float[Tensor, "*batch tokens s"],
+        reference: Float[Tensor, "*#batch k"],
+    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
+        """Tokens after the block.
+
+        Args:
+            multivectors: Tokens' multivectors.
+            scalars: Tokens' scalars.
+            reference: A multivector that moves with the tokens, such as the mean of the network's inputs. Only its e123
+                is read, and nothing in an algebra without a null vector; see ``GeometricBilinear``.
+        """
+        return self.transform(*self.attend(multivectors, scalars), reference)
+
+    def attend(
+        self, multivectors: Float[Tensor, "*batch tokens c k"], scalars: Float[Tensor, "*batch tokens s"]
+    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
+        """The block's first half, in which tokens look at each other."""
+        attended = self.attention(*equivariant_norm(self.algebra, multivectors, scalars))
+        return multivectors + attended[0], scalars + attended[1]
+
+    def transform(
+        self,
+        multivectors: Float[Tensor, "*batch tokens c k"],
+        scalars: Float[Tensor, "*batch tokens s"],
+        reference: Float[Tensor, "*#batch k"],
+    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
+        """The block's second half, each token by itself."""
+        products = self.bilinear(*equivariant_norm(self.algebra, multivectors, scalars), reference)
+        made = self.linear(*gated_gelu(*products))
+        return multivectors + made[0], scalars + made[1]

@@ -1,0 +1,46 @@
+"""Where Hydra finds gaigs's configuration files and those of plug-ins."""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+from gaigs.registry import KINDS, find_holders
+
+
+def conf_dir() -> Path:
+    """The folder of gaigs's own configuration: inside the package where it is installed, beside it in a checkout."""
+    here = Path(__file__).parent
+    packaged = here / "conf"
+    return packaged if packaged.is_dir() else here.parent / "conf"
+
+
+def plugin_conf_dirs() -> list[Path]:
+    """The conf folders of plug-ins, each with ``<kind>/<name>.yaml`` inside.
+
+    They are ``plugins/conf``, ``plugins/<folder>/conf``, and ``<package>/conf`` of every package that an entry point of
+    ours points into. No plug-in is imported.
+    """
+    folders = [*Path.cwd().glob("plugins/conf"), *sorted(Path.cwd().glob("plugins/[!_.]*/conf"))]
+    for holder in (holder for kind in KINDS for holder in find_holders(kind)[0]):
+        if holder.root is not None:
+            folders.append(holder.root / holder.package / "conf")
+        elif holder.file is None:
+            spec = find_spec(holder.package)  # imports nothing, as the name has no dots
+            folders += [Path(place) / "conf" for place in (spec and spec.submodule_search_locations) or ()]
+    return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
+
+
+class PluginConfigurations(SearchPathPlugin):
+    """Puts the conf folders of plug-ins behind gaigs's own, so that none of them replaces a file of ours."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in plugin_conf_dirs():
+            search_path.append(provider="gaigs plug-in", path=f"file://{folder}")
+
+
+def install() -> None:
+    """Makes Hydra look into the conf folders of plug-ins too; to be called before ``hydra.main`` composes."""
+    Plugins.instance().register(PluginConfigurations)

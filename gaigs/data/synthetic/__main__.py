@@ -1,0 +1,36 @@
+"""Writes the built-in scene as a folder: python -m gaigs.data.synthetic FOLDER"""
+
+import argparse
+from pathlib import Path
+
+from gaigs.data.nerf2_spectrum import write
+from gaigs.data.synthetic import ROOM, furnished_room, wavefront_obj
+
+
+def main() -> None:
+    # An option that is not given is not passed on, so that the function's defaults hold.
+    parser = argparse.ArgumentParser(
+        prog="python -m gaigs.data.synthetic",
+        description="Simulate the furnished room and write its spectra in the layout of the NeRF² spectra.",
+        argument_default=argparse.SUPPRESS,
+    )
+    parser.add_argument("folder", type=Path, help="folder to write; must not exist, or be empty")
+    parser.add_argument("--spectrum", choices=("band", "carrier"), help="averaged over the band, or one frequency")
+    parser.add_argument("--transmitters", type=int, help="how many; the last fifth of them tests")
+    parser.add_argument("--frequency", type=float, help="carrier frequency [Hz]")
+    parser.add_argument("--bandwidth", type=float, help="width of the band around it [Hz]")
+    parser.add_argument("--order", type=int, help="largest number of reflections of a path")
+    parser.add_argument("--seed", type=int, help="of the transmitters' places")
+    options = vars(parser.parse_args())
+    folder = options.pop("folder")
+    try:
+        links = furnished_room(split={"protocol": "official", "validation": 0}, **options)
+        write(folder, links)
+    except (ValueError, FileExistsError) as error:
+        parser.error(str(error))
+    (folder / "geometry.obj").write_text(wavefront_obj(ROOM))
+    print(f"{folder}: {len(links.split.train)} training and {len(links.split.test)} test spectra")
+
+
+if __name__ == "__main__":
+    main()

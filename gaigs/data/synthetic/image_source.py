@@ -1,0 +1,298 @@
+"""The image-source method in a furnished box room: paths, the response of a planar array, spectra and signal strength.
+
+Everything is computed in float64. The formulas and what they leave out stand in docs/data.md.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Complex, Float, Int
+from scipy.constants import epsilon_0, speed_of_light
+from torch import Tensor
+
+from gaigs.data import Grid
+from gaigs.geometry import Pose, from_spherical
+
+MATERIALS = {
+    "concrete": (5.24, 0.0462, 0.7822),
+    "brick": (3.91, 0.0238, 0.16),
+    "plasterboard": (2.73, 0.0085, 0.9395),
+    "wood": (1.99, 0.0047, 1.0718),
+    "glass": (6.31, 0.0036, 1.3394),
+    "ceiling_board": (1.48, 0.0011, 1.0750),
+    "metal": (1.0, 1e7, 0.0),
+}
+"""Relative permittivity, and c and d of the conductivity c (f / GHz)^d [S/m]; ITU-R P.2040-3, table 3, 1 to 40 GHz."""
+
+SIDE = 4
+"""Elements along each side of the square array, as in the NeRF² spectra."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A piece of furniture: a cuboid along the room's axes that dims every wave passing through it.
+
+    Attributes:
+        name: What it is.
+        lower, upper: Opposite corners, world frame [m].
+        loss_db: Penetration loss of one passage, however short [dB].
+    """
+
+    name: str
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    loss_db: float
+
+
+@dataclass(frozen=True)
+class Room:
+    """A box room with one corner at the world's origin.
+
+    Attributes:
+        size: Extent along x, y and z [m].
+        walls: Materials of the walls at x = 0, x = size, y = 0, y = size, of the floor and of the ceiling.
+        furniture: What stands in the room.
+    """
+
+    size: tuple[float, float, float]
+    walls: tuple[str, str, str, str, str, str]
+    furniture: tuple[Box, ...] = ()
+
+
+def permittivity(material: str, frequency: float) -> complex:
+    """Complex relative permittivity of a building material at a frequency [Hz], time dependence exp(+j omega t).
+
+    Raises:
+        ValueError: The material is unknown, or the frequency outside the range of the tables.
+
+    Source: ITU-R P.2040-3, section 2.1.4.
+    """
+    if material not in MATERIALS:
+        raise ValueError(f"unknown material {material!r}; there are: {', '.join(MATERIALS)}")
+    if not 1e9 <= frequency <= 40e9:
+        raise ValueError(f"frequency must lie in 1e9..40e9 Hz, where materials are tabulated, got {frequency:.6g}")
+    real, c, d = MATERIALS[material]
+    return complex(real, -c * (frequency / 1e9) ** d / (2 * math.pi * epsilon_0 * frequency))
+
+
+def reflection(
+    permittivity: complex, cosines: Float[Tensor, "*batch"]
+) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
+    """Fresnel reflection coefficients of a half-space, electric field across (TE) and in (TM) the plane of incidence.
+
+    Args:
+        permittivity: Complex, relative.
+        cosines: Of the angle of incidence against the surface's normal.
+
+    Source: Fresnel's formulas in the form of ITU-R P.2040-3.
+    """
+    root = torch.sqrt(permittivity - (1 - cosines.square()))
+    te = (cosines - root) / (cosines + root)
+    tm = (permittivity * cosines - root) / (permittivity * cosines + root)
+    return te, tm
+
+
+def cells(order: int) -> Int[Tensor, "p 3"]:
+    """Copies of the room, mirrored at its walls, that a path of at most ``order`` reflections ends in; the room first.
+
+    Cell (i, j, k) lies i rooms along x, j along y and k along z; |i| + |j| + |k| is the number of reflections.
+    """
+    steps = range(-order, order + 1)
+    found = [cell for cell in itertools.product(steps, repeat=3) if sum(map(abs, cell)) <= order]
+    return torch.tensor(sorted(found, key=lambda cell: sum(map(abs, cell))))
+
+
+def mirror(points: Float[Tensor, "*batch 3"], cell: Int[Tensor, "*batch 3"], size: Float[Tensor, "3"]) -> Tensor:
+    """Where points of the room [m] lie in a mirrored copy of it."""
+    return cell * size + torch.where(cell % 2 == 0, points, size - points)
+
+
+def passes(
+    start: Float[Tensor, "*batch 3"],
+    end: Float[Tensor, "*batch 3"],
+    lower: Float[Tensor, "*batch 3"],
+    upper: Float[Tensor, "*batch 3"],
+) -> Tensor:
+    """Whether the segments from ``start`` to ``end`` pass through the inside of cuboids along the axes; exact.
+
+    A segment meets each pair of faces' planes at two fractions of its length; it is inside between the last entry and
+    the first exit. One that only runs in a face has 0 / 0 there, hence NaN, and does not pass.
+    """
+    ray = end - start
+    first, second = (lower - start) / ray, (upper - start) / ray
+    entry = torch.minimum(first, second).amax(-1).clamp(min=0)
+    leave = torch.maximum(first, second).amin(-1).clamp(max=1)
+    return entry < leave
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Paths from transmitters to one receiver point, each replaced by a straight one from an image.
+
+    Attributes:
+        images: Mirrored transmitters, world frame (b, p, 3) [m]; the first is the transmitter itself.
+        gains: Product of the path's reflection coefficients and penetration losses (b, p); free space has 1.
+    """
+
+    images: Float[Tensor, "b p 3"]
+    gains: Complex[Tensor, "b p"]
+
+
+def trace(
+    room: Room, transmitters: Float[Tensor, "b 3"], receiver: Float[Tensor, "3"], frequency: float, order: int
+) -> Paths:
+    """Every path with at most ``order`` reflections.
+
+    The field is vertically polarised: TE at the four walls, TM at floor and ceiling. Instead of folding a path at the
+    walls, the furniture is mirrored with the room: a path stays the straight line from the receiver to an image.
+
+    Args:
+        room: Walls and furniture.
+        transmitters: Positions [m].
+        receiver: Position [m].
+        frequency: At which the walls reflect [Hz].
+        order: Largest number of reflections.
+
+    Raises:
+        ValueError: A transmitter or the receiver is not inside the room, or is inside a piece of furniture; the order
+            is negative; a material is unknown or not tabulated at the frequency.
+
+    Source: Allen and Berkley, Image method for efficiently simulating small-room acoustics, 1979; ITU-R P.2040-3.
+    """
+    if order < 0:
+        raise ValueError(f"order must be the largest number of reflections, 0 or more, got {order}")
+    transmitters, receiver = transmitters.double(), receiver.double()
+    size = transmitters.new_tensor(room.size)
+    check_free(room, torch.cat((receiver[None], transmitters)))
+    cell = cells(order).to(size.device)
+    images = mirror(transmitters[:, None], cell, size)
+    rays = images - receiver
+    cosines = rays.abs() / rays.norm(dim=-1, keepdim=True)
+
+    gains = torch.ones_like(cosines[..., 0], dtype=torch.complex128)
+    for wall, material in enumerate(room.walls):
+        axis, side = divmod(wall, 2)
+        te, tm = reflection(permittivity(material, frequency), cosines[..., axis])
+        # Of m reflections between two opposite walls the one on the image's side takes the odd one.
+        towards = cell[:, axis] > 0 if side else cell[:, axis] < 0
+        bounces = (cell[:, axis].abs() + towards) // 2
+        gains = gains * (tm if axis == 2 else te) ** bounces
+
+    if room.furniture:
+        corners = size.new_tensor([(box.lower, box.upper) for box in room.furniture])
+        mirrored = mirror(corners[:, :, None], cell, size)
+        through = passes(receiver, images[:, :, None, None], mirrored.amin(1), mirrored.amax(1))
+        loss_db = through.sum(-1).double() @ size.new_tensor([box.loss_db for box in room.furniture])
+        gains = gains * 10 ** (-loss_db / 20)
+    return Paths(images, gains)
+
+
+def check_free(room: Room, points: Float[Tensor, "k 3"]) -> None:
+    """Raises a ValueError unless all points lie inside the room and outside its furniture."""
+    free = is_free(room, points)
+    if not free.all():
+        point = [round(value, 4) for value in points[~free][0].tolist()]
+        raise ValueError(
+            f"transmitters and receiver must lie inside the room of {room.size} m and outside its furniture, "
+            f"got {point}; move it"
+        )
+
+
+def is_free(room: Room, points: Float[Tensor, "*batch 3"]) -> Tensor:
+    """Whether points lie inside the room and outside its furniture."""
+    free = ((points > 0) & (points < points.new_tensor(room.size))).all(-1)
+    for box in room.furniture:
+        free &= ~((points >= points.new_tensor(box.lower)) & (points <= points.new_tensor(box.upper))).all(-1)
+    return free
+
+
+def frequency_offsets(room: Room, bandwidth: float, order: int) -> Float[Tensor, "f"]:
+    """Frequencies that sample a band, relative to its middle [Hz]; so dense that no two paths' beat is aliased.
+
+    Raises:
+        ValueError: The bandwidth is not positive.
+    """
+    if not 0 < bandwidth < math.inf:
+        raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}; one frequency is the spectrum 'carrier'")
+    longest = (order + 1) * math.hypot(*room.size)
+    count = math.ceil(bandwidth * longest / speed_of_light) + 1
+    return torch.linspace(-bandwidth / 2, bandwidth / 2, count, dtype=torch.float64)
+
+
+def array_elements(pose: Pose, wavelength: float) -> Float[Tensor, "elements 3"]:
+    """Positions of the square array's elements, half a wavelength apart, world frame [m]."""
+    steps = (torch.arange(SIDE, dtype=torch.float64) - (SIDE - 1) / 2) * wavelength / 2
+    x, y = torch.meshgrid(steps, steps, indexing="ij")
+    return pose.position.double() + torch.stack((x, y, 0 * x), -1).flatten(0, 1) @ pose.rotation.double().T
+
+
+def respond(
+    room: Room,
+    transmitters: Float[Tensor, "b 3"],
+    pose: Pose,
+    frequency: float,
+    offsets: Float[Tensor, "f"],
+    order: int,
+) -> Complex[Tensor, "b elements f"]:
+    """What each element of the array receives from a unit-power isotropic transmitter.
+
+    The phase is that of a spherical wave from each image to each element; reflection, penetration and the elements'
+    pattern are those at the array's centre. The elements are patches with a field pattern of the cosine from the
+    array's normal, 1 there and 0 behind.
+
+    Args:
+        room: Walls and furniture.
+        transmitters: Positions [m].
+        pose: The array's; its z axis is the normal.
+        frequency: Of the carrier [Hz]; the elements stand half its wavelength apart.
+        offsets: Frequencies to evaluate, relative to the carrier [Hz].
+        order: Largest number of reflections.
+
+    Raises:
+        ValueError: A frequency is not positive, or as for ``trace``.
+
+    Source: Friis, A note on a simple transmission formula, 1946.
+    """
+    if frequency + offsets.min() <= 0:
+        raise ValueError(f"frequencies must be positive, got {frequency + offsets.min():.6g} Hz; narrow the bandwidth")
+    paths = trace(room, transmitters, pose.position, frequency, order)
+    local = (paths.images - pose.position.double()) @ pose.rotation.double()
+    pattern = (local[..., 2] / local.norm(dim=-1)).clamp(min=0)
+    elements = array_elements(pose, speed_of_light / frequency)
+    distances = (paths.images[:, :, None] - elements).norm(dim=-1)[..., None]
+    phases = distances * (2 * math.pi * (frequency + offsets.double()) / speed_of_light)
+    # Friis: wavelength / (4 pi distance), which is 1 / (2 phase).
+    return torch.einsum("bp,bpnf->bnf", paths.gains * pattern, torch.polar(0.5 / phases, -phases))
+
+
+def bartlett(responses: Complex[Tensor, "b elements f"], grid: Grid) -> Float[Tensor, "b rows columns"]:
+    """Amplitude of the conventional beamformer's output, root mean square over the frequencies.
+
+    At one frequency it is |sum_n y_n exp(-j pi (i_n cos az cos el + k_n sin az cos el))| with the elements' places
+    (i, k) in half wavelengths of the carrier. Its square depends on the covariance of the y_n only through the sums
+    over pairs of elements with the same difference of places; 49 of them instead of 256 pairs make it cheap.
+
+    Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
+    """
+    covariances = responses @ responses.mH / responses.shape[-1]
+    places = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
+    steps, pair = torch.unique((places[:, None] - places).flatten(0, 1), dim=0, return_inverse=True)
+    lags = covariances.new_zeros(len(responses), len(steps)).index_add(1, pair, covariances.flatten(1))
+    elevations, azimuths = torch.meshgrid(grid.elevations.double(), grid.azimuths.double(), indexing="ij")
+    phases = math.pi * steps.double() @ from_spherical(azimuths, elevations)[..., :2].flatten(0, 1).T
+    power = lags.real @ torch.cos(phases) + lags.imag @ torch.sin(phases)
+    # In a null of the pattern rounding may leave the power a little below zero.
+    return power.clamp(min=0).sqrt().unflatten(1, grid.shape)
+
+
+def rss_dbm(responses: Complex[Tensor, "b elements f"], tx_power_dbm: float = 0.0) -> Float[Tensor, "b"]:
+    """Received signal strength [dBm]: power averaged over elements and frequencies."""
+    return tx_power_dbm + 10 * torch.log10(responses.abs().square().mean((1, 2)))
+
+
+def min_max(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b rows columns"]:
+    """Each spectrum scaled to [0, 1], as NeRF² labels are."""
+    low, high = spectra.amin((1, 2), keepdim=True), spectra.amax((1, 2), keepdim=True)
+    return (spectra - low) / (high - low)

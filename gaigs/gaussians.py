@@ -1,0 +1,179 @@
+"""The scene's Gaussians: parameters, activations, placement, and .ply files."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from plyfile import PlyData, PlyElement
+from torch import Tensor, nn
+
+from gaigs.data import Scene
+from gaigs.geometry import covariances, from_spherical
+
+SH_DC = 0.5 / math.sqrt(math.pi)
+"""The constant spherical harmonic, by which .ply viewers multiply the first signal coefficient."""
+
+
+class Gaussians(nn.Module):
+    """n anisotropic Gaussians, each a virtual transmitter; parameters are stored raw, properties give them activated.
+
+    They start in the directions that the label shows: for every receiver on a Fibonacci lattice over the part of the sphere
+    that the label's grid covers, at random distances, each wide enough to meet its neighbours. So the count follows from the
+    angular detail wanted: ``count`` splats over the upper hemisphere lie sqrt(2 pi / count) rad apart.
+
+    Args:
+        scene: Receivers and grid, which say where to put the Gaussians.
+        channels: Signal channels a Gaussian sends on; the pooling knows how many it needs.
+        count: Gaussians at the start.
+        near, far: Range of the distances to the receiver at the start [m].
+        spread: Standard deviation at the start, as a fraction of the distance to the next Gaussian of the lattice.
+        opacity: At the start, in (0, 1).
+        signal: Standard deviation of the signal's random start.
+
+    Source: parametrisation of Kerbl et al., 3D Gaussian Splatting, 2023, with SH degree 0: a direction-dependent signal adds
+    nothing where each Gaussian is seen from one receiver.
+    """
+
+    PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "signal")
+
+    def __init__(
+        self,
+        scene: Scene,
+        channels: int,
+        count: int,
+        near: float,
+        far: float,
+        spread: float,
+        opacity: float,
+        signal: float,
+    ):
+        super().__init__()
+        if count < len(scene.receivers):
+            raise ValueError(f"gaussians.count must be at least one a receiver ({len(scene.receivers)}), got {count}")
+        if not 0 < near <= far:
+            raise ValueError(f"gaussians.near and far must satisfy 0 < near <= far, got {near} and {far} m")
+        if not 0 < opacity < 1:
+            raise ValueError(f"gaussians.opacity must lie between 0 and 1, got {opacity}")
+        shares = [count // len(scene.receivers) + (i < count % len(scene.receivers)) for i in range(len(scene.receivers))]
+        means, scales = [], []
+        low, high = (-math.pi / 2, math.pi / 2)
+        if scene.grid is not None:
+            low, high = scene.grid.elevations.min().item(), scene.grid.elevations.max().item()
+        for receiver, share in zip(scene.receivers, shares, strict=True):
+            directions = fibonacci_lattice(share, low, high)
+            distances = near + (far - near) * torch.rand(share)
+            pitch = math.sqrt(2 * math.pi * (math.sin(high) - math.sin(low)) / share)
+            means.append(receiver.pose.world(distances[:, None] * directions))
+            scales.append(distances * pitch * spread)
+        self.means = nn.Parameter(torch.cat(means))
+        self.quats = nn.Parameter(torch.randn(count, 4))
+        self.log_scales = nn.Parameter(torch.cat(scales).log()[:, None].repeat(1, 3))
+        self.opacity_logits = nn.Parameter(torch.full((count,), opacity).logit())
+        self.signal = nn.Parameter(signal * torch.randn(count, channels, 1))
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def scales(self) -> Float[Tensor, "n 3"]:
+        """Standard deviations along the axes [m]."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Float[Tensor, "n"]:
+        """In (0, 1)."""
+        return self.opacity_logits.sigmoid()
+
+    @property
+    def unit_quats(self) -> Float[Tensor, "n 4"]:
+        """Orientations as unit quaternions (w, x, y, z)."""
+        return nn.functional.normalize(self.quats, dim=-1)
+
+    @property
+    def covariances(self) -> Float[Tensor, "n 3 3"]:
+        """World frame [m²]."""
+        return covariances(self.quats, self.scales)
+
+    def resize(self, count: int) -> None:
+        """Makes room for another number of Gaussians; their values are undefined until they are loaded."""
+        for name in self.PARAMETERS:
+            old = getattr(self, name)
+            setattr(self, name, nn.Parameter(old.new_empty(count, *old.shape[1:])))
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        """Takes the count of the checkpoint, which density control has changed since the configuration was written."""
+        if (means := state_dict.get(f"{prefix}means")) is not None and len(means) != len(self):
+            self.resize(len(means))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def save_ply(self, path: str | Path) -> None:
+        """Writes the Gaussians as a .ply that 3-D Gaussian splatting viewers open.
+
+        Positions [m], log scales, quaternions (w, x, y, z), opacity logits; the signal's first three channels stand in
+        f_dc_*, absent ones as 0, further ones in f_rest_*.
+        """
+        columns = _ply_columns(self)
+        vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
+        comment = f"gaigs: {self.signal.shape[1]} signal channels"
+        PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(path))
+
+    def load_ply(self, path: str | Path) -> None:
+        """Takes over the Gaussians of a .ply, whatever their number.
+
+        Raises:
+            ValueError: The file is no splatting .ply or has fewer signal channels than these Gaussians.
+        """
+        vertices = PlyData.read(str(path))["vertex"].data
+        channels = self.signal.shape[1]
+        wanted = {name: columns for name, columns in _ply_names(channels).items() if name != "normals"}
+        lacking = [column for columns in wanted.values() for column in columns if column not in vertices.dtype.names]
+        if lacking:
+            raise ValueError(f"{path} must hold the properties of Gaussian splats with {channels} signal channels; it lacks {', '.join(lacking)}")
+        self.resize(len(vertices))
+        with torch.no_grad():
+            for name, columns in wanted.items():
+                values = np.stack([vertices[column] for column in columns], -1).astype(np.float32)
+                parameter = getattr(self, name)
+                parameter.copy_(torch.from_numpy(values)[:, : parameter[0].numel()].reshape(parameter.shape))
+
+
+def fibonacci_lattice(count: int, low: float, high: float) -> Float[Tensor, "count 3"]:
+    """Unit vectors spread evenly over a zone of the sphere.
+
+    Args:
+        low, high: Elevations that bound the zone [rad].
+
+    Source: Swinbank and Purser, Fibonacci grids, 2006.
+    """
+    i = torch.arange(count, dtype=torch.float64) + 0.5
+    heights = math.sin(low) + (math.sin(high) - math.sin(low)) * i / count
+    golden = math.pi * (1 + math.sqrt(5))
+    return from_spherical(torch.remainder(golden * i, 2 * math.pi), torch.asin(heights)).float()
+
+
+def _ply_names(channels: int) -> dict[str, list[str]]:
+    """Properties of a splatting .ply for each parameter, in the order viewers expect."""
+    return {
+        "means": ["x", "y", "z"],
+        "normals": ["nx", "ny", "nz"],
+        "signal": [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(channels - 3)],
+        "opacity_logits": ["opacity"],
+        "log_scales": [f"scale_{i}" for i in range(3)],
+        "quats": [f"rot_{i}" for i in range(4)],
+    }
+
+
+def _ply_columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    n, channels, _ = gaussians.signal.shape
+    columns = {}
+    for name, properties in _ply_names(channels).items():
+        if name == "normals":
+            values = np.zeros((n, 3))
+        else:
+            values = getattr(gaussians, name).detach().cpu().numpy().reshape(n, -1)
+        filled = np.zeros((n, len(properties)), np.float32)
+        filled[:, : values.shape[1]] = values
+        columns |= zip(properties, filled.T, strict=True)
+    return columns

@@ -1,0 +1,1 @@
+"""Poolings turn the map over directions into what the receiver reports."""

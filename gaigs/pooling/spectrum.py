@@ -1,0 +1,28 @@
+"""The spatial spectrum: the map's magnitude."""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.registry import register
+
+
+@register("pooling", "spectrum")
+class Spectrum(nn.Module):
+    """|C_0|, or |C_0 + j C_1|: channels are signed, so that paths can cancel.
+
+    Args:
+        channels: 1 (real) or 2 (complex).
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        if channels not in (1, 2):
+            raise ValueError(f"pooling 'spectrum' renders 1 real or 2 complex channels, got channels={channels}")
+        self.channels = channels
+
+    def forward(self, image: Float[Tensor, "b c rows columns"]) -> Float[Tensor, "b rows columns"]:
+        """The predicted spectrum.
+
+        ``vector_norm`` takes the subgradient 0 where the map is 0.
+        """
+        return image.norm(dim=1)

@@ -1,0 +1,96 @@
+"""Projections lay Gaussians on the receiver's perception plane."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gaigs.geometry import Pose
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Gaussians on the perception plane of one receiver.
+
+    Attributes:
+        means2d: Centres (n, 2) as (u, v); they do not depend on the transmitter.
+        covariances2d: (1 or b, n, 2, 2); one for all transmitters where nothing deforms the Gaussians.
+        depths: Distance to the receiver (n,) [m].
+        visible: False where a Gaussian has no direction (it sits on the receiver) (n,).
+    """
+
+    means2d: Float[Tensor, "n 2"]
+    covariances2d: Float[Tensor, "b n 2 2"]
+    depths: Float[Tensor, "n"]
+    visible: Bool[Tensor, "n"]
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Where the label's pixel centres lie on the perception plane.
+
+    Attributes:
+        u: (1, columns), or (rows, columns) where the projection mixes azimuth and elevation.
+        v: (rows, 1), or (rows, columns).
+        period: u repeats after this; a splat then acts at the nearest of its images. None: no wrap.
+    """
+
+    u: Float[Tensor, "r columns"]
+    v: Float[Tensor, "rows c"]
+    period: float | None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.v.shape[0], self.u.shape[1]
+
+
+class Projection(ABC):
+    """The contract of kind ``projection``, and what all projections share.
+
+    A projection is a smooth map from directions to the plane, ``coordinates``; a Gaussian's footprint there is that of
+    the map's linearisation at its centre, ``jacobian`` (EWA splatting). To it comes the variance of a square pixel,
+    so that a splat narrower than a pixel is not lost between two pixel centres.
+
+    Args:
+        pixel: Edge of that pixel, the pitch of the label's grid [rad].
+
+    Source: GAI-GS, "Projection and Render Module"; Zwicker et al., EWA Splatting, 2002.
+    """
+
+    def __init__(self, pixel: float):
+        if not pixel > 0:
+            raise ValueError(f"a projection's pixel must be wider than 0 rad, got {pixel}")
+        self.pixel_variance = pixel**2 / 12
+
+    @abstractmethod
+    def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
+        """Plane coordinates (u, v) of points in the array's frame, of any distance but zero."""
+
+    @abstractmethod
+    def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
+        """Derivative of ``coordinates`` [1/m]; finite everywhere but at the origin."""
+
+    @abstractmethod
+    def plane(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"]) -> Plane:
+        """Plane coordinates of a label's pixel centres, given in radians."""
+
+    def project(
+        self, means: Float[Tensor, "n 3"], covariances: Float[Tensor, "b n 3 3"], receiver: Pose
+    ) -> Splats:
+        """Gaussians as the receiver sees them.
+
+        Args:
+            means: Centres, world frame [m].
+            covariances: World frame [m²]; one set (b = 1), or one a transmitter.
+            receiver: Position [m] and orientation of the antenna array.
+        """
+        points = receiver.local(means)
+        depths = points.norm(dim=-1)
+        visible = depths > 0
+        # A Gaussian on the receiver has no direction: a stand-in keeps values and gradients finite, `visible` hides it.
+        points = torch.where(visible[:, None], points, points.new_tensor([1.0, 0.0, 0.0]))
+        half = self.jacobian(points) @ receiver.rotation.mT
+        pixel = self.pixel_variance * torch.eye(2, dtype=means.dtype, device=means.device)
+        return Splats(self.coordinates(points), half @ covariances @ half.mT + pixel, depths, visible)

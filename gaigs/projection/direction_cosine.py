@@ -1,0 +1,36 @@
+"""The plane of direction cosines."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.geometry import from_spherical
+from gaigs.projection import Plane, Projection
+from gaigs.registry import register
+
+
+@register("projection", "direction_cosine")
+class DirectionCosine(Projection):
+    """(u, v) = (l, m) = (cos(el) cos(az), cos(el) sin(az)), in which a planar array's response is shift-invariant.
+
+    No seam and no pole: smooth on the whole hemisphere. As a planar array does, it cannot tell a direction below the
+    array's plane from its mirror image above. Rows and columns of a spectrum mix, so ``plane`` gives full grids.
+
+    Args:
+        pixel: Edge of the pixel whose variance a splat is widened by [rad].
+
+    Source: any text on planar arrays, e.g. Van Trees, Optimum Array Processing, chapter 4.
+    """
+
+    def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
+        return (points / points.norm(dim=-1, keepdim=True))[..., :2]
+
+    def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
+        distances = points.norm(dim=-1)[..., None, None]
+        unit = points[..., None, :] / distances
+        identity = torch.eye(3, dtype=points.dtype, device=points.device)
+        return (identity - unit.mT @ unit)[..., :2, :] / distances
+
+    def plane(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"]) -> Plane:
+        directions = from_spherical(*torch.meshgrid(azimuths, elevations, indexing="xy"))
+        return Plane(directions[..., 0], directions[..., 1], None)

@@ -1,0 +1,23 @@
+"""The plate carrée plane."""
+
+import torch
+from torch import Tensor
+
+from gaigs.projection._cylindrical import Cylindrical
+from gaigs.registry import register
+
+
+@register("projection", "equirectangular")
+class Equirectangular(Cylindrical):
+    """u = azimuth, v = elevation.
+
+    Args:
+        pixel: Edge of the pixel whose variance a splat is widened by [rad].
+        limit_deg: Elevations are clamped to this absolute value [deg].
+    """
+
+    def __init__(self, pixel: float, limit_deg: float = 89.5):
+        super().__init__(pixel, limit_deg)
+
+    def stretch(self, elevations: Tensor) -> tuple[Tensor, Tensor]:
+        return elevations, torch.ones_like(elevations)

@@ -1,0 +1,236 @@
+"""The rasterizer in eager torch: any device, float32 and float64."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.projection import Plane, Splats
+from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN
+from gaigs.registry import register
+
+TILE = 16
+"""Edge of a tile in pixels."""
+
+CHUNK = 2**20
+"""(transmitter, splat, pixel) triples worked on at a time: 4 MiB an array of float32, which a core's cache holds."""
+
+
+@register("rasterizer", "torch")
+class TorchRasterizer:
+    """Tiles of 16 x 16 pixels, each against the splats that reach it; the gradient is written by hand.
+
+    Splats are sorted by depth once, for all transmitters. A tile keeps those whose bounding box, at the opacity
+    ``ALPHA_MIN`` and over all transmitters, meets it. Tiles of similar length are worked on together, in chunks whose
+    intermediate arrays are small and are computed anew in the backward pass, so memory does not grow with the number of
+    (splat, pixel) pairs. Contract and formulas: ``gaigs.rasterizer.Rasterizer``.
+    """
+
+    def __call__(
+        self,
+        splats: Splats,
+        signal: Float[Tensor, "b n c"],
+        opacities: Float[Tensor, "b n"],
+        attenuations: Float[Tensor, "b n"] | None,
+        plane: Plane,
+    ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
+        """The map, and the transmittance left behind the last splat; see ``gaigs.rasterizer.Rasterizer``."""
+        order = torch.argsort(splats.depths.masked_fill(~splats.visible, math.inf), stable=True)
+        order = order[: int(splats.visible.sum())]
+        a, b, c, d = splats.covariances2d[:, order].flatten(-2).unbind(-1)
+        conics = torch.stack((d, -(b + c) / 2, a), -1) / (a * d - b * c)[..., None]
+        with torch.no_grad():
+            tiles = _Tiles(plane, splats.means2d[order], torch.stack((a, d), -1), opacities[:, order])
+        return _Composite.apply(
+            tiles,
+            splats.means2d[order],
+            conics,
+            signal[:, order],
+            opacities[:, order],
+            None if attenuations is None else attenuations[:, order].log(),
+        )
+
+
+class _Tiles:
+    """Which splats reach which tile, in chunks of tiles whose lists have similar lengths."""
+
+    def __init__(self, plane: Plane, means: Tensor, variances: Tensor, opacities: Tensor):
+        self.shape, self.period = plane.shape, plane.period
+        self.down, self.across = (-(-edge // TILE) for edge in self.shape)
+        u, v = (self._cut(coordinate) for coordinate in (plane.u, plane.v))
+        self.u, self.v = u, v
+
+        # The footprint falls to ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box has these halves.
+        reach = 2 * (opacities / ALPHA_MIN).log().clamp_min(0)
+        halves = (reach[..., None] * variances).amax(0).sqrt()
+        touches = (opacities.amax(0) >= ALPHA_MIN).expand(self.down * self.across, -1)
+        for axis, (coordinate, period) in enumerate(((u, self.period), (v, None))):
+            coordinate = coordinate.flatten(1)
+            low, high = coordinate.amin(1, keepdim=True), coordinate.amax(1, keepdim=True)
+            offset = _nearest(means[:, axis] - (low + high) / 2, period).abs()
+            # A few roundings' slack: whoever is listed in vain is sorted out pixel by pixel.
+            touches = touches & (offset <= (halves[:, axis] + (high - low) / 2) * (1 + 1e-5) + 1e-6)
+        self.chunks = self._chunks(touches, len(opacities))
+
+    def _cut(self, coordinate: Tensor) -> Tensor:
+        """A plane coordinate (rows or 1, columns or 1) as tiles (t, y, x), the last ones filled up by repetition."""
+        rows, columns = (
+            torch.arange(edges * TILE, device=coordinate.device).clamp_max(size - 1) if size > 1 else torch.zeros(1).long()
+            for edges, size in zip((self.down, self.across), coordinate.shape, strict=True)
+        )
+        y, x = (TILE if len(index) > 1 else 1 for index in (rows, columns))
+        cut = coordinate[rows.to(coordinate.device)][:, columns.to(coordinate.device)]
+        cut = cut.view(len(rows) // y, y, len(columns) // x, x).transpose(1, 2)
+        return cut.expand(self.down, self.across, y, x).reshape(-1, y, x)
+
+    def _chunks(self, touches: Tensor, transmitters: int) -> list[tuple[Tensor, Tensor]]:
+        """(tiles, splats of each (t, k) with n as the filling) a chunk, longest lists first."""
+        counts = touches.sum(1)
+        n = touches.shape[1]
+        # Sorting the indices with "not touched" pushed behind keeps the depth order in front.
+        splats = torch.where(touches, torch.arange(n, device=counts.device), n).sort(1).values
+        lengths, tiles = counts.sort(descending=True)
+        lengths, chunks, start = lengths.tolist(), [], 0
+        while start < len(lengths) and lengths[start]:
+            size = max(1, CHUNK // (transmitters * lengths[start] * TILE * TILE))
+            chosen = tiles[start : start + size]
+            chunks.append((chosen, splats[chosen, : lengths[start]]))
+            start += size
+        return chunks
+
+    def offsets(self, tiles: Tensor, means: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixel minus splat centre (t, k, y or 1, x or 1) in u and v for splats (t, k, 2)."""
+        du = _nearest(self.u[tiles][:, None] - means[..., 0, None, None], self.period)
+        return du, self.v[tiles][:, None] - means[..., 1, None, None]
+
+    def join(self, tiled: Tensor) -> Tensor:
+        """Tiles (..., t, y x) as an image (..., rows, columns)."""
+        image = tiled.unflatten(-1, (TILE, TILE)).unflatten(-3, (self.down, self.across))
+        return image.transpose(-3, -2).flatten(-4, -3).flatten(-2)[..., : self.shape[0], : self.shape[1]]
+
+    def split(self, image: Tensor) -> Tensor:
+        """The inverse of ``join``; pixels outside the image are 0."""
+        rows, columns = self.shape
+        image = torch.nn.functional.pad(image, (0, self.across * TILE - columns, 0, self.down * TILE - rows))
+        return image.unflatten(-1, (self.across, TILE)).unflatten(-3, (self.down, TILE)).transpose(-3, -2).flatten(-2).flatten(-3, -2)
+
+
+def _nearest(offset: Tensor, period: float | None) -> Tensor:
+    """An offset taken to the nearest image."""
+    return offset if period is None else offset - period * (offset / period).round()
+
+
+@dataclass
+class _Weights:
+    """One chunk composited: everything is (b, t, k, y x) but ``left`` (b, t, y x)."""
+
+    du: Tensor
+    dv: Tensor
+    footprint: Tensor
+    alpha: Tensor
+    live: Tensor
+    transmittance: Tensor
+    left: Tensor
+
+
+def _weigh(tiles: _Tiles, chosen: Tensor, means: Tensor, conics: Tensor, opacities: Tensor, logs: Tensor | None) -> _Weights:
+    """Footprints, opacities and transmittances of one chunk, its splats already gathered as (b, t, k)."""
+    du, dv = tiles.offsets(chosen, means)
+    uu, uv, vv = (conic[..., None, None] for conic in conics.unbind(-1))
+    exponent = (-0.5 * uu * du * du) + (-0.5 * vv * dv * dv)
+    exponent = exponent.addcmul_(-uv * dv, du).flatten(-2)
+    footprint = exponent.exp_()
+    alpha = footprint * opacities[..., None]
+    live = alpha >= ALPHA_MIN
+    alpha = alpha.clamp_max(ALPHA_MAX).mul_(live)
+    passed = torch.log1p(-alpha)
+    if logs is not None:
+        passed.addcmul_(footprint * live, logs[..., None])
+    total = passed.cumsum(-2)
+    left = total[..., -1, :].exp()
+    return _Weights(du, dv, footprint, alpha, live, total.sub_(passed).exp_(), left)
+
+
+class _Composite(torch.autograd.Function):
+    """Composites sorted splats. Below, D_i = signal_i . gradient and S_i = sum_{j>i} D_j A_j T_j + left gradient_left:
+    d/dA_i = T_i D_i - S_i / (1 - A_i), and a change of log T behind splat i acts with S_i."""
+
+    @staticmethod
+    def forward(ctx, tiles, means, conics, signal, opacities, logs):
+        ctx.tiles = tiles
+        ctx.save_for_backward(means, conics, signal, opacities, logs)
+        b, _, c = signal.shape
+        image = signal.new_zeros(b, c, tiles.down * tiles.across, TILE * TILE)
+        left = signal.new_ones(b, tiles.down * tiles.across, TILE * TILE)
+        means, conics, signal, opacities, logs = _filled(means, conics, signal, opacities, logs)
+        for chosen, k in tiles.chunks:
+            weights = _weigh(tiles, chosen, means[k], conics[:, k], opacities[:, k], None if logs is None else logs[:, k])
+            image[:, :, chosen] = (signal[:, k].mT @ weights.transmittance.mul_(weights.alpha)).transpose(1, 2)
+            left[:, chosen] = weights.left
+        return tiles.join(image), tiles.join(left)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, image_gradient, left_gradient):
+        tiles = ctx.tiles
+        inputs = _filled(*ctx.saved_tensors)
+        means, conics, signal, opacities, logs = inputs
+        gradients = [None if tensor is None else torch.zeros_like(tensor) for tensor in inputs]
+        image_gradient = tiles.split(image_gradient)
+        left_gradient = tiles.split(left_gradient)
+        for chosen, k in tiles.chunks:
+            w = _weigh(tiles, chosen, means[k], conics[:, k], opacities[:, k], None if logs is None else logs[:, k])
+            towards = image_gradient[:, :, chosen].transpose(1, 2)
+            blend = w.alpha * w.transmittance
+            d_signal = blend @ towards.mT
+            d = signal[:, k] @ towards
+            flow = blend.mul_(d)
+            behind = flow.flip(-2).cumsum(-2).flip(-2).sub_(flow)
+            behind += (w.left * left_gradient[:, chosen])[..., None, :]
+            # The opacity's own gradient, 0 where the splat does nothing or is clamped.
+            d_alpha = (d.mul_(w.transmittance) - behind / (1 - w.alpha)).mul_(w.live & (w.alpha < ALPHA_MAX))
+            d_opacity = (d_alpha * w.footprint).sum(-1)
+            d_exponent = d_alpha.mul_(w.alpha)
+            d_logs = None
+            if logs is not None:
+                covered = behind.mul_(w.footprint).mul_(w.live)
+                d_logs = covered.sum(-1)
+                d_exponent = d_exponent + covered * logs[:, k][..., None]
+            d_means, d_conics = _moments(d_exponent.unflatten(-1, (TILE, TILE)), w.du, w.dv, conics[:, k])
+            found = (d_means.sum(0), d_conics.sum_to_size(conics[:, k].shape), d_signal, d_opacity, d_logs)
+            for gradient, part, axis in zip(gradients, found, (0, 1, 1, 1, 1), strict=True):
+                if gradient is not None:
+                    gradient.index_add_(axis, k.flatten(), part.flatten(axis, axis + 1))
+        axes = (0, 1, 1, 1, 1)
+        cut = (None if g is None else g.narrow(axis, 0, g.shape[axis] - 1) for g, axis in zip(gradients, axes, strict=True))
+        return None, *cut
+
+
+def _filled(means, conics, signal, opacities, logs):
+    """The splats and, behind them, one that does nothing: it fills the tiles' lists up."""
+    pad = torch.nn.functional.pad
+    return (
+        pad(means, (0, 0, 0, 1)),
+        pad(conics, (0, 0, 0, 1)),
+        pad(signal, (0, 0, 0, 1)),
+        pad(opacities, (0, 1)),
+        None if logs is None else pad(logs, (0, 1)),
+    )
+
+
+def _moments(d_exponent: Tensor, du: Tensor, dv: Tensor, conics: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of centres (b, t, k, 2) and conics (b, t, k, 3) from that of the exponents (b, t, k, y, x)."""
+    if du.shape[-2] == 1:  # the plane is a product of columns and rows: contract the columns first
+        powers = torch.cat((torch.ones_like(du), du, du * du), -2).mT
+        m0, m1, m2 = (d_exponent @ powers).unbind(-1)
+        dv = dv.squeeze(-1)
+    else:
+        m0, m1 = d_exponent.flatten(-2), (d_exponent * du).flatten(-2)
+        du, dv = du.flatten(-2), dv.flatten(-2)
+        m2 = m1 * du
+    u, v = m1.sum(-1), (m0 * dv).sum(-1)
+    uu, uv, vv = m2.sum(-1), (m1 * dv).sum(-1), (m0 * dv * dv).sum(-1)
+    a, b, c = conics.unbind(-1)
+    return torch.stack((a * u + b * v, b * u + c * v), -1), torch.stack((-0.5 * uu, -uv, -0.5 * vv), -1)

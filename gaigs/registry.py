@@ -1,0 +1,279 @@
+"""Components by name: the built-in ones, those of installed packages and those in ./plugins of the working directory.
+
+Names are found without importing anybody's code; what a name stands for is imported when it is asked for.
+"""
+
+import ast
+import difflib
+import functools
+import importlib
+import inspect
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from types import MappingProxyType
+
+from omegaconf import OmegaConf
+
+KINDS = ("tokenizer", "projection", "rasterizer", "pooling", "model", "data")
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who holds a name, known before any of their code runs.
+
+    Attributes:
+        name: The registered name.
+        where: The file or distribution, as errors call it.
+        target: ``module``, which registers the component by decorator, or ``module:attribute``, which is the component.
+        file: The module's file, where the name was read from it.
+        root: Folder that must be on ``sys.path`` for the import, where it may not be yet.
+    """
+
+    name: str
+    where: str
+    target: str
+    file: Path | None = None
+    root: Path | None = None
+
+    @property
+    def package(self) -> str:
+        """The top-level package of the target."""
+        return re.split("[.:]", self.target)[0]
+
+    def owns(self, component: object) -> bool:
+        """Whether a component comes from the holder's file or, for an entry point, from the package it points into."""
+        module = getattr(component, "__module__", "")
+        return module == self.target if self.file else module.split(".")[0] == self.package
+
+
+class Registry:
+    """The components of one kind, by name.
+
+    Args:
+        kind: One of ``KINDS``: a folder of gaigs, a folder of conf, and the entry-point group ``gaigs.<kind>``.
+    """
+
+    def __init__(self, kind: str):
+        self.kind = kind
+        self._registered: dict[str, Callable] = {}
+
+    def names(self) -> list[str]:
+        """Every name that can be asked for, sorted."""
+        holders, _ = find_holders(self.kind)
+        return sorted({holder.name for holder in holders} | self._registered.keys())
+
+    def register(self, name: str) -> Callable:
+        """The decorator that ``gaigs.register`` gives for this kind.
+
+        Raises:
+            ValueError: The name is taken by another component.
+        """
+
+        def decorate(component):
+            held = self._registered.get(name)
+            if held is not None and _origin(held) != _origin(component):  # the same origin: a module loaded anew
+                raise self._taken(name, _origin(held), _origin(component))
+            holders, _ = find_holders(self.kind, name)
+            if holders and not any(holder.owns(component) for holder in holders):
+                raise self._taken(name, holders[0].where, _origin(component))
+            self._registered[name] = component
+            return component
+
+        return decorate
+
+    def get(self, name: str) -> Callable:
+        """The class or function of that name; of all modules only the one that holds it is imported.
+
+        Raises:
+            ValueError: Nobody holds the name, or two do.
+            ImportError: The module cannot be imported.
+        """
+        holders, unreadable = find_holders(self.kind, name)
+        component = self._registered.get(name)
+        claims = [holder.where for holder in holders]
+        if component is not None and not any(holder.owns(component) for holder in holders):
+            claims.insert(0, _origin(component))  # registered by code that no file of ours declares, e.g. a notebook
+        if len(claims) > 1:
+            raise self._taken(name, *claims[:2])
+        if holders:
+            return self._load(holders[0])
+        if component is not None:
+            return component
+        names = self.names()
+        causes = "".join(f"; cannot read {cause}" for cause in unreadable)
+        raise ValueError(f"unknown {self.kind} {_suggest(name, names)}; there are: {_listed(names)}{causes}")
+
+    def build(self, config: Mapping, **context):
+        """The component that a configuration names, made with its options.
+
+        Args:
+            config: The key ``name``; every other key is an option of the component.
+            context: What the caller knows and no configuration says, e.g. ``scene``; passed where the component has a
+                parameter of that name.
+
+        Raises:
+            TypeError: The configuration is no mapping.
+            ValueError: The name is missing, unknown or taken twice; an option is missing or unknown.
+            ImportError: The component cannot be imported.
+        """
+        options = _plain(config, self.kind)
+        if "name" not in options:
+            raise ValueError(
+                f"a {self.kind} configuration needs the key 'name', got {options}; there are: {_listed(self.names())}"
+            )
+        name = options.pop("name")
+        component = self.get(name)
+        parameters = inspect.signature(component).parameters.values()
+        named = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+        takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters)
+        has = [key for key in named if key not in context]
+        unknown = [key for key in options if key in context or not (takes_all or key in named)]
+        if unknown:
+            words = " or ".join(_suggest(key, has) for key in unknown)
+            raise ValueError(f"{self.kind} {name!r} has no option {words}; it has: {_listed(has)}")
+        arguments = options | {key: value for key, value in context.items() if takes_all or key in named}
+        missing = [key for key, p in named.items() if p.default is p.empty and key not in arguments]
+        if missing:
+            raise ValueError(f"{self.kind} {name!r} needs option {_listed(missing)}; it has: {_listed(has)}")
+        return component(**arguments)
+
+    def _load(self, holder: Holder) -> Callable:
+        if holder.root is not None and str(holder.root) not in sys.path:
+            sys.path.append(str(holder.root))  # last, so that nothing in ./plugins shadows what is installed
+        name, _, attribute = holder.target.partition(":")
+        try:
+            module = importlib.import_module(name.strip())
+            if holder.file is not None and not holder.file.samefile(module.__file__):
+                raise ImportError(f"{module.__file__} is imported as {name!r} already; rename one of the two")
+            if attribute:
+                return functools.reduce(getattr, attribute.strip().split("."), module)
+            return self._registered[holder.name]
+        except Exception as error:  # whatever a stranger's module raises: say whose it is, and why
+            cause = f"{type(error).__name__}: {error}"
+            raise ImportError(f"{self.kind} {holder.name!r} of {holder.where} cannot be loaded: {cause}") from error
+
+    def _taken(self, name: str, holder: str, asker: str) -> ValueError:
+        return ValueError(f"{self.kind} {name!r} is held by {holder}, and {asker} asks for it; choose another name")
+
+
+registries: Mapping[str, Registry] = MappingProxyType({kind: Registry(kind) for kind in KINDS})
+"""The registry of each kind."""
+
+
+def registry(kind: str) -> Registry:
+    """The registry of a kind.
+
+    Raises:
+        ValueError: There is no such kind.
+    """
+    if kind not in registries:
+        raise ValueError(f"unknown kind {_suggest(kind, KINDS)}; there are: {_listed(KINDS)}")
+    return registries[kind]
+
+
+def register(kind: str, name: str, /) -> Callable:
+    """Decorator that gives a class or function a name among the components of a kind.
+
+    Kind and name are string literals and the component stands at the top level of its file, because names are read
+    from the source before anything is imported.
+
+    Raises:
+        ValueError: There is no such kind, or the name is taken by another component.
+    """
+    return registry(kind).register(name)
+
+
+def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
+    """Who holds the names of a kind, or one name: gaigs itself first, then installed packages, then ./plugins.
+
+    Returns:
+        The holders, and the files that cannot be read, each with the cause.
+    """
+    here, cwd = Path(__file__).parent, Path.cwd()
+    built_in, unreadable = _scan(kind, here / kind, f"gaigs.{kind}")
+    points = metadata.entry_points(group=f"gaigs.{kind}")
+    installed = [Holder(p.name, f"distribution {p.dist.name} {p.dist.version}", p.value) for p in points]
+    dropped, causes = _scan(kind, cwd / "plugins", "plugins", root=cwd)
+    targets = {(holder.name, holder.target) for holder in installed}
+    # A package in ./plugins that is installed as well is no rival of itself.
+    holders = built_in + installed + [holder for holder in dropped if (holder.name, holder.target) not in targets]
+    return [holder for holder in holders if name in (None, holder.name)], unreadable + causes
+
+
+def _scan(kind: str, folder: Path, package: str, root: Path | None = None) -> tuple[list[Holder], list[str]]:
+    """Holders in a folder's files, and the files that cannot be read."""
+    holders, unreadable = [], []
+    for module, file in _files(folder, package):
+        where = str(file.relative_to(root or Path(__file__).parents[1]))
+        try:
+            if file.name == "pyproject.toml":
+                # Packages lie in src where there is one, else beside the pyproject.toml.
+                source = file.parent / "src" if (file.parent / "src").is_dir() else file.parent
+                holders += [Holder(name, where, target, root=source) for name, target in _entry_points(kind, file)]
+            else:
+                holders += [Holder(name, where, module, file, root) for name in _decorated(kind, file)]
+        except (SyntaxError, ValueError, OSError) as error:
+            unreadable.append(f"{where}: {error}")
+    return holders, unreadable
+
+
+def _files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
+    """Modules and their files in a folder and its packages, and of an installable project its pyproject.toml."""
+    for path in sorted(folder.glob("[!_.]*")):
+        if path.suffix == ".py":
+            yield f"{package}.{path.stem}", path
+        elif (path / "pyproject.toml").is_file():
+            yield path.name, path / "pyproject.toml"
+        elif (path / "__init__.py").is_file():
+            yield f"{package}.{path.name}", path / "__init__.py"
+            yield from _files(path, f"{package}.{path.name}")
+
+
+def _entry_points(kind: str, file: Path) -> Iterable[tuple[str, str]]:
+    """Names and targets that a pyproject.toml declares."""
+    project = tomllib.loads(file.read_text(encoding="utf-8")).get("project", {})
+    return project.get("entry-points", {}).get(f"gaigs.{kind}", {}).items()
+
+
+def _decorated(kind: str, file: Path) -> Iterator[str]:
+    """Names that a file's top-level ``@register(kind, name)`` decorators claim."""
+    for node in ast.parse(file.read_bytes(), file.name).body:
+        for decorator in getattr(node, "decorator_list", ()):
+            match decorator:
+                case ast.Call(
+                    func=ast.Name(id="register") | ast.Attribute(attr="register"),
+                    args=[ast.Constant(value=literal), ast.Constant(value=str(name))],
+                ) if literal == kind:
+                    yield name
+
+
+def _plain(config: Mapping, kind: str) -> dict:
+    """A configuration as plain dicts, lists and scalars, its interpolations resolved."""
+    if OmegaConf.is_config(config):
+        missing = OmegaConf.missing_keys(config)
+        if missing:
+            raise ValueError(
+                f"a {kind} configuration needs values for {_listed(sorted(missing))}, which stand at '???'"
+            )
+        config = OmegaConf.to_container(config, resolve=True)
+    if not isinstance(config, Mapping):
+        raise TypeError(f"a {kind} configuration must be a mapping with the key 'name', got {config!r}")
+    return {k: OmegaConf.to_container(v, resolve=True) if OmegaConf.is_config(v) else v for k, v in config.items()}
+
+
+def _suggest(word: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(str(word), known, n=1)
+    return f"{word!r} (did you mean {near[0]!r}?)" if near else repr(word)
+
+
+def _listed(words: Iterable[str]) -> str:
+    return ", ".join(words) or "none"
+
+
+def _origin(component: Callable) -> str:
+    return f"{component.__module__}.{component.__qualname__}"

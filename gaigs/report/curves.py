@@ -1,0 +1,138 @@
+"""Curves: how SSIM is distributed over the test set, how the losses fell, and what an error costs in time."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
+from numpy import ndarray
+
+from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE
+
+
+def ssim_cdf(scores: Mapping[str, Float[ndarray, "t"]], split: str) -> Figure:
+    """Share of test spectra that score at most a given SSIM, one step curve a model, medians marked.
+
+    Args:
+        scores: SSIM of every test spectrum by model, the run's own model first.
+        split: Name of the split.
+    """
+    with rc_context(STYLE):
+        figure = Figure(figsize=(COLUMN, 2.6), layout="constrained")
+        ax = figure.subplots()
+        ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
+        for (name, ssim), (colour, dash) in zip(scores.items(), cycle(LINES), strict=False):
+            median = float(np.median(ssim))
+            ax.ecdf(ssim, color=colour, linestyle=dash, label=f"{name} {median:.3f}")
+            ax.plot(median, 0.5, "o", color=colour, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
+        ax.set(xlabel=f"SSIM, split {split}", ylabel="share of test spectra", ylim=(0, 1.01))
+        ax.set_xlim(right=1)
+        figure.legend(loc="outside upper center", title="median SSIM", ncols=3, handlelength=1.8, columnspacing=1.2)
+        ax.grid(axis="x")
+    return figure
+
+
+def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
+    """Steps and values of every quantity in files of Lightning's CSVLogger, whose rows leave out what they lack.
+
+    Args:
+        paths: One file for each time the run was started; where they overlap, the later file counts.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: A file has no column ``step``.
+    """
+    curves: dict[str, dict[float, float]] = {}
+    for path in paths:
+        with open(path, newline="") as file:
+            reader = csv.DictReader(file)
+            if "step" not in (reader.fieldnames or ()):
+                raise ValueError(f"{path} must have a column 'step', got {reader.fieldnames}; is it of a CSVLogger?")
+            for row in reader:
+                for name in reader.fieldnames:
+                    if row[name] and name not in ("step", "epoch"):
+                        curves.setdefault(name, {})[float(row["step"])] = float(row[name])
+    return {name: tuple(np.array(sorted(points.items())).T) for name, points in curves.items()}
+
+
+def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:
+    """Training loss with its terms, and the validation scores, against the optimiser's steps.
+
+    Args:
+        curves: Steps and values by name, as ``read_curves`` gives them: ``train/...`` are the loss and its terms,
+            ``validation/...`` the scores; other names are left out.
+
+    Raises:
+        ValueError: No name begins so.
+    """
+    panels = {
+        group: {name.removeprefix(f"{group}/"): curve for name, curve in curves.items() if name.startswith(f"{group}/")}
+        for group in ("train", "validation")
+    }
+    panels = {group: names for group, names in panels.items() if names}
+    if not panels:
+        raise ValueError(f"loss curves need a quantity named train/... or validation/..., got {list(curves)}")
+    with rc_context(STYLE):
+        figure = Figure(figsize=(COLUMN * len(panels), 2.6), layout="constrained")
+        for ax, (group, names) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+            for (name, curve), (colour, dash) in zip(names.items(), cycle(LINES), strict=False):
+                _draw_smoothed(ax, *curve, color=colour, linestyle=dash, label=name)
+            ax.set(xlabel="step", title="Training loss and its terms" if group == "train" else "Validation")
+            ax.grid()
+            ax.legend()
+            if group == "train" and any((values > 0).any() for _, values in names.values()):
+                ax.set_yscale("log")
+    return figure
+
+
+def speed_against_error(
+    names: Sequence[str],
+    scores: Float[ndarray, "runs"],
+    times: Mapping[str, Float[ndarray, "runs"]],
+    score_label: str,
+    baselines: Mapping[str, float],
+) -> Figure:
+    """Score of each run against what it costs, one panel a kind of time.
+
+    Args:
+        names: What to call each run; the key below the panels.
+        scores: Score of each run.
+        times: Times of each run by axis label; NaN where unknown.
+        score_label: What the score is, with its unit.
+        baselines: Scores of the look-ups, drawn as lines over all times.
+    """
+    with rc_context(STYLE):
+        key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page
+        key_rows = (len(names) + len(baselines) + 1) // key_columns
+        figure = Figure(figsize=(PAGE, 2.4 + 0.15 * key_rows), layout="constrained")
+        axes = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]
+        for ax, (label, values) in zip(axes, times.items(), strict=True):
+            for run, (name, look) in enumerate(zip(names, cycle(MARKERS), strict=False)):
+                ax.plot(values[run], scores[run], linestyle="", markersize=5, label=name, **look)
+            for (name, score), (colour, dash) in zip(baselines.items(), cycle(LINES[1:]), strict=False):
+                ax.axhline(score, color=colour, linestyle=dash, linewidth=0.9, zorder=0, label=name)
+            ax.set_xlabel(label)
+            ax.grid()
+            known = values[np.isfinite(values)]
+            if len(known) and 0 < 10 * known.min() < known.max():
+                ax.set_xscale("log")
+                ticks = LogLocator(subs=(1, 2, 5))
+                ax.xaxis.set(major_locator=ticks, major_formatter="{x:g}", minor_locator=NullLocator())
+        axes[0].set_ylabel(score_label)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=key_columns)
+    return figure
+
+
+def _draw_smoothed(ax: Axes, steps, values, **line) -> None:
+    """A running mean over a fiftieth of the points, above the points themselves."""
+    window = max(1, len(values) // 50)
+    if window > 1:
+        ax.plot(steps, values, color=line["color"], alpha=0.2, linewidth=0.5)
+    mean = np.convolve(values, np.full(window, 1 / window), "valid")
+    ax.plot(steps[(window - 1) // 2 :][: len(mean)], mean, **line)

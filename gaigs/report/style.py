@@ -1,0 +1,37 @@
+"""The look that all figures share: sizes for a printed page, colours that survive colour blindness and grey print."""
+
+COLUMN, PAGE = 3.5, 7.16
+"""Widths of one column and of a page of two columns [inch]."""
+
+DPI = 200
+"""Pixels per inch of the files."""
+
+STYLE = {
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "0.88",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.3,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+}
+
+BLUE, ORANGE, GREEN, PURPLE, SKY, GREY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#6E6E6E"
+
+LINES = ((BLUE, "-"), (GREY, "--"), (ORANGE, "-."), (GREEN, ":"), (PURPLE, (0, (5, 1))), (SKY, (0, (1, 1))))
+"""Colour and dash of the first, second, ... line; the run's own model comes first, and unbroken."""
+
+MARKERS = tuple(
+    {"marker": marker, "color": colour, "markeredgecolor": "white", "markeredgewidth": 0.5}
+    for marker in "os^Dv"
+    for colour in (BLUE, ORANGE, GREEN, PURPLE, SKY)
+)
+"""Looks of the points of up to 25 runs."""

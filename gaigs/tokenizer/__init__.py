@@ -1,0 +1,22 @@
+"""Tokenizers embed the transmitter, the Gaussians and the scene as a whole."""
+
+from typing import NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+class Tokens(NamedTuple):
+    """What the scene mapping network sees; any width may be 0.
+
+    Attributes:
+        scene: CLS, one a transmitter (b, d_scene).
+        gaussians: E(P_x), one a Gaussian (n, d_x).
+        transmitters: E(P_TX) (b, d_tx).
+
+    Source: GAI-GS, "Multi-view Tokenizer".
+    """
+
+    scene: Float[Tensor, "b d_scene"]
+    gaussians: Float[Tensor, "n d_x"]
+    transmitters: Float[Tensor, "b d_tx"]

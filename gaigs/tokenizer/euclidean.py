@@ -1,0 +1,76 @@
+"""Fourier features of positions: metric structure, no scene token."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.data import Scene
+from gaigs.registry import register
+from gaigs.tokenizer import Tokens
+
+
+@register("tokenizer", "euclidean")
+class EuclideanTokenizer(nn.Module):
+    """Fourier features of the Gaussians, and of the transmitter through a two-layer network.
+
+    The transmitter's network runs once a transmitter, not once a Gaussian, so its width costs next to nothing.
+
+    Args:
+        scene: Positions are taken relative to the middle of the transmitters' box, and of the receivers.
+        gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a metre.
+        transmitter_octaves: The same for the transmitter. Its spectrum changes within half a wavelength.
+        hidden: Width of the transmitter network's hidden layer.
+        width: Width of E(P_TX).
+
+    Source: GAI-GS, "Multi-view Tokenizer"; Tancik et al., Fourier Features, 2020.
+    """
+
+    scene_width = 0
+
+    def __init__(
+        self,
+        scene: Scene,
+        gaussian_octaves: tuple[int, int],
+        transmitter_octaves: tuple[int, int],
+        hidden: int,
+        width: int,
+    ):
+        super().__init__()
+        positions = torch.stack([receiver.pose.position for receiver in scene.receivers])
+        self.register_buffer("receivers_middle", positions.mean(0))
+        self.register_buffer("transmitters_middle", (scene.lower + scene.upper) / 2)
+        self.register_buffer("gaussian_frequencies", octaves("gaussian_octaves", *gaussian_octaves))
+        self.register_buffer("transmitter_frequencies", octaves("transmitter_octaves", *transmitter_octaves))
+        self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
+        self.transmitter_width = width
+        features = 3 * (1 + 2 * len(self.transmitter_frequencies))
+        self.network = nn.Sequential(nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, width))
+
+    def forward(
+        self, means: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], transmitters: Float[Tensor, "b 3"]
+    ) -> Tokens:
+        """E(P_x) and E(P_TX); opacities are not looked at."""
+        gaussians = fourier_features(means - self.receivers_middle, self.gaussian_frequencies)
+        features = fourier_features(transmitters - self.transmitters_middle, self.transmitter_frequencies)
+        return Tokens(transmitters.new_zeros(len(transmitters), 0), gaussians, self.network(features))
+
+
+def octaves(option: str, lowest: int, highest: int) -> Float[Tensor, "octaves"]:
+    """Angular frequencies 2 pi 2^k [rad/m] for k from lowest to highest.
+
+    Raises:
+        ValueError: The range is empty.
+    """
+    if lowest > highest:
+        raise ValueError(f"tokenizer option {option} must be [lowest, highest], got [{lowest}, {highest}]")
+    return 2 * math.pi * 2.0 ** torch.arange(lowest, highest + 1)
+
+
+def fourier_features(
+    points: Float[Tensor, "*batch d"], frequencies: Float[Tensor, "octaves"]
+) -> Float[Tensor, "*batch features"]:
+    """[x, sin(w x), cos(w x)] for every coordinate and angular frequency w: d (1 + 2 octaves) numbers."""
+    phases = (points[..., None] * frequencies).flatten(-2)
+    return torch.cat((points, phases.sin(), phases.cos()), -1)

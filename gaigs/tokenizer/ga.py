@@ -1,0 +1,114 @@
+"""A scene token by geometric-algebra attention between the transmitter and the most opaque Gaussians."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.algebra import PROJECTIVE, SPACETIME
+from gaigs.algebra.embedding import embed_event, embed_point
+from gaigs.algebra.layers import EquivariantLinear, GATrBlock
+from gaigs.data import Scene
+from gaigs.registry import register
+from gaigs.tokenizer import Tokens
+
+ALGEBRAS = {"projective": (PROJECTIVE, embed_point), "spacetime": (SPACETIME, embed_event)}
+
+
+@register("tokenizer", "ga")
+class GATokenizer(nn.Module):
+    """CLS of a Geometric Algebra Transformer (GATr) over CLS, the transmitter and anchors; no position embeddings.
+
+    Tokens are [CLS, TX, anchors]: CLS is a learnable point, anchors are the centres of the most opaque Gaussians,
+    chosen anew at every call, the same for all transmitters, without a gradient. Each is a multivector, and two scalars
+    say which of the three it is. The linear read-out makes CLS depend on the room's axes, as the field does.
+
+    Positions are taken relative to the middle of the box around the transmitters and receivers and divided by half its
+    longest edge, one scale for all axes, so that they are of order one and motions remain motions.
+
+    Args:
+        scene: Its box and receivers fix that middle and scale.
+        anchors: Gaussians among the tokens; all of them where there are fewer. The paper's M, 16 as released.
+        blocks: GATr blocks; one as released.
+        multivectors: Multivector channels within the blocks, even and a multiple of ``heads``; 16 as released.
+        scalars: Scalar channels within the blocks, a multiple of ``heads``; 4 as released.
+        heads: Attention heads of a block; ours.
+        width: Numbers of the scene token; 16 as released.
+        algebra: ``projective``, G(3,0,1), whose motions are rotations, translations and mirrors (GATr's), or
+            ``spacetime``, G(3,1,0), rotations, boosts and mirrors about the middle (the paper's preliminaries); points
+            are events at time zero there.
+
+    Raises:
+        ValueError: An option is out of range, or the box is a single point.
+
+    Source: GAI-GS, "Multi-view Tokenizer"; Brehmer et al., Geometric Algebra Transformer, 2023.
+    """
+
+    gaussian_width = 0
+    transmitter_width = 0
+
+    def __init__(
+        self,
+        scene: Scene,
+        anchors: int = 16,
+        blocks: int = 1,
+        multivectors: int = 16,
+        scalars: int = 4,
+        heads: int = 4,
+        width: int = 16,
+        algebra: str = "projective",
+    ):
+        super().__init__()
+        if algebra not in ALGEBRAS:
+            raise ValueError(f"tokenizer option algebra must be one of {', '.join(ALGEBRAS)}, got {algebra!r}")
+        counts = {
+            "anchors": anchors, "blocks": blocks, "multivectors": multivectors, "scalars": scalars, "heads": heads,
+            "width": width,
+        }  # fmt: skip
+        for option, count in counts.items():
+            if count < 1:
+                raise ValueError(f"tokenizer option {option} must be at least 1, got {count}")
+        corners = torch.stack((scene.lower, scene.upper, *(receiver.pose.position for receiver in scene.receivers)))
+        lower, upper = corners.amin(0), corners.amax(0)
+        scale = (upper - lower).max() / 2
+        if not scale > 0:
+            raise ValueError(
+                f"transmitters and receivers must not all stand at one point, got {lower.tolist()}; check the positions"
+            )
+        self.register_buffer("middle", (lower + upper) / 2)
+        self.register_buffer("scale", scale)
+        self.anchors = anchors
+        self.scene_width = width
+        self.algebra, self.embed = ALGEBRAS[algebra]
+        self.cls = nn.Parameter(torch.zeros(3))
+        self.types = nn.Parameter(torch.randn(3, 2))
+        self.first = EquivariantLinear(self.algebra, (1, multivectors), (2, scalars))
+        self.blocks = nn.ModuleList(GATrBlock(self.algebra, multivectors, scalars, heads) for _ in range(blocks))
+        self.last = EquivariantLinear(self.algebra, (multivectors, 1), (scalars, 2))
+        self.read_out = nn.Linear(self.algebra.size + 2, width)
+
+    def forward(
+        self, means: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], transmitters: Float[Tensor, "b 3"]
+    ) -> Tokens:
+        """CLS for every transmitter.
+
+        Args:
+            means: Gaussian centres, world frame [m].
+            opacities: Their opacities; only their order matters.
+            transmitters: Positions, world frame [m].
+        """
+        b, m = len(transmitters), min(self.anchors, len(means))
+        anchors = means.detach()[opacities.topk(m).indices]
+        tx, anchors = ((positions - self.middle) / self.scale for positions in (transmitters, anchors))
+        points = self.embed(torch.cat((self.cls.expand(b, 1, 3), tx[:, None], anchors.expand(b, m, 3)), 1))
+        types = torch.cat((self.types[:2], self.types[2:].expand(m, 2)))
+
+        multivectors, scalars = self.first(points[..., None, :], types.expand(b, -1, -1))
+        reference = points.mean(1)
+        *blocks, final = self.blocks
+        for block in blocks:
+            multivectors, scalars = block(multivectors, scalars, reference)
+        # Only CLS is read, so the half of the final block in which tokens are by themselves runs for CLS alone.
+        multivectors, scalars = (x[:, :1] for x in final.attend(multivectors, scalars))
+        multivectors, scalars = self.last(*final.transform(multivectors, scalars, reference))
+        scene = self.read_out(torch.cat((multivectors.flatten(1), scalars.flatten(1)), -1))
+        return Tokens(scene, means.new_zeros(len(means), 0), transmitters.new_zeros(b, 0))

@@ -1,0 +1,36 @@
+"""The paper's tokenizer: geometric algebra and Euclidean embeddings together."""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.data import Scene
+from gaigs.registry import register, registry
+from gaigs.tokenizer import Tokens
+
+
+@register("tokenizer", "multiview")
+class MultiviewTokenizer(nn.Module):
+    """The scene token of ``ga`` beside the position embeddings of ``euclidean``.
+
+    Args:
+        scene: Handed to both.
+        ga: Configuration of the tokenizer that gives the scene token.
+        euclidean: Configuration of the tokenizer that gives the position embeddings.
+
+    Source: GAI-GS, "Multi-view Tokenizer".
+    """
+
+    def __init__(self, scene: Scene, ga: dict, euclidean: dict):
+        super().__init__()
+        self.ga = registry("tokenizer").build(ga, scene=scene)
+        self.euclidean = registry("tokenizer").build(euclidean, scene=scene)
+        self.scene_width = self.ga.scene_width
+        self.gaussian_width = self.euclidean.gaussian_width
+        self.transmitter_width = self.euclidean.transmitter_width
+
+    def forward(
+        self, means: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], transmitters: Float[Tensor, "b 3"]
+    ) -> Tokens:
+        """CLS of the one, E(P_x) and E(P_TX) of the other."""
+        _, gaussians, transmitters_ = self.euclidean(means, opacities, transmitters)
+        return Tokens(self.ga(means, opacities, transmitters).scene, gaussians, transmitters_)

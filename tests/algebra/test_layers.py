@@ -1,0 +1,208 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gaigs.algebra import PROJECTIVE, SPACETIME, Algebra
+from gaigs.algebra.embedding import embed_direction, embed_point
+from gaigs.algebra.layers import (
+    HOMOGENEOUS_FLOOR,
+    NORM_FLOOR,
+    EquivariantLinear,
+    GATrBlock,
+    GeometricAttention,
+    GeometricBilinear,
+    equivariant_norm,
+    gated_gelu,
+)
+
+algebras = pytest.mark.parametrize("algebra", [PROJECTIVE, SPACETIME, Algebra(2, 0, 1), Algebra(1, 1, 1)], ids=str)
+B, TOKENS, C, S = 2, 5, 4, 3
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def tokens(algebra):
+    return torch.randn(B, TOKENS, C, algebra.size).double(), torch.randn(B, TOKENS, S).double()
+
+
+def reference_of(multivectors):
+    return multivectors.mean((-3, -2))
+
+
+@algebras
+def test_linear_is_equivariant(algebra, tokens, check_equivariance):
+    layer = EquivariantLinear(algebra, (C, 6), (S, 2)).double()
+    torch.nn.init.normal_(layer.from_scalars.bias)
+    check_equivariance(algebra, lambda x: layer(x, tokens[1]), tokens[0])
+
+
+@algebras
+def test_linear_has_every_equivariant_map(algebra, make_versor):
+    """Matrices that commute with mirrors in general position, counted as the null space of that condition."""
+    eye = torch.eye(algebra.size, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(3)
+    actions = [algebra.sandwich(make_versor(algebra, 1, generator), eye).contiguous() for _ in range(6)]
+    condition = torch.cat([torch.kron(a, eye) - torch.kron(eye, a.mT.contiguous()) for a in actions])
+    singular = torch.linalg.svdvals(condition)
+    layer = EquivariantLinear(algebra, (1, 1), (1, 1)).double()
+    assert len(layer.weight) == (singular < 1e-9).sum()
+
+    outputs = []
+    for number in range(len(layer.weight)):
+        torch.nn.init.zeros_(layer.weight)
+        torch.nn.init.zeros_(layer.from_scalars.weight)
+        layer.weight.data[number] = 1
+        outputs.append(layer(eye[:, None], torch.zeros(algebra.size, 1).double())[0].flatten())
+    assert torch.linalg.matrix_rank(torch.stack(outputs)) == len(layer.weight)
+
+
+def test_the_projective_algebra_has_nine_maps_and_spacetime_five():
+    for algebra, maps in ((PROJECTIVE, 9), (SPACETIME, 5)):
+        assert len(EquivariantLinear(algebra, (1, 1), (1, 1)).weight) == maps
+
+
+@algebras
+def test_linear_mixes_scalars_and_channels(algebra, tokens):
+    layer = EquivariantLinear(algebra, (C, 6), (S, 2)).double()
+    multivectors, scalars = layer(*tokens)
+    assert multivectors.shape == (B, TOKENS, 6, algebra.size)
+    assert scalars.shape == (B, TOKENS, 2)
+    other, other_scalars = layer(tokens[0], tokens[1] + 1)
+    assert (other - multivectors)[..., 0].abs().min() > 1e-3
+    torch.testing.assert_close(other[..., 1:], multivectors[..., 1:])
+    assert (other_scalars - scalars).abs().min() > 1e-3
+    shifted = tokens[0].clone()
+    shifted[..., 0] += 1
+    assert (layer(shifted, tokens[1])[1] - scalars).abs().min() > 1e-3
+
+
+@algebras
+def test_bilinear_is_equivariant(algebra, tokens, check_equivariance):
+    layer = GeometricBilinear(algebra, C, S).double()
+    check_equivariance(algebra, lambda x: layer(x, tokens[1], reference_of(x)), tokens[0])
+
+
+def test_joins_need_the_reference_to_be_equivariant(check_equivariance):
+    layer = GeometricBilinear(PROJECTIVE, C, S).double()
+    multivectors, scalars = torch.randn(B, TOKENS, C, 16).double(), torch.randn(B, TOKENS, S).double()
+    reference = reference_of(multivectors)
+    with pytest.raises(AssertionError, match="not close"):
+        check_equivariance(PROJECTIVE, lambda x: layer(x, scalars, reference), multivectors)
+
+
+def test_bilinear_joins_points_to_lines():
+    layer = GeometricBilinear(PROJECTIVE, 2, 1)
+    points = embed_point(torch.randn(1, 1, 2, 3))
+    with_join, _ = layer(points, torch.zeros(1, 1, 1), points.mean((1, 2)))
+    without, _ = layer(points, torch.zeros(1, 1, 1), torch.zeros(1, 16))
+    lines = slice(8, 11)  # e12, e13, e23: the direction of a line, which no product of points has
+    assert not without[..., lines].any()
+    assert with_join[..., lines].abs().max() > 1e-3
+
+
+@algebras
+def test_attention_is_equivariant(algebra, tokens, check_equivariance):
+    layer = GeometricAttention(algebra, C, 2, heads=2).double()
+    check_equivariance(algebra, lambda x: layer(x, tokens[1][..., :2]), tokens[0])
+
+
+def test_attention_sees_the_distance_of_points():
+    layer = GeometricAttention(PROJECTIVE, 1, 1, heads=1).double()
+    points = torch.randn(2, 7, 3).double()
+    query, key = layer.features(embed_point(points))
+    logits = ((query @ layer.form) * key).sum(-1)
+    squared = (points[0] - points[1]).square().sum(-1)
+    torch.testing.assert_close(logits, 1 - squared / (1 + HOMOGENEOUS_FLOOR) ** 2)  # 1 of the two e123
+
+
+def test_attention_is_finite_for_directions():
+    layer = GeometricAttention(PROJECTIVE, 1, 1, heads=1)
+    directions = embed_direction(torch.randn(1, 4, 1, 3)).requires_grad_()
+    result, _ = layer(directions, torch.zeros(1, 4, 1))
+    result.sum().backward()
+    assert result.isfinite().all()
+    assert directions.grad.isfinite().all()
+
+
+@algebras
+def test_norm_is_equivariant(algebra, tokens, check_equivariance):
+    check_equivariance(algebra, lambda x: equivariant_norm(algebra, x, tokens[1]), tokens[0])
+
+
+@algebras
+def test_norm_gives_unit_size(algebra, tokens):
+    multivectors, scalars = equivariant_norm(algebra, 100 * tokens[0], tokens[1])
+    grades = [algebra.grade(multivectors, g) for g in range(algebra.dimension + 1)]
+    size = sum(algebra.inner(x, x).abs() for x in grades).mean(-1)
+    torch.testing.assert_close(size, torch.ones_like(size), rtol=1e-4, atol=0)
+    torch.testing.assert_close(scalars.mean(-1), torch.zeros(B, TOKENS).double())
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 10**6), st.floats(1e-30, 1e6))
+def test_norm_amplifies_no_more_than_its_floor_allows(seed, scale):
+    x = scale * torch.randn(1, 3, 16, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    for algebra in (PROJECTIVE, SPACETIME):
+        normed, _ = equivariant_norm(algebra, x, torch.zeros(1, 2))
+        assert (normed.abs() <= x.abs() * NORM_FLOOR**-0.5 * (1 + 1e-12)).all()
+
+
+@algebras
+def test_gated_gelu_is_equivariant(algebra, tokens, check_equivariance):
+    check_equivariance(algebra, lambda x: gated_gelu(x, tokens[1]), tokens[0])
+
+
+def test_the_check_finds_what_is_not_equivariant(check_equivariance):
+    multivectors = torch.randn(B, TOKENS, C, 16).double()
+    with pytest.raises(AssertionError, match="not close"):
+        check_equivariance(PROJECTIVE, lambda x: (torch.nn.functional.gelu(x), torch.zeros(1)), multivectors)
+
+
+@algebras
+def test_block_is_equivariant(algebra, tokens, check_equivariance):
+    block = GATrBlock(algebra, C, 2, heads=2).double()
+    check_equivariance(algebra, lambda x: block(x, tokens[1][..., :2], reference_of(x)), tokens[0])
+
+
+@algebras
+def test_block_ignores_the_order_of_tokens(algebra, tokens):
+    block = GATrBlock(algebra, C, 2, heads=2).double()
+    order = torch.tensor([3, 1, 4, 0, 2])
+    multivectors, scalars = tokens[0], tokens[1][..., :2]
+    result = block(multivectors, scalars, reference_of(multivectors))
+    permuted = block(multivectors[:, order], scalars[:, order], reference_of(multivectors))
+    torch.testing.assert_close(permuted[0], result[0][:, order])
+    torch.testing.assert_close(permuted[1], result[1][:, order])
+
+
+@algebras
+def test_block_has_finite_gradients_at_zero(algebra):
+    block = GATrBlock(algebra, C, 2, heads=2)
+    multivectors = torch.zeros(B, TOKENS, C, algebra.size, requires_grad=True)
+    scalars = torch.zeros(B, TOKENS, 2, requires_grad=True)
+    results = block(multivectors, scalars, torch.zeros(algebra.size))
+    (results[0].sum() + results[1].sum()).backward()
+    for tensor in (multivectors, scalars, *block.parameters()):
+        assert tensor.grad is not None
+        assert tensor.grad.isfinite().all()
+    assert multivectors.grad.any()
+
+
+@pytest.mark.parametrize("algebra", [PROJECTIVE, SPACETIME], ids=str)
+def test_block_has_the_right_gradients(algebra):
+    block = GATrBlock(algebra, 2, 1, heads=1).double()
+    multivectors, scalars = torch.randn(1, 3, 2, 16).double(), torch.randn(1, 3, 1).double()
+    inputs = multivectors.requires_grad_(), scalars.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x, s: block(x, s, reference_of(x)), inputs, fast_mode=True)
+
+
+def test_channels_that_cannot_be_shared_are_refused():
+    with pytest.raises(ValueError, match="make both multiples of 3"):
+        GeometricAttention(PROJECTIVE, 6, 4, heads=3)
+    with pytest.raises(ValueError, match="must be even, got 3"):
+        GeometricBilinear(PROJECTIVE, 3, 2)

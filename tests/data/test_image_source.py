@@ -1,0 +1,382 @@
+"""Physics of the simulated room: free space against Friis, paths against folded legs, blockers against samples."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.constants import speed_of_light
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from gaigs.data import Grid
+from gaigs.data.synthetic.image_source import (
+    MATERIALS,
+    Box,
+    Room,
+    array_elements,
+    bartlett,
+    frequency_offsets,
+    min_max,
+    passes,
+    permittivity,
+    reflection,
+    respond,
+    rss_dbm,
+    trace,
+)
+from gaigs.geometry import Pose, from_spherical
+
+FREQUENCY = 3e9
+WAVELENGTH = speed_of_light / FREQUENCY
+CARRIER = torch.zeros(1)
+WALLS = ("concrete", "glass", "plasterboard", "brick", "wood", "ceiling_board")
+HALL = Room((400.0, 400.0, 400.0), WALLS)
+"""So large that order 0 in its middle is free space."""
+
+ROOM = Room(
+    (7.0, 5.0, 3.0),
+    WALLS,
+    (
+        Box("cupboard", (2.0, 4.3, 0.0), (4.0, 5.0, 2.0), 12.0),
+        Box("shelf", (4.6, 1.6, 0.0), (5.0, 3.2, 1.9), 7.0),
+        Box("table", (1.0, 1.2, 0.7), (2.4, 2.0, 0.75), 3.0),
+        Box("column", (3.1, 2.6, 0.0), (3.4, 2.9, 3.0), 20.0),
+    ),
+)
+RECEIVER = torch.tensor([0.4, 0.5, 2.6], dtype=torch.float64)
+TRANSMITTERS = torch.tensor(
+    [[5.9, 3.1, 1.2], [1.5, 3.4, 0.4], [4.3, 0.6, 2.2], [6.3, 4.4, 0.3], [1.7, 1.6, 0.5]], dtype=torch.float64
+)
+
+
+def pose(position, angles=(0.0, 0.0, 0.0)):
+    return Pose.from_xyzw(position, Rotation.from_euler("ZYZ", angles, degrees=True).as_quat())
+
+
+def fold(points, size):
+    """Unfolded points back in the room: a triangle wave along each axis."""
+    return size - np.abs(points % (2 * size) - size)
+
+
+def test_free_space_follows_friis():
+    centre = pose((200.0, 200.0, 200.0))
+    for distance in (1.0, 3.7, 25.0):
+        transmitter = centre.position + torch.tensor([0.0, 0.0, distance])
+        response = respond(HALL, transmitter[None], centre, FREQUENCY, CARRIER, 0)[0, :, 0]
+        distances = (transmitter.double() - array_elements(centre, WAVELENGTH)).norm(dim=-1)
+        expected = WAVELENGTH / (4 * math.pi * distances) * torch.exp(-2j * math.pi * distances / WAVELENGTH)
+        torch.testing.assert_close(response, expected, rtol=1e-6, atol=0)
+
+
+def test_signal_strength_in_free_space():
+    centre = pose((200.0, 200.0, 200.0))
+    transmitters = centre.position + torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, 10.0]])
+    responses = respond(HALL, transmitters, centre, FREQUENCY, CARRIER, 0)
+    path_loss_db = [20 * math.log10(4 * math.pi * d / WAVELENGTH) for d in (5, 10)]
+    assert rss_dbm(responses, tx_power_dbm=20.0).tolist() == pytest.approx(
+        [20 - loss for loss in path_loss_db], abs=5e-3
+    )
+    assert rss_dbm(responses)[0] - rss_dbm(responses)[1] == pytest.approx(6.02, abs=1e-2)
+
+
+def test_elements_are_half_a_wavelength_apart_in_the_plane_of_the_array():
+    centre = pose((1.0, 2.0, 0.5), (20, 50, -70))
+    local = centre.local(array_elements(centre, WAVELENGTH).float()) / WAVELENGTH
+    places = {(round(x, 3), round(y, 3), abs(round(z, 3))) for x, y, z in local.tolist()}
+    steps = (-0.75, -0.25, 0.25, 0.75)
+    assert places == {(x, y, 0.0) for x in steps for y in steps}
+
+
+def test_patches_do_not_hear_from_behind_and_fade_as_the_cosine():
+    centre = pose((200.0, 200.0, 200.0), (0, 90, 0))
+    angles = torch.tensor([0.0, 60.0, 85.0, 95.0, 180.0]).deg2rad()
+    directions = torch.stack((angles.cos(), angles.sin(), 0 * angles), -1)  # the normal points along x
+    transmitters = centre.position + 20 * directions
+    responses = respond(HALL, transmitters, centre, FREQUENCY, CARRIER, 0).abs().mean((1, 2))
+    torch.testing.assert_close(responses / responses[0], angles.cos().clamp(min=0).double(), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (40, 125, 20), (-100, 60, 170)])
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 30), (77, 45), (180, 20), (301, 62), (359, 75)])
+def test_spectrum_peaks_at_the_direction_of_arrival(angles, azimuth, elevation):
+    centre = pose((200.0, 200.0, 200.0), angles)
+    direction = from_spherical(*torch.tensor([azimuth, elevation]).deg2rad())
+    transmitter = centre.position + 50 * centre.rotation @ direction
+    grid = Grid.degrees()
+    spectrum = bartlett(respond(HALL, transmitter[None], centre, FREQUENCY, CARRIER, 0), grid)[0]
+    row, column = divmod(int(spectrum.argmax()), 360)
+    assert (column, row + 1) == (azimuth, elevation)
+
+
+def test_spectrum_is_the_sum_over_steered_elements():
+    """Against the formula of the labels, element by element in the array's own frame."""
+    generator = torch.Generator().manual_seed(0)
+    centre = pose((2.0, 3.0, 1.0), (10, 40, 80))
+    responses = torch.randn(3, 16, 1, dtype=torch.complex128, generator=generator)
+    grid = Grid.degrees((1, 37, 90), (0, 123, 359))
+    local = (array_elements(centre, WAVELENGTH) - centre.position.double()) @ centre.rotation.double()
+    for b, (i, el), (j, az) in itertools.product(
+        range(3), enumerate(grid.elevations.tolist()), enumerate(grid.azimuths.tolist())
+    ):
+        delay = local[:, 0] * math.cos(az) * math.cos(el) + local[:, 1] * math.sin(az) * math.cos(el)
+        expected = (responses[b, :, 0] * torch.exp(-2j * math.pi / WAVELENGTH * delay)).sum().abs()
+        assert bartlett(responses, grid)[b, i, j].item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_band_spectrum_is_the_mean_power_of_its_frequencies():
+    generator = torch.Generator().manual_seed(0)
+    responses = torch.randn(2, 16, 5, dtype=torch.complex128, generator=generator)
+    grid = Grid.degrees(range(5, 90, 20), range(0, 360, 30))
+    single = torch.stack([bartlett(responses[..., k : k + 1], grid) for k in range(5)])
+    torch.testing.assert_close(bartlett(responses, grid), single.square().mean(0).sqrt())
+
+
+def test_a_wide_band_adds_powers_of_paths_and_a_carrier_their_fields():
+    generator = torch.Generator().manual_seed(0)
+    transmitters = 0.5 + torch.tensor([6.0, 4.0, 2.0]) * torch.rand(60, 3, generator=generator)
+    room, centre = Room(ROOM.size, WALLS), pose(RECEIVER.tolist(), (45, 120, 0))
+    band, carrier = (
+        rss_dbm(respond(room, transmitters, centre, 6e9, offsets, 2))
+        for offsets in (frequency_offsets(room, 2e9, 2), CARRIER)
+    )
+    paths = trace(room, transmitters, centre.position, 6e9, 2)
+    local = (paths.images - centre.position.double()) @ centre.rotation.double()
+    amplitudes = paths.gains.abs() * local[..., 2].clamp(min=0) / local.square().sum(-1) * speed_of_light / 6e9
+    incoherent = 10 * torch.log10((amplitudes / (4 * math.pi)).square().sum(-1))
+    assert (band - incoherent).square().mean().sqrt() < 0.7
+    assert (carrier - incoherent).square().mean().sqrt() > 1.5
+
+
+def test_a_band_is_sampled_finely_enough_for_its_longest_path():
+    offsets = frequency_offsets(ROOM, 500e6, 2)
+    assert offsets[[0, -1]].tolist() == [-250e6, 250e6]
+    spacing = (offsets[1] - offsets[0]).item()
+    corners = torch.tensor([[0.01, 0.01, 0.01], [6.99, 4.99, 2.99]], dtype=torch.float64)
+    longest = max((trace(ROOM, corners, c, FREQUENCY, 2).images - c).norm(dim=-1).max().item() for c in corners)
+    assert spacing < speed_of_light / longest
+
+
+def test_image_distances_are_the_shortest_ways_over_the_walls():
+    """Fermat: each path minimises its length among all that touch the same walls in the same order."""
+    size, start, end = np.array(ROOM.size), RECEIVER.numpy(), TRANSMITTERS[0].numpy()
+    walls = [(axis, side) for axis in range(3) for side in (0, 1)]
+
+    def shortest(order):
+        def length(free):
+            points = np.insert(free.reshape(-1, 2), 0, 0, axis=1)
+            stops = [start]
+            for point, (axis, side) in zip(points, order, strict=True):
+                stop = np.roll(point, axis)
+                stop[axis] = side * size[axis]
+                stops.append(stop)
+            return sum(np.linalg.norm(b - a) for a, b in itertools.pairwise([*stops, end]))
+
+        return minimize(length, np.ones(2 * len(order)), method="BFGS").fun
+
+    lengths = [np.linalg.norm(end - start), *(shortest([wall]) for wall in walls)]
+    for first, second in itertools.permutations(walls, 2):
+        if first[0] == second[0]:
+            lengths.append(shortest([first, second]))
+        elif first < second:  # at a corner only one of the two orders is a mirror path, the other is a detour
+            lengths.append(min(shortest([first, second]), shortest([second, first])))
+    distances = (trace(ROOM, TRANSMITTERS[:1], RECEIVER, FREQUENCY, 2).images[0] - RECEIVER).norm(dim=-1)
+    assert len(distances) == 25
+    np.testing.assert_allclose(np.sort(distances), np.sort(lengths), atol=1e-6)
+
+
+def test_third_order_has_every_image_once():
+    images = trace(ROOM, TRANSMITTERS[:1], RECEIVER, FREQUENCY, 3).images[0].numpy()
+    found = [tuple(np.floor(image / np.array(ROOM.size)).astype(int).tolist()) for image in images]
+    expected = [c for c in itertools.product(range(-3, 4), repeat=3) if sum(map(abs, c)) <= 3]
+    assert sorted(found) == sorted(expected)
+    np.testing.assert_allclose(fold(images, np.array(ROOM.size)), np.tile(TRANSMITTERS[0], (63, 1)), atol=1e-12)
+    np.testing.assert_array_equal(images[0], TRANSMITTERS[0])
+
+
+def test_gains_are_those_of_the_reflection_points():
+    """Legs folded back into the room: each ends on a wall, and each bounce has that wall's coefficient at its angle."""
+    empty = Room(ROOM.size, WALLS)
+    size, start = np.array(ROOM.size), RECEIVER.numpy()
+    paths = trace(empty, TRANSMITTERS, RECEIVER, FREQUENCY, 2)
+    for images, gains in zip(paths.images.numpy(), paths.gains, strict=True):
+        for image, gain in zip(images, gains, strict=True):
+            cell = np.floor(image / size).astype(int)
+            crossings = []
+            for axis, steps in enumerate(cell):
+                planes = range(1, steps + 1) if steps > 0 else range(0, steps, -1)
+                crossings += [((k * size[axis] - start[axis]) / (image - start)[axis], axis) for k in planes]
+            stops = [start, *(fold(start + t * (image - start), size) for t, _ in sorted(crossings)), fold(image, size)]
+            legs = [b - a for a, b in itertools.pairwise(stops)]
+            assert sum(map(np.linalg.norm, legs)) == pytest.approx(np.linalg.norm(image - start), rel=1e-12)
+            expected = 1
+            for stop, (_, axis), before, after in zip(stops[1:], sorted(crossings), legs, legs[1:], strict=False):
+                side = int(round(stop[axis] / size[axis]))
+                assert stop[axis] == pytest.approx(side * size[axis], abs=1e-9)
+                cosine = abs(before[axis]) / np.linalg.norm(before)
+                assert cosine == pytest.approx(abs(after[axis]) / np.linalg.norm(after))
+                te, tm = reflection(permittivity(WALLS[2 * axis + side], FREQUENCY), torch.tensor([cosine]))
+                expected = expected * (tm if axis == 2 else te).item()
+            assert gain.item() == pytest.approx(expected, rel=1e-9)
+
+
+def test_furniture_takes_its_loss_on_every_leg():
+    """Brute force: every leg is sampled each 0.2 mm and folded into the room."""
+    size, start = np.array(ROOM.size), RECEIVER.numpy()
+    furnished = trace(ROOM, TRANSMITTERS, RECEIVER, FREQUENCY, 2)
+    empty = trace(Room(ROOM.size, WALLS), TRANSMITTERS, RECEIVER, FREQUENCY, 2)
+    losses_db = -20 * torch.log10((furnished.gains / empty.gains).abs())
+    for images, losses in zip(furnished.images.numpy(), losses_db.tolist(), strict=True):
+        for image, loss_db in zip(images, losses, strict=True):
+            points = np.linspace(start, image, int(np.linalg.norm(image - start) / 2e-4))
+            legs, inside = np.floor(points / size), fold(points, size)
+            expected = 0.0
+            for box in ROOM.furniture:
+                hit = ((inside > box.lower) & (inside < box.upper)).all(-1)
+                expected += box.loss_db * len(np.unique(legs[hit], axis=0))
+            assert loss_db == pytest.approx(expected, abs=1e-9)
+    assert 0.2 < (losses_db > 0).double().mean() < 0.95  # both kinds of paths are there
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "hits"),
+    [
+        ((-1, 0.5, 0.5), (2, 0.5, 0.5), True),  # along an axis, through the middle
+        ((-1, 0.5, 0.5), (-0.1, 0.5, 0.5), False),  # ends before
+        ((1.1, 0.5, 0.5), (3, 0.5, 0.5), False),  # starts behind
+        ((0.4, 0.5, 0.5), (0.6, 0.5, 0.5), True),  # wholly inside
+        ((0.5, 0.5, 0.5), (0.5, 0.5, 9), True),  # starts inside
+        ((-1, 2, 0.5), (2, 2, 0.5), False),  # parallel, beside
+        ((-1, 1, 0.5), (2, 1, 0.5), False),  # runs in a face
+        ((-1, 0, 0), (2, 0, 0), False),  # runs along an edge
+        ((-1, -1, -1), (2, 2, 2), True),  # corner to corner
+        ((-1, 1, 0.5), (1, 3, 0.5), False),  # past a corner
+        ((-0.5, 0.5, 0.5), (0.5, 1.5, 0.5), False),  # touches an edge
+        ((-0.5, 0.4, 0.5), (0.5, 1.4, 0.5), True),  # cuts off an edge
+    ],
+)
+def test_segments_through_the_unit_cube(start, end, hits):
+    cube = torch.zeros(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
+    start, end = torch.tensor(start, dtype=torch.float64), torch.tensor(end, dtype=torch.float64)
+    assert passes(start, end, *cube).item() is hits
+    assert passes(end, start, *cube).item() is hits
+
+
+def test_channel_is_reciprocal():
+    there = trace(ROOM, TRANSMITTERS, RECEIVER, FREQUENCY, 2)
+    wavenumber = 2 * math.pi / WAVELENGTH
+    field = lambda paths, at: (
+        paths.gains * torch.polar(1 / (paths.images - at).norm(dim=-1), -wavenumber * (paths.images - at).norm(dim=-1))
+    ).sum(-1)
+    forward = field(there, RECEIVER)
+    back = torch.stack([field(trace(ROOM, RECEIVER[None], t, FREQUENCY, 2), t)[0] for t in TRANSMITTERS])
+    torch.testing.assert_close(forward, back, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("angles", [(90, 0, 0), (33, 71, -140)])
+def test_turning_everything_in_free_space_changes_nothing(angles):
+    turn = torch.tensor(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix(), dtype=torch.float32)
+    first = pose((200.0, 200.0, 200.0), (40, 125, 20))
+    turned = Pose(first.position, turn @ first.rotation)
+    offset = torch.tensor([[1.0, 0.7, -2.0], [3.0, -1.0, 0.5]])
+    grid = Grid.degrees(range(1, 91, 4), range(0, 360, 10))
+    here, there = (
+        bartlett(respond(HALL, first.position + r, p, FREQUENCY, CARRIER, 0), grid)
+        for r, p in ((offset, first), (offset @ turn.T, turned))
+    )
+    torch.testing.assert_close(here, there, rtol=1e-3, atol=1e-3 * here.max().item())
+
+
+def test_turning_room_receiver_and_transmitters_changes_nothing():
+    """A quarter turn about the vertical, (x, y) to (5 - y, x), which leaves the polarisation as it is."""
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    shift = torch.tensor([5.0, 0.0, 0.0], dtype=torch.float64)
+    move = lambda point: torch.as_tensor(point, dtype=torch.float64) @ turn.T + shift
+    boxes = []
+    for box in ROOM.furniture:
+        corners = torch.stack((move(box.lower), move(box.upper)))
+        boxes.append(Box(box.name, tuple(corners.amin(0).tolist()), tuple(corners.amax(0).tolist()), box.loss_db))
+    west, east, south, north, floor, ceiling = WALLS
+    turned = Room((5.0, 7.0, 3.0), (north, south, west, east, floor, ceiling), tuple(boxes))
+    first = pose(RECEIVER.tolist(), (45, 130, 20))
+    second = Pose(move(first.position).float(), turn.float() @ first.rotation)
+    grid = Grid.degrees(range(1, 91, 4), range(0, 360, 10))
+    offsets = frequency_offsets(ROOM, 200e6, 2)
+    here = bartlett(respond(ROOM, TRANSMITTERS, first, FREQUENCY, offsets, 2), grid)
+    there = bartlett(respond(turned, move(TRANSMITTERS), second, FREQUENCY, offsets, 2), grid)
+    torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4 * here.max().item())
+    # The receiver left behind sees something else.
+    other = bartlett(
+        respond(turned, move(TRANSMITTERS), Pose(second.position, first.rotation), FREQUENCY, offsets, 2), grid
+    )
+    assert (here - other).abs().max() > 0.1 * here.max()
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_reflection_is_passive_and_total_at_grazing(material):
+    te, tm = reflection(permittivity(material, 5e9), torch.linspace(0, 1, 200, dtype=torch.float64))
+    assert te.abs().max() <= 1
+    assert tm.abs().max() <= 1
+    assert te[0].item() == pytest.approx(-1)
+    assert tm[0].item() == pytest.approx(-1)
+    torch.testing.assert_close(te[-1], -tm[-1])
+
+
+def test_reflection_of_glass_like_and_metal_surfaces():
+    epsilon = 4.0
+    straight = torch.ones(1, dtype=torch.float64)
+    te, _ = reflection(complex(epsilon), straight)
+    assert te.item() == pytest.approx(-1 / 3)  # (1 - n) / (1 + n) with n = 2
+    brewster = math.atan(2.0)
+    _, tm = reflection(complex(epsilon), straight * math.cos(brewster))
+    assert abs(tm.item()) < 1e-12
+    te, tm = reflection(permittivity("metal", 5e9), straight * 0.5)
+    assert te.item() == pytest.approx(-1, abs=1e-3)
+    assert tm.item() == pytest.approx(1, abs=1e-2)
+
+
+def test_permittivity_is_that_of_the_recommendation():
+    """Its own form of the imaginary part: 17.98 sigma / f with f in GHz."""
+    at_2, at_10 = permittivity("concrete", 2e9), permittivity("concrete", 10e9)
+    assert at_2.real == at_10.real == 5.24
+    assert at_2.imag == pytest.approx(-17.98 * 0.0462 * 2**0.7822 / 2, rel=1e-3)
+    assert at_10.imag == pytest.approx(-17.98 * 0.0462 * 10**0.7822 / 10, rel=1e-3)
+
+
+def test_labels_span_zero_to_one():
+    labels = min_max(torch.rand(4, 5, 6) + 3)
+    assert labels.amin((1, 2)).tolist() == [0] * 4
+    assert labels.amax((1, 2)).tolist() == [1] * 4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"room": Room(ROOM.size, ("marzipan",) * 6)}, "unknown material 'marzipan'; there are: concrete, brick"),
+        ({"frequency": 920e6}, r"frequency must lie in 1e9\.\.40e9 Hz, where materials are tabulated, got 9\.2e\+08"),
+        ({"offsets": torch.tensor([-4e9])}, "frequencies must be positive"),
+        ({"order": -1}, "order must be the largest number of reflections, 0 or more, got -1"),
+        ({"transmitters": torch.tensor([[1.0, 1.0, 3.5]])}, r"inside the room of .* got \[1\.0, 1\.0, 3\.5\]"),
+        ({"transmitters": torch.tensor([[3.2, 2.7, 1.0]])}, r"outside its furniture, got \[3\.2, 2\.7, 1\.0\]"),
+        ({"pose": pose((3.2, 2.7, 1.0))}, "outside its furniture"),
+        ({"transmitters": torch.tensor([[math.nan, 1.0, 1.0]])}, "inside the room"),
+    ],
+)
+def test_impossible_scenes_are_refused(change, message):
+    scene = {
+        "room": ROOM,
+        "transmitters": TRANSMITTERS,
+        "pose": pose(RECEIVER.tolist()),
+        "frequency": FREQUENCY,
+        "offsets": CARRIER,
+        "order": 1,
+    }
+    with pytest.raises(ValueError, match=message):
+        respond(**{**scene, **change})
+
+
+@pytest.mark.parametrize("bandwidth", [0, -1e6, math.inf, math.nan])
+def test_impossible_bands_are_refused(bandwidth):
+    with pytest.raises(ValueError, match="bandwidth must be positive"):
+        frequency_offsets(ROOM, bandwidth, 2)

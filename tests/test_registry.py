@@ -1,0 +1,246 @@
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+import gaigs
+from gaigs.registry import KINDS, Registry, find_holders, register, registries, registry
+
+
+class Waveguide:
+    def __init__(self, scene, width: float, modes: int = 3):
+        self.scene, self.width, self.modes = scene, width, modes
+
+
+def horn(*, gain_db=0.0, **rest):
+    return gain_db, rest
+
+
+@pytest.fixture
+def models():
+    """A registry of two components, apart from the one of the process."""
+    models = Registry("model")
+    models.register("waveguide")(Waveguide)
+    models.register("horn")(horn)
+    return models
+
+
+@pytest.fixture
+def plugins(tmp_path, monkeypatch):
+    """Writes files below ./plugins of an empty working directory; what is imported from there is forgotten again."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+
+    def write(path, text):
+        file = tmp_path / "plugins" / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+        return file
+
+    yield write
+    for module in [name for name in sys.modules if name.split(".")[0] in ("plugins", "cavity")]:
+        del sys.modules[module]
+    for kind in KINDS:
+        registered = registries[kind]._registered
+        for name in [
+            name
+            for name, component in registered.items()
+            if component.__module__.split(".")[0] in ("plugins", "cavity")
+        ]:
+            del registered[name]
+
+
+def component(kind, name, body="value = 1"):
+    return f"from gaigs.registry import register\n\n\n@register({kind!r}, {name!r})\nclass Component:\n    {body}\n"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_built_in_file_bears_the_registered_name(kind):
+    holders, unreadable = find_holders(kind)
+    folder = Path(gaigs.__path__[0]) / kind
+    assert not unreadable
+    assert [h.name for h in holders if h.file and h.file.parent == folder] == sorted(
+        file.stem for file in folder.glob("[!_]*.py") if "@register(" in file.read_text()
+    )
+
+
+def test_registry_of_an_unknown_kind_suggests_the_nearest():
+    with pytest.raises(
+        ValueError, match=r"'tokeniser' \(did you mean 'tokenizer'\?\); there are: tokenizer, projection"
+    ):
+        registry("tokeniser")
+    with pytest.raises(ValueError, match="unknown kind"):
+        register("antenna", "horn")
+
+
+# --- names taken and unknown ---
+
+
+def test_a_taken_name_tells_who_holds_it_and_who_asks(models):
+    with pytest.raises(ValueError, match=r"model 'horn' is held by \w+.horn, and \w+.Waveguide asks for it"):
+        models.register("horn")(Waveguide)
+    assert models.get("horn") is horn
+
+
+def test_a_built_in_name_is_taken_before_its_file_is_imported():
+    with pytest.raises(
+        ValueError, match=r"'mercator' is held by gaigs.projection.mercator\.py, and \w+.Waveguide asks"
+    ):
+        Registry("projection").register("mercator")(Waveguide)
+
+
+def test_a_module_loaded_anew_may_register_again(models):
+    reloaded = type("Waveguide", (), {"__module__": Waveguide.__module__, "__qualname__": Waveguide.__qualname__})
+    models.register("waveguide")(reloaded)
+    assert models.get("waveguide") is reloaded
+
+
+def test_an_unknown_name_suggests_the_nearest_and_lists_all(models):
+    with pytest.raises(
+        ValueError, match=r"unknown model 'wavegiude' \(did you mean 'waveguide'\?\); there are:.* horn\b"
+    ):
+        models.get("wavegiude")
+
+
+# --- build ---
+
+
+def test_build_passes_options_and_the_context_that_is_asked_for(models):
+    config = OmegaConf.create({"lambda_": 0.33, "model": {"name": "waveguide", "width": "${lambda_}", "modes": 2}})
+    built = models.build(config.model, scene="room", frequency=9e8)
+    assert vars(built) == {"scene": "room", "width": 0.33, "modes": 2}
+
+
+def test_build_hands_over_plain_python(models):
+    config = {"name": "horn", "taper": OmegaConf.create([1, "${.0}"])}
+    assert models.build(config, scene="room") == (0.0, {"taper": [1, 1], "scene": "room"})
+    assert type(models.build(config)[1]["taper"]) is list
+    assert config.keys() == {"name", "taper"}, "the caller's configuration is left as it was"
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"width": 1}, r"a model configuration needs the key 'name', got {'width': 1}; there are:.* horn,.* waveguide"),
+        ({"name": "waveguide"}, r"model 'waveguide' needs option width; it has: width, modes"),
+        (
+            {"name": "waveguide", "widht": 1, "width": 1},
+            r"'waveguide' has no option 'widht' \(did you mean 'width'\?\); it has: width, modes",
+        ),
+        ({"name": "waveguide", "width": 1, "scene": 2}, r"'waveguide' has no option 'scene'; it has: width, modes"),
+        ({"name": "horn", "scene": 2}, r"'horn' has no option 'scene'; it has: gain_db"),
+        (OmegaConf.create({"name": "waveguide", "width": "???"}), r"needs values for width, which stand at '\?\?\?'"),
+    ],
+)
+def test_build_refuses(models, config, message):
+    with pytest.raises(ValueError, match=message):
+        models.build(config, scene="room")
+
+
+@pytest.mark.parametrize("config", ["horn", ["horn"], OmegaConf.create(["horn"]), None])
+def test_build_needs_a_mapping(models, config):
+    with pytest.raises(TypeError, match="must be a mapping with the key 'name', got"):
+        models.build(config)
+
+
+# --- files dropped in ./plugins ---
+
+
+def test_of_dropped_files_only_the_one_asked_for_is_imported(plugins):
+    plugins("slot.py", component("pooling", "slot"))
+    plugins("patch.py", component("pooling", "patch"))
+    assert {"slot", "patch"} <= set(registry("pooling").names())
+    assert "slot" not in registry("model").names()
+    assert not any(module.startswith("plugins") for module in sys.modules)
+    assert registry("pooling").build({"name": "slot"}).value == 1
+    assert "plugins.slot" in sys.modules
+    assert "plugins.patch" not in sys.modules
+
+
+def test_a_dropped_folder_is_a_package(plugins):
+    plugins("dipole/__init__.py", "LENGTH = 0.16\n")
+    plugins("dipole/half_wave.py", component("model", "half_wave", "from . import LENGTH as value"))
+    plugins("dipole/_private.py", component("model", "private"))
+    assert registry("model").build({"name": "half_wave"}).value == 0.16
+    assert "private" not in registry("model").names()
+
+
+@pytest.mark.parametrize("layout", ["cavity/cavity/box.py", "cavity/src/cavity/box.py"])
+def test_a_dropped_project_need_not_be_installed(plugins, layout):
+    plugins(
+        "cavity/pyproject.toml",
+        '[project]\nname = "Cavity"\n[project.entry-points."gaigs.model"]\nbox = "cavity.box:Box"\n',
+    )
+    plugins(layout, "from . import MODES\n\n\nclass Box:\n    modes = MODES\n")
+    plugins(Path(layout).with_name("__init__.py"), "MODES = 7\n")
+    assert registry("model").build({"name": "box"}).modes == 7
+
+
+def test_names_in_comments_strings_and_functions_are_no_names(plugins):
+    plugins(
+        "hidden.py",
+        '"""\n@register("model", "in_docstring")\n"""\n# @register("model", "in_comment")\n'
+        'def local():\n    @register("model", "in_function")\n    class Local: ...\n',
+    )
+    assert not {"in_docstring", "in_comment", "in_function"} & set(registry("model").names())
+
+
+@pytest.mark.parametrize(
+    ("body", "cause"),
+    [
+        ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
+        ("value = 1 / 0", "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_a_plugin_that_fails_hurts_only_who_asks_for_it(plugins, body, cause):
+    plugins("broken.py", component("model", "broken", body))
+    plugins("sound.py", component("model", "sound"))
+    assert registry("model").build({"name": "sound"}).value == 1
+    with pytest.raises(ImportError, match=rf"model 'broken' of plugins.broken\.py cannot be loaded: {cause}"):
+        registry("model").get("broken")
+
+
+def test_files_that_cannot_be_read_hurt_only_who_finds_no_name(plugins):
+    plugins("typo.py", component("model", "typo", "value = = 1"))
+    plugins("cavity/pyproject.toml", "[project\n")
+    plugins("sound.py", component("model", "sound"))
+    assert registry("model").build({"name": "sound"}).value == 1
+    with pytest.raises(
+        ValueError, match=r"unknown model 'typo'.*; cannot read plugins.cavity.*; cannot read .*typo\.py"
+    ) as error:
+        registry("model").get("typo")
+    assert "invalid syntax (typo.py, line 6)" in str(error.value)
+
+
+def test_a_dropped_file_may_not_take_a_name(plugins):
+    plugins("map.py", component("projection", "mercator"))
+    with pytest.raises(ValueError, match=r"'mercator' is held by gaigs.*mercator\.py, and plugins.map\.py asks for it"):
+        registry("projection").get("mercator")
+    registry("projection").get("equirectangular")
+
+
+def test_a_plugin_may_not_take_a_registered_name(plugins, models):
+    plugins("flare.py", component("model", "horn"))
+    with pytest.raises(ValueError, match=r"'horn' is held by \w+\.horn, and plugins.flare\.py asks for it"):
+        models.get("horn")
+
+
+def test_a_module_of_the_same_name_from_elsewhere_is_not_taken_for_the_plugin(plugins, tmp_path, monkeypatch):
+    plugins("slot.py", component("model", "slot"))
+    registry("model").get("slot")
+    other = tmp_path / "elsewhere"
+    plugins("../elsewhere/plugins/slot.py", component("model", "notch"))
+    monkeypatch.chdir(other)
+    with pytest.raises(
+        ImportError, match=r"model 'notch' of plugins.slot\.py .* is imported as 'plugins.slot' already"
+    ):
+        registry("model").get("notch")
+
+
+@pytest.mark.parametrize(("target", "file"), [("cavity.box:Box.open", "box.py"), ("cavity.horn", "horn.py")])
+def test_an_entry_point_names_an_attribute_or_a_module_that_registers(plugins, target, file):
+    plugins("cavity/pyproject.toml", f'[project]\n[project.entry-points."gaigs.model"]\nopened = "{target}"\n')
+    plugins("cavity/cavity/box.py", "class Box:\n    @staticmethod\n    def open(value=1):\n        return Box()\n")
+    plugins("cavity/cavity/horn.py", component("model", "opened"))
+    assert type(registry("model").build({"name": "opened"})).__module__ == f"cavity.{file.removesuffix('.py')}"

@@ -1,0 +1,146 @@
+import pytest
+import torch
+
+from gaigs.data import Receiver, Scene
+from gaigs.geometry import Pose
+from gaigs.registry import registry
+from gaigs.tokenizer.ga import GATokenizer
+
+N, B = 40, 3
+both = pytest.mark.parametrize("algebra", ["projective", "spacetime"])
+
+
+def make_scene(shift=0.0, scale=1.0):
+    place = lambda *coordinates: scale * torch.tensor(coordinates) + shift
+    receiver = Receiver("gateway", Pose(place(5.0, 0.3, 1.0), torch.eye(3)))
+    return Scene((receiver,), place(0.0, 0.0, 0.0), place(4.0, 3.0, 2.0), None, "none")
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def room():
+    """Gaussian centres [m], their opacities, transmitters [m]."""
+    return 3 * torch.randn(N, 3), torch.rand(N), 4 * torch.rand(B, 3)
+
+
+@both
+def test_widths_are_those_of_the_tokens(room, algebra):
+    tokenizer = registry("tokenizer").build({"name": "ga", "width": 7, "algebra": algebra}, scene=make_scene())
+    tokens = tokenizer(*room)
+    assert tokens.scene.shape == (B, tokenizer.scene_width) == (B, 7)
+    assert tokens.gaussians.shape == (N, tokenizer.gaussian_width) == (N, 0)
+    assert tokens.transmitters.shape == (B, tokenizer.transmitter_width) == (B, 0)
+    assert tokens.scene.isfinite().all()
+
+
+@both
+def test_only_the_most_opaque_gaussians_count(room, algebra):
+    tokenizer = GATokenizer(make_scene(), anchors=5, algebra=algebra)
+    means, opacities, transmitters = room
+    scene = tokenizer(*room).scene
+    ranks = opacities.argsort(descending=True)
+    for moved, counts in ((ranks[5:], False), (ranks[4], True)):
+        other = means.clone()
+        other[moved] += 1
+        assert torch.equal(tokenizer(other, opacities, transmitters).scene, scene) != counts
+    raised = opacities.clone()
+    raised[ranks[20]] = 2  # chosen anew at every call
+    assert not torch.allclose(tokenizer(means, raised, transmitters).scene, scene)
+
+
+@both
+def test_the_order_of_gaussians_does_not_count(room, algebra):
+    tokenizer = GATokenizer(make_scene(), algebra=algebra)
+    means, opacities, transmitters = room
+    order = torch.randperm(N)
+    torch.testing.assert_close(
+        tokenizer(means[order], opacities[order], transmitters).scene, tokenizer(*room).scene, rtol=1e-4, atol=1e-5
+    )
+
+
+@both
+def test_each_transmitter_has_a_token_of_its_own(room, algebra):
+    tokenizer = GATokenizer(make_scene(), algebra=algebra)
+    means, opacities, transmitters = room
+    scene = tokenizer(*room).scene
+    for transmitter, token in zip(transmitters, scene, strict=True):
+        alone = tokenizer(means, opacities, transmitter[None]).scene
+        torch.testing.assert_close(alone[0], token, rtol=1e-4, atol=1e-5)
+    assert torch.pdist(scene).min() > 1e-3
+
+
+@both
+def test_the_origin_and_the_unit_of_length_do_not_count(room, algebra):
+    tokenizers = []
+    for scene in (make_scene(), make_scene(shift=20.0, scale=3.0)):
+        torch.manual_seed(4)
+        tokenizers.append(GATokenizer(scene, algebra=algebra).double())
+    means, opacities, transmitters = (x.double() for x in room)
+    torch.testing.assert_close(
+        tokenizers[1](3 * means + 20, opacities, 3 * transmitters + 20).scene,
+        tokenizers[0](means, opacities, transmitters).scene,
+        rtol=1e-5,  # the scene's corners are float32
+        atol=1e-6,
+    )
+
+
+def test_fewer_gaussians_than_anchors_are_all_anchors(room):
+    tokenizer = GATokenizer(make_scene(), anchors=16)
+    means, opacities, transmitters = room
+    scene = tokenizer(means[:3], opacities[:3], transmitters).scene
+    assert scene.shape == (B, 16)
+    few = GATokenizer(make_scene(), anchors=3)
+    few.load_state_dict(tokenizer.state_dict())
+    torch.testing.assert_close(few(means[:3], opacities[:3], transmitters).scene, scene)
+
+
+@both
+def test_gradients_reach_every_parameter_but_not_the_anchors(room, algebra):
+    tokenizer = GATokenizer(make_scene(), blocks=2, algebra=algebra)
+    means, opacities, transmitters = (x.requires_grad_() for x in room)
+    tokenizer(means, opacities, transmitters).scene.square().sum().backward()
+    assert means.grad is None
+    assert opacities.grad is None
+    assert transmitters.grad.any()
+    for name, parameter in tokenizer.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any(), name
+
+
+@both
+def test_a_network_of_other_size(room, algebra):
+    tokenizer = GATokenizer(
+        make_scene(), anchors=1, blocks=2, multivectors=6, scalars=2, heads=2, width=3, algebra=algebra
+    )
+    assert tokenizer(*room).scene.shape == (B, 3)
+    assert len(tokenizer.blocks) == 2
+
+
+def test_tokens_have_the_dtype_of_the_input(room):
+    tokens = GATokenizer(make_scene()).double()(*(x.double() for x in room))
+    assert {tensor.dtype for tensor in tokens} == {torch.float64}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"algebra": "conformal"}, "projective, spacetime, got 'conformal'"),
+        ({"anchors": 0}, "anchors must be at least 1, got 0"),
+        ({"scalars": 2}, "make both multiples of 4"),
+        ({"multivectors": 3, "heads": 1}, "must be even, got 3"),
+    ],
+)
+def test_impossible_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        GATokenizer(make_scene(), **options)
+
+
+def test_a_room_of_one_point_is_refused():
+    scene = Scene((Receiver("gateway", Pose(torch.ones(3), torch.eye(3))),), torch.ones(3), torch.ones(3), None, "none")
+    with pytest.raises(ValueError, match="one point"):
+        GATokenizer(scene)
