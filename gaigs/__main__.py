@@ -7,27 +7,42 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import CompactHydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from gaigs import configuration
 
-log = logging.getLogger("gaigs")
-
 
 def run(config: DictConfig) -> None:
-    """Runs one configuration in Hydra's run folder."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    OmegaConf.resolve(config)
-    OmegaConf.save(config, folder / "config.yaml")
-    from gaigs import experiment  # torch and Lightning load once the configuration has proved good
+    """Runs one configuration in Hydra's run folder.
 
+    Raises:
+        CompactHydraException: What a user can mend, as one message; Hydra prints it without the traceback and exits
+            with 1, after the other jobs of a multirun.
+    """
+    if missing := sorted(OmegaConf.missing_keys(config)):
+        raise CompactHydraException(f"gaigs: {', '.join(missing)} must be set, e.g. {missing[0]}=VALUE")
+    # Slow to import: here, once the configuration has proved good.
+    from lightning.pytorch.utilities.exceptions import MisconfigurationException
+
+    from gaigs import experiment
+
+    for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
+        logging.getLogger(name).setLevel(logging.WARNING)
+    settings = HydraConfig.get()
     try:
-        experiment.run(OmegaConf.to_container(config), folder)
-    except (ValueError, TypeError, FileNotFoundError, ImportError, RuntimeError) as error:
-        if log.isEnabledFor(logging.DEBUG):
-            raise
-        # What a user can mend is one line; the traceback is in the log of hydra.verbose=true.
-        raise SystemExit(f"gaigs: {error}") from None
+        experiment.run(OmegaConf.to_container(config, resolve=True), Path(settings.runtime.output_dir))
+    except KeyboardInterrupt as stop:
+        mode = "sweep" if settings.mode is RunMode.MULTIRUN else "run"
+        folder = f"hydra.{mode}.dir={settings[mode].dir}"
+        print(f"gaigs: {str(stop) or 'stopped'}; the same command with {folder} goes on", file=sys.stderr)
+        raise SystemExit(130) from None  # as shells report Ctrl-C
+    except (
+        ValueError, TypeError, OSError, ImportError, RuntimeError, OmegaConfBaseException, MisconfigurationException
+    ) as error:  # fmt: skip
+        raise CompactHydraException(f"gaigs: {error}") from error
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ def read(path: str | Path) -> dict:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no checkpoint of gaigs.
+        ValueError: It is no checkpoint of gaigs, or not a whole one.
     """
     path = Path(path)
     if not path.is_file():
@@ -25,9 +25,10 @@ def read(path: str | Path) -> dict:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises whatever its unpickler or archive reader meets
-        raise ValueError(f"{path} cannot be read as a checkpoint: {error}") from error
+        cause = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise ValueError(f"{path} must be a checkpoint of gaigs, and is damaged or another file ({cause})") from error
     if not isinstance(content, dict) or KEY not in content:
-        raise ValueError(f"{path} is no checkpoint of gaigs: it lacks the entry {KEY!r}")
+        raise ValueError(f"{path} must be a checkpoint of gaigs, and lacks the entry {KEY!r}")
     return content
 
 
@@ -42,11 +43,15 @@ def load(path: str | Path) -> Model:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no checkpoint of gaigs, or its components are not installed here.
+        ValueError: It is no checkpoint of gaigs, its components are not installed here, or its weights are not theirs.
     """
     content = read(path)
     model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(content[KEY]["scene"]))
     prefix = "model."
     weights = {key.removeprefix(prefix): value for key, value in content["state_dict"].items() if key.startswith(prefix)}
-    model.load_state_dict(weights)
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:  # one line a tensor
+        defects = " ".join(str(error).split())
+        raise ValueError(f"{path} holds weights that do not fit its configuration in this version: {defects}") from error
     return model.eval()

@@ -27,7 +27,7 @@ def prune(gaussians: Gaussians, optimizer: Optimizer, gone: Bool[Tensor, "n"]) -
         ValueError: None would be left.
     """
     if gone.all():
-        raise ValueError(f"pruning would remove all {len(gone)} Gaussians; lower the opacity bound or the learning rates")
+        raise ValueError(f"pruning must leave a Gaussian, and all {len(gone)} would go; lower the opacity bound")
     keep = ~gone
     _rearrange(gaussians, optimizer, lambda values: values[keep], lambda state: state[keep])
 
@@ -37,19 +37,16 @@ def clone(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, "n"])
 
     1 - (1 - a')² = a gives a' = 1 - sqrt(1 - a); the signal is that of the original. Copies start without momentum.
     """
-    opacities = gaussians.opacities.detach()
-    # a' = 1 - sqrt(1 - a), and its logit, without cancellation for small a
-    shared = -torch.expm1(0.5 * torch.log1p(-opacities[chosen]))
-    _append(gaussians, optimizer, chosen)
-    copies = torch.cat((chosen, chosen.new_ones(int(chosen.sum()))))
+    copies = _append(gaussians, optimizer, chosen)
     with torch.no_grad():
-        gaussians.opacity_logits[copies] = shared.logit().repeat(2)
+        # The logit of a' in that of a, which loses no digits where a is near 0 or 1.
+        logits = gaussians.opacity_logits[copies]
+        gaussians.opacity_logits[copies] = nn.functional.softplus(logits).div(2).expm1().log()
 
 
 def split(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, "n"], generator: torch.Generator) -> None:
     """Replaces each chosen Gaussian by two smaller ones drawn from it."""
-    _append(gaussians, optimizer, chosen)
-    halves = torch.cat((chosen, chosen.new_ones(int(chosen.sum()))))
+    halves = _append(gaussians, optimizer, chosen)
     with torch.no_grad():
         scales, quats = gaussians.scales[halves], gaussians.quats[halves]
         steps = torch.randn(scales.shape, generator=generator).to(scales) * scales
@@ -57,13 +54,15 @@ def split(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, "n"],
         gaussians.log_scales[halves] -= math.log(SHRINK)
 
 
-def _append(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, "n"]) -> None:
+def _append(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, "n"]) -> Bool[Tensor, "m"]:
+    """Puts copies of the chosen behind all others; True for both of each pair."""
     _rearrange(
         gaussians,
         optimizer,
         lambda values: torch.cat((values, values[chosen])),
         lambda state: torch.cat((state, torch.zeros_like(state[chosen]))),
     )
+    return torch.cat((chosen, chosen[chosen]))
 
 
 def _rearrange(
@@ -75,7 +74,7 @@ def _rearrange(
     """New parameters in place of the old ones, in the module and in the optimizer."""
     for name in Gaussians.PARAMETERS:
         old = getattr(gaussians, name)
-        new = nn.Parameter(pick(old.detach()))
+        new = nn.Parameter(pick(old.detach()), old.requires_grad)
         setattr(gaussians, name, new)
         for group in optimizer.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]

@@ -3,36 +3,33 @@
 import json
 import logging
 import platform
-import shutil
+import signal
 import statistics
 import time
 from collections.abc import Callable
-from datetime import timedelta
 from pathlib import Path
 
 import lightning
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint, RichProgressBar, Timer
+from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.loggers import CSVLogger, Logger
+from omegaconf import OmegaConf
 from rich.console import Console
 
 from gaigs import checkpoint
 from gaigs.data import Links
 from gaigs.model import Model
-from gaigs.registry import registry
+from gaigs.registry import call, registry
 from gaigs.report.figures import write_figures
 from gaigs.report.table import metrics_table, verdict
 from gaigs.training.batches import Batches, Pass, take
-from gaigs.training.callbacks import DensityControl, StopCleanly
+from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine
 from gaigs.training.metrics import spectrum_scores, summarise
 from gaigs.training.module import Training
 
 LOOK_UPS = ({"name": "mean"}, {"name": "knn", "k": 3})
 """What every result stands beside."""
-
-SAVE_EVERY = timedelta(seconds=15)
-"""What a killed run loses at most."""
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +39,8 @@ def run(config: dict, folder: Path) -> dict:
 
     Args:
         config: The resolved configuration.
-        folder: Gets ``metrics.json``, ``predictions.npz``, ``figures/``, ``best.ckpt``, ``last.ckpt``, ``gaussians.ply``,
-            ``loss.csv`` and ``config.yaml``.
+        folder: Gets ``config.yaml``, ``best.ckpt``, ``last.ckpt``, ``log/``, ``predictions.npz``, ``gaussians.ply``,
+            ``figures/`` and, last of all, ``metrics.json``. Where that is already, nothing is done anew.
 
     Returns:
         The contents of ``metrics.json``.
@@ -51,37 +48,84 @@ def run(config: dict, folder: Path) -> dict:
     Raises:
         ValueError: A configuration that does not fit the data, or another run's folder.
         FileNotFoundError: Data that are not there.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    claim(folder, config)
+    finished = folder / "metrics.json"
+    if finished.is_file():
+        log.info("finished already: %s", finished)
+        metrics = json.loads(finished.read_text())
+    else:
+        metrics = train_and_test(config, folder)
+        part = finished.with_suffix(".part")
+        part.write_text(json.dumps(metrics, indent=2) + "\n")
+        part.replace(finished)
+    console = Console()
+    console.print(metrics_table(metrics))
+    console.print(verdict(metrics))
+    console.print(f"results: {folder}", soft_wrap=True)
+    return metrics
+
+
+def claim(folder: Path, config: dict) -> None:
+    """Writes the configuration into a run folder, unless a run has left something there to go on from.
+
+    Raises:
+        ValueError: It has, and it was a run of another configuration.
+    """
+    file = folder / "config.yaml"
+    if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(OmegaConf.create(config), file)
+        return
+    there, here = _flat(OmegaConf.to_container(OmegaConf.load(file))), _flat(config)
+    differing = sorted(key for key in there.keys() | here.keys() if there.get(key) != here.get(key))
+    if differing:
+        told = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
+        listed = "; ".join(f"{key} was {there.get(key)!r}, is {here.get(key)!r}" for key in told)
+        raise ValueError(
+            f"{folder} must be free or hold a run of the same configuration, but {listed}; choose another folder with "
+            "hydra.run.dir=DIR (nothing was written into this one but Hydra's own .hydra/)"
+        )
+
+
+def train_and_test(config: dict, folder: Path) -> dict:
+    """All of a run but the terminal's tables.
+
+    Returns:
+        What stands in ``metrics.json``; None for what the model does not have.
     """
     lightning.seed_everything(config["seed"], verbose=False)
     links = registry("data").build(config["data"])
     sizes = ", ".join(f"{len(part)} {name}" for name, part in links.split.parts().items())
     log.info("data: %s; split %s: %s", config["data"]["name"], links.split.name, sizes)
     model = registry("model").build(config["model"], scene=links.scene)
+    parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
+    log.info("model: %s", ", ".join([config["model"]["name"], *(f"{key} {name}" for key, name in parts.items())]))
     model.fit(links)
 
-    metrics = {"split": links.split.name, "seed": config["seed"], "device": device_name()}
+    start, seconds, size = count_gaussians(model), None, None
     if any(parameter.requires_grad for parameter in model.parameters()):
-        if hasattr(model, "gaussians"):
-            metrics["num_gaussians_start"] = len(model.gaussians)
         model, seconds = train(model, links, config, folder)
-        metrics |= {"train_seconds": seconds, "checkpoint_bytes": (folder / "best.ckpt").stat().st_size}
-    gaussians = getattr(model, "gaussians", None)
-    metrics |= {
+        size = (folder / "best.ckpt").stat().st_size
+    metrics = {
+        "split": links.split.name,
+        "seed": config["seed"],
+        "device": device_name(device_of(model)),
+        "rasterizer": parts.get("rasterizer"),
+        "train_seconds": seconds,
         "inference_ms": inference_ms(model, links),
         "render_ms": render_ms(model, links),
-        "num_gaussians": len(gaussians) if gaussians is not None else 0,
+        "num_gaussians": count_gaussians(model),
+        "num_gaussians_start": start,
         "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
+        "checkpoint_bytes": size,
+        "models": test(model, config["model"]["name"], links, folder),
     }
-    metrics["models"] = test(model, config["model"]["name"], links, folder)
-    (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-
+    gaussians = getattr(model, "gaussians", None)
     if gaussians is not None:
         gaussians.save_ply(folder / "gaussians.ply")
     write_figures(folder, links, gaussians)
-    console = Console()
-    console.print(metrics_table(metrics))
-    console.print(verdict(metrics))
-    console.print(f"results: {folder}", soft_wrap=True)
     return metrics
 
 
@@ -91,56 +135,44 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
     Returns:
         The model at the step with the best validation SSIM, or at the last step where nothing is held out for
         validation; and the seconds it took, over all parts of a run that was interrupted.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C; ``last.ckpt`` is written.
     """
-    options, steps = dict(config["training"]), config["trainer"]["max_steps"]
-    batch_size, patience, density = (options.pop(key) for key in ("batch_size", "patience", "density"))
     split = {"name": links.split.name, **links.split.parts()}
     identity = {"model": config["model"], "scene": links.scene.state(), "split": split, "config": config}
+    module = call("training", Training, config["training"], model=model, identity=identity, seed=config["seed"])
     last, best = folder / "last.ckpt", folder / "best.ckpt"
-    if last.is_file():
-        check_resumable(last, config)
-        log.info("going on from %s", last)
-    module = Training(model, identity, seed=config["seed"], **options)
-
-    timer = Timer()
-    callbacks = [timer, StopCleanly(last), RichProgressBar(leave=True)]
-    if density is not None:
-        callbacks.append(DensityControl(**density, seed=config["seed"]))
-    if len(links.split.validation):
-        watched = {"monitor": "validation/ssim", "mode": "max"}
-        callbacks.append(ModelCheckpoint(folder, best.stem, **watched, enable_version_counter=False))
-        if patience is not None:
-            callbacks.append(EarlyStopping(**watched, patience=patience))
-    # Behind the others, so that it stores their state of this step too.
-    callbacks.append(ModelCheckpoint(folder, last.stem, train_time_interval=SAVE_EVERY, enable_version_counter=False))
+    timer, keep_last = Timer(), KeepLast(last, config["save_every"])
+    callbacks = [timer, KeepBest(best, module.patience), keep_last]
+    if module.density is not None:
+        callbacks.append(call("training.density", DensityControl, module.density, seed=config["seed"]))
+    if config["trainer"].get("enable_progress_bar", True):
+        callbacks.append(ProgressLine())
     loggers = [CSVLogger(folder, "log")]
     if config["tensorboard"]:
         loggers.append(tensorboard_logger(folder))
-    trainer = lightning.Trainer(**config["trainer"], callbacks=callbacks, logger=loggers, default_root_dir=folder)
-    batches = Batches(links, links.split.train, batch_size, config["seed"], steps)
-    validation = Pass(links, links.split.validation, batch_size) if len(links.split.validation) else None
-    resume = last if last.is_file() else None
-    trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
-    trainer.save_checkpoint(last)
-    if not len(links.split.validation):
-        shutil.copyfile(last, best)
-    return checkpoint.load(best), timer.time_elapsed("train")
-
-
-def check_resumable(path: Path, config: dict) -> None:
-    """Sees to it that a checkpoint is of this very configuration.
-
-    Raises:
-        ValueError: It is of another, or it is no checkpoint.
-    """
-    there, here = _flat(checkpoint.read(path)[checkpoint.KEY]["config"]), _flat(config)
-    differing = [key for key in there.keys() | here.keys() if there.get(key) != here.get(key)]
-    if differing:
-        listed = "; ".join(f"{key} was {there.get(key)!r}, is {here.get(key)!r}" for key in sorted(differing)[:5])
-        raise ValueError(
-            f"{path} is of another configuration ({len(differing)} differing: {listed}); choose another folder with "
-            "hydra.run.dir=DIR, or give the same configuration to go on"
-        )
+    context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
+    trainer = call("trainer", lightning.Trainer, config["trainer"], **context)
+    if trainer.world_size > 1:
+        raise ValueError(f"trainer.devices must be 1, got {trainer.world_size}; batches are not shared among processes")
+    batches = Batches(links, links.split.train, module.batch_size, config["seed"], trainer.max_steps)
+    validation = Pass(links, links.split.validation, module.batch_size) if len(links.split.validation) else None
+    resume = None
+    if last.is_file():
+        resume = last
+        log.info("going on after step %d", checkpoint.read(last)["global_step"])
+    handler = signal.signal(signal.SIGINT, keep_last.interrupt)
+    try:
+        trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
+    except Interrupted as stop:
+        raise KeyboardInterrupt(str(stop)) from None
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    seconds, steps = timer.time_elapsed("train"), trainer.global_step
+    rate = steps / seconds
+    log.info("trained %d steps of %d transmitters in %.0f s: %.1f steps/s", steps, module.batch_size, seconds, rate)
+    return checkpoint.load(best).to(trainer.strategy.root_device), seconds
 
 
 def test(model: Model, name: str, links: Links, folder: Path) -> dict[str, dict[str, float]]:
@@ -182,7 +214,7 @@ def render_ms(model: Model, links: Links) -> float | None:
     """Milliseconds of the rasterizer alone; None for a model without one."""
     if not hasattr(model, "render_arguments"):
         return None
-    batch = take(links, links.split.test[:1])
+    batch = take(links, links.split.test[:1]).to(device_of(model))
     with torch.no_grad():
         arguments = model.render_arguments(batch)
         return median_ms(lambda: model.rasterizer(*arguments))
@@ -190,20 +222,34 @@ def render_ms(model: Model, links: Links) -> float | None:
 
 def median_ms(work: Callable, warm_up: int = 5, repeats: int = 25) -> float:
     """Median duration of a call [ms], after warm-up."""
+    wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
     seconds = []
     for _ in range(warm_up + repeats):
+        wait()
         start = time.perf_counter()
         work()
+        wait()
         seconds.append(time.perf_counter() - start)
     return 1e3 * statistics.median(seconds[warm_up:])
 
 
-def device_name() -> str:
+def count_gaussians(model: Model) -> int:
+    """How many Gaussians a model has; 0 for one of another kind."""
+    return len(getattr(model, "gaussians", ()))
+
+
+def device_of(model: Model) -> torch.device:
+    """Where a model computes."""
+    return next((tensor.device for tensor in model.state_dict().values()), torch.device("cpu"))
+
+
+def device_name(device: torch.device) -> str:
     """What the numbers were computed on."""
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
     names = [line.split(":")[1].strip() for line in _cpuinfo() if line.startswith("model name")]
-    return f"{names[0] if names else platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"
+    threads = torch.get_num_threads()
+    return f"{names[0] if names else platform.processor() or platform.machine()}, {threads} thread{'s' * (threads > 1)}"
 
 
 def tensorboard_logger(folder: Path) -> Logger:

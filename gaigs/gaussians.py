@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor, nn
 
 from gaigs.data import Scene
@@ -19,9 +19,9 @@ SH_DC = 0.5 / math.sqrt(math.pi)
 class Gaussians(nn.Module):
     """n anisotropic Gaussians, each a virtual transmitter; parameters are stored raw, properties give them activated.
 
-    They start in the directions that the label shows: for every receiver on a Fibonacci lattice over the part of the sphere
-    that the label's grid covers, at random distances, each wide enough to meet its neighbours. So the count follows from the
-    angular detail wanted: ``count`` splats over the upper hemisphere lie sqrt(2 pi / count) rad apart.
+    They start in the directions that the label shows: for every receiver on a Fibonacci lattice over the part of the
+    sphere that the label's grid covers, at random distances, each wide enough to meet its neighbours. So the count
+    follows from the angular detail wanted: ``count`` splats over the upper hemisphere lie sqrt(2 pi / count) rad apart.
 
     Args:
         scene: Receivers and grid, which say where to put the Gaussians.
@@ -32,8 +32,11 @@ class Gaussians(nn.Module):
         opacity: At the start, in (0, 1).
         signal: Standard deviation of the signal's random start.
 
-    Source: parametrisation of Kerbl et al., 3D Gaussian Splatting, 2023, with SH degree 0: a direction-dependent signal adds
-    nothing where each Gaussian is seen from one receiver.
+    Raises:
+        ValueError: An option is out of range.
+
+    Source: parametrisation of Kerbl et al., 3D Gaussian Splatting, 2023, with SH degree 0: a direction-dependent signal
+    adds nothing where each Gaussian is seen from one receiver.
     """
 
     PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "signal")
@@ -50,13 +53,14 @@ class Gaussians(nn.Module):
         signal: float,
     ):
         super().__init__()
-        if count < len(scene.receivers):
-            raise ValueError(f"gaussians.count must be at least one a receiver ({len(scene.receivers)}), got {count}")
+        receivers = len(scene.receivers)
+        if count < receivers:
+            raise ValueError(f"gaussians.count must be at least one a receiver ({receivers}), got {count}")
         if not 0 < near <= far:
             raise ValueError(f"gaussians.near and far must satisfy 0 < near <= far, got {near} and {far} m")
         if not 0 < opacity < 1:
             raise ValueError(f"gaussians.opacity must lie between 0 and 1, got {opacity}")
-        shares = [count // len(scene.receivers) + (i < count % len(scene.receivers)) for i in range(len(scene.receivers))]
+        shares = [count // receivers + (i < count % receivers) for i in range(receivers)]
         means, scales = [], []
         low, high = (-math.pi / 2, math.pi / 2)
         if scene.grid is not None:
@@ -100,7 +104,7 @@ class Gaussians(nn.Module):
         """Makes room for another number of Gaussians; their values are undefined until they are loaded."""
         for name in self.PARAMETERS:
             old = getattr(self, name)
-            setattr(self, name, nn.Parameter(old.new_empty(count, *old.shape[1:])))
+            setattr(self, name, nn.Parameter(old.new_empty(count, *old.shape[1:]), old.requires_grad))
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
         """Takes the count of the checkpoint, which density control has changed since the configuration was written."""
@@ -123,14 +127,20 @@ class Gaussians(nn.Module):
         """Takes over the Gaussians of a .ply, whatever their number.
 
         Raises:
+            FileNotFoundError: There is no such file.
             ValueError: The file is no splatting .ply or has fewer signal channels than these Gaussians.
         """
-        vertices = PlyData.read(str(path))["vertex"].data
+        try:
+            vertices = PlyData.read(str(path))["vertex"].data
+        except (PlyParseError, KeyError) as error:
+            raise ValueError(f"{path} must be a whole .ply file with an element 'vertex': {error}") from error
         channels = self.signal.shape[1]
         wanted = {name: columns for name, columns in _ply_names(channels).items() if name != "normals"}
         lacking = [column for columns in wanted.values() for column in columns if column not in vertices.dtype.names]
         if lacking:
-            raise ValueError(f"{path} must hold the properties of Gaussian splats with {channels} signal channels; it lacks {', '.join(lacking)}")
+            raise ValueError(
+                f"{path} must hold Gaussian splats with {channels} signal channels; it lacks {', '.join(lacking)}"
+            )
         self.resize(len(vertices))
         with torch.no_grad():
             for name, columns in wanted.items():

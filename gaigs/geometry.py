@@ -35,10 +35,12 @@ class Pose:
                 f"{tuple(quaternion.shape)}"
             )
         if not (torch.isfinite(position).all() and torch.isfinite(quaternion).all()):
-            raise ValueError(f"a pose must be finite, got position {position.tolist()}, quaternion {quaternion.tolist()}")
+            raise ValueError(f"a pose must be finite, got {position.tolist()} and quaternion {quaternion.tolist()}")
         norm = float(quaternion.norm())
         if abs(norm - 1) > 1e-3:
-            raise ValueError(f"a rotation quaternion must have length 1, got {norm:.6g} for {quaternion.tolist()}; normalise it")
+            raise ValueError(
+                f"a rotation quaternion must have length 1, got {norm:.6g} for {quaternion.tolist()}; normalise it"
+            )
         rotation = quaternions_to_rotations(quaternion.roll(1))
         return cls(position.float(), rotation.float())
 
@@ -78,17 +80,21 @@ def covariances(quats: Float[Tensor, "*batch 4"], scales: Float[Tensor, "*batch 
 
 
 def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Azimuth in (-pi, pi] [rad], elevation in [-pi/2, pi/2] [rad] and distance [m] of points in the array's frame.
+    """Azimuth in [-pi, pi] [rad], elevation in [-pi/2, pi/2] [rad] and distance [m] of points in the array's frame.
 
-    ``atan2`` of the height over the horizontal distance equals asin(z / r) and is accurate at the zenith too.
+    ``atan2`` of the height over the horizontal distance equals asin(z / r) and is accurate at the zenith too. There,
+    where azimuth is undefined, it is 0. Gradients are finite everywhere but at the origin.
     """
     x, y, z = points.unbind(-1)
-    return torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y)), points.norm(dim=-1)
+    distances = points.norm(dim=-1)
+    # Nearer to the axis than this no azimuth is resolved: such a point counts as one just beside it, at azimuth 0.
+    least = torch.finfo(points.dtype).eps * distances.detach()
+    axial = torch.hypot(x, y) <= least
+    x, y = torch.where(axial, least, x), torch.where(axial, 0.0, y)
+    return torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y)), distances
 
 
 def from_spherical(azimuths: Float[Tensor, "*batch"], elevations: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
     """Unit vectors towards azimuths and elevations [rad]; the inverse of ``to_spherical``."""
     horizontal = torch.cos(elevations)
-    return torch.stack(
-        (horizontal * torch.cos(azimuths), horizontal * torch.sin(azimuths), torch.sin(elevations)), -1
-    )
+    return torch.stack((horizontal * torch.cos(azimuths), horizontal * torch.sin(azimuths), torch.sin(elevations)), -1)

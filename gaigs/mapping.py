@@ -43,13 +43,12 @@ class TokenLinear(nn.Module):
     def __init__(self, tokens: tuple[int, int, int], width: int, hidden: int = 0):
         super().__init__()
         scene, gaussian, transmitter = tokens
-        fan_in = scene + gaussian + transmitter + hidden
-        self.links = nn.Linear(scene + transmitter, width)
+        self.links = nn.utils.skip_init(nn.Linear, scene + transmitter, width)
         self.gaussians = nn.Linear(gaussian, width, bias=False) if gaussian else None
         self.hidden = nn.Linear(hidden, width, bias=False) if hidden else None
-        for layer in (self.links, self.gaussians, self.hidden):
-            if layer is not None:  # as one layer over the whole concatenation would start
-                nn.init.uniform_(layer.weight, -(fan_in**-0.5), fan_in**-0.5)
+        bound = max(scene + gaussian + transmitter + hidden, 1) ** -0.5
+        for parameter in self.parameters():  # as one layer over the whole concatenation would start
+            nn.init.uniform_(parameter, -bound, bound)
 
     def forward(self, tokens: Tokens, hidden: Float[Tensor, "b n h"] | None = None) -> Float[Tensor, "b n width"]:
         result = self.links(torch.cat((tokens.scene, tokens.transmitters), -1))[:, None]
@@ -81,7 +80,10 @@ class SceneMapping(nn.Module):
         channels: Signal channels of a Gaussian.
         width: Of both branches.
         attenuation_layers, signal_layers: Residual layers of each branch, behind its first layer.
-        heads: Which of ``HEADS`` exist; the signal head is the one nothing works without.
+        heads: Which of ``HEADS`` exist; what only a head left out would need has no parameters.
+
+    Raises:
+        ValueError: There is no such head.
 
     Source: GAI-GS, "Scene Mapping Network".
     """
@@ -99,10 +101,11 @@ class SceneMapping(nn.Module):
         unknown = set(heads) - set(HEADS)
         if unknown:
             raise ValueError(f"mapping.heads must be among {', '.join(HEADS)}, got {', '.join(sorted(unknown))}")
-        self.channels = channels
+        self.heads = nn.ModuleDict()
+        if not heads:
+            return
         self.attenuation_first = TokenLinear(tokenizer_widths, width)
         self.attenuation_rest = nn.Sequential(*(ResidualLayer(width) for _ in range(attenuation_layers)))
-        self.heads = nn.ModuleDict()
         if "opacity" in heads:
             self.heads["opacity"] = nn.Linear(width, 1)
         if "attenuation" in heads:
@@ -123,8 +126,10 @@ class SceneMapping(nn.Module):
 
     def forward(self, tokens: Tokens) -> Residuals:
         """Residuals for every (transmitter, Gaussian) pair."""
-        attenuation = self.attenuation_rest(functional.gelu(self.attenuation_first(tokens)))
         results = dict.fromkeys(HEADS)
+        if not self.heads:
+            return Residuals(*results.values())
+        attenuation = self.attenuation_rest(functional.gelu(self.attenuation_first(tokens)))
         features = {"opacity": attenuation, "attenuation": attenuation}
         if self.has_signal_branch:
             signal = self.signal_rest(functional.gelu(self.signal_first(tokens, attenuation)))
@@ -137,4 +142,4 @@ class SceneMapping(nn.Module):
             results["opacity"] = results["opacity"].squeeze(-1)
         if results["attenuation"] is not None:
             results["attenuation"] = DARKEST + (1 - DARKEST) * results["attenuation"].squeeze(-1).sigmoid()
-        return Residuals(*(results[name] for name in HEADS))
+        return Residuals(*results.values())

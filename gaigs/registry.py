@@ -127,20 +127,7 @@ class Registry:
                 f"a {self.kind} configuration needs the key 'name', got {options}; there are: {_listed(self.names())}"
             )
         name = options.pop("name")
-        component = self.get(name)
-        parameters = inspect.signature(component).parameters.values()
-        named = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-        takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters)
-        has = [key for key in named if key not in context]
-        unknown = [key for key in options if key in context or not (takes_all or key in named)]
-        if unknown:
-            words = " or ".join(_suggest(key, has) for key in unknown)
-            raise ValueError(f"{self.kind} {name!r} has no option {words}; it has: {_listed(has)}")
-        arguments = options | {key: value for key, value in context.items() if takes_all or key in named}
-        missing = [key for key, p in named.items() if p.default is p.empty and key not in arguments]
-        if missing:
-            raise ValueError(f"{self.kind} {name!r} needs option {_listed(missing)}; it has: {_listed(has)}")
-        return component(**arguments)
+        return call(f"{self.kind} {name!r}", self.get(name), options, **context)
 
     def _load(self, holder: Holder) -> Callable:
         if holder.root is not None and str(holder.root) not in sys.path:
@@ -186,6 +173,36 @@ def register(kind: str, name: str, /) -> Callable:
         ValueError: There is no such kind, or the name is taken by another component.
     """
     return registry(kind).register(name)
+
+
+def call(what: str, function: Callable, options: Mapping, /, **context):
+    """The result of a function or class that takes the options of a configuration.
+
+    Args:
+        what: Whose options they are, as errors call it.
+        function: Its parameters are the options.
+        options: By name.
+        context: What the caller knows and no configuration says; passed where the function has a parameter of that name.
+
+    Raises:
+        TypeError: The options are no mapping.
+        ValueError: An option is missing or unknown.
+    """
+    if not isinstance(options, Mapping):
+        raise TypeError(f"{what} must be a mapping of options, got {options!r}")
+    parameters = inspect.signature(function).parameters.values()
+    named = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+    takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    has = [key for key in named if key not in context]
+    unknown = [key for key in options if key in context or not (takes_all or key in named)]
+    if unknown:
+        words = " or ".join(_suggest(key, has) for key in unknown)
+        raise ValueError(f"{what} has no option {words}; it has: {_listed(has)}")
+    arguments = {**options, **{key: value for key, value in context.items() if takes_all or key in named}}
+    missing = [key for key, p in named.items() if p.default is p.empty and key not in arguments]
+    if missing:
+        raise ValueError(f"{what} needs option {_listed(missing)}; it has: {_listed(has)}")
+    return function(**arguments)
 
 
 def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:

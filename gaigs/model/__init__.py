@@ -52,8 +52,8 @@ class Prediction(NamedTuple):
 class Model(nn.Module):
     """The contract of kind ``model``: ``forward`` takes a ``Batch`` and gives a ``Prediction``.
 
-    A model with parameters is trained by gradient descent, and all that ``predict`` needs is in its state dict. One without
-    parameters, a look-up, learns in ``fit`` alone and is not stored.
+    A model with parameters is trained by gradient descent, and all that ``predict`` needs is in its state dict. One
+    without parameters, a look-up, learns in ``fit`` alone and is not stored.
 
     Args:
         scene: Receivers, grid and normalisation of the labels.

@@ -1,6 +1,5 @@
 """The splatting pipeline: GAI-GS, its ablations and its neighbours, put together from registered parts."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -10,7 +9,7 @@ from gaigs.geometry import Pose, covariances
 from gaigs.mapping import Residuals, SceneMapping
 from gaigs.model import Batch, Model, Prediction
 from gaigs.projection import Splats
-from gaigs.registry import register, registry
+from gaigs.registry import call, register, registry
 
 
 @register("model", "gaigs")
@@ -27,16 +26,24 @@ class GaussianSplatting(Model):
     """
 
     def __init__(
-        self, scene: Scene, tokenizer: dict, projection: dict, rasterizer: dict, pooling: dict, gaussians: dict, mapping: dict
+        self,
+        scene: Scene,
+        tokenizer: dict,
+        projection: dict,
+        rasterizer: dict,
+        pooling: dict,
+        gaussians: dict,
+        mapping: dict,
     ):
         super().__init__(scene)
         self.pooling = registry("pooling").build(pooling)
         self.projection = registry("projection").build(projection, pixel=scene.grid.pitch)
         self.rasterizer = registry("rasterizer").build(rasterizer)
-        self.gaussians = Gaussians(scene, self.pooling.channels, **gaussians)
+        self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, channels=self.pooling.channels)
         self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
         widths = (self.tokenizer.scene_width, self.tokenizer.gaussian_width, self.tokenizer.transmitter_width)
-        self.mapping = SceneMapping(widths, self.pooling.channels, **mapping)
+        context = {"tokenizer_widths": widths, "channels": self.pooling.channels}
+        self.mapping = call("mapping", SceneMapping, mapping, **context)
 
     def forward(self, batch: Batch) -> Prediction:
         residuals = self._residuals(batch.transmitters)
@@ -67,7 +74,7 @@ class GaussianSplatting(Model):
             signal = signal + residuals.delta_signal
         if residuals.delta_opacities is not None:
             opacities = (opacities + residuals.delta_opacities).clamp(0, 1)
-        splats = self._splats(residuals, self.scene.receivers[batch.receiver].pose.to(batch.transmitters))
+        splats = self._splats(residuals, self.scene.receivers[batch.receiver].pose)
         plane = self.projection.plane(batch.grid.elevations, batch.grid.azimuths)
         signal = SH_DC * signal.squeeze(-1)
         return splats, signal.expand(b, -1, -1), opacities.expand(b, -1), residuals.attenuations, plane

@@ -9,6 +9,10 @@ from torch import Tensor
 
 from gaigs.geometry import Pose
 
+NEAR = 1e-6
+"""A Gaussian nearer to the receiver than this sits on it [m]: float32 tells no direction between two positions of some
+metres so close together, and footprints, which grow as 1 / distance², have a finite determinant down to here."""
+
 
 @dataclass(frozen=True)
 class Splats:
@@ -76,9 +80,7 @@ class Projection(ABC):
     def plane(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"]) -> Plane:
         """Plane coordinates of a label's pixel centres, given in radians."""
 
-    def project(
-        self, means: Float[Tensor, "n 3"], covariances: Float[Tensor, "b n 3 3"], receiver: Pose
-    ) -> Splats:
+    def project(self, means: Float[Tensor, "n 3"], covariances: Float[Tensor, "b n 3 3"], receiver: Pose) -> Splats:
         """Gaussians as the receiver sees them.
 
         Args:
@@ -86,9 +88,10 @@ class Projection(ABC):
             covariances: World frame [m²]; one set (b = 1), or one a transmitter.
             receiver: Position [m] and orientation of the antenna array.
         """
+        receiver = receiver.to(means)
         points = receiver.local(means)
         depths = points.norm(dim=-1)
-        visible = depths > 0
+        visible = ~(depths < NEAR)  # a centre that is NaN is no reason to hide it
         # A Gaussian on the receiver has no direction: a stand-in keeps values and gradients finite, `visible` hides it.
         points = torch.where(visible[:, None], points, points.new_tensor([1.0, 0.0, 0.0]))
         half = self.jacobian(points) @ receiver.rotation.mT

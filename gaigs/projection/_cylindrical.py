@@ -15,8 +15,11 @@ class Cylindrical(Projection):
 
     Args:
         pixel: See ``Projection`` [rad].
-        limit_deg: Elevations are clamped to this absolute value [deg], in (0, 90): at the pole the azimuth of a small
-            step diverges as 1 / cos(elevation), and here it stops growing.
+        limit_deg: Elevations are clamped to this absolute value [deg], in (0, 90): towards the pole the azimuth of a
+            small step diverges as 1 / cos(elevation), and beyond the limit a Gaussian is as wide as at it.
+
+    Raises:
+        ValueError: An option is out of range.
     """
 
     def __init__(self, pixel: float, limit_deg: float):
@@ -30,26 +33,22 @@ class Cylindrical(Projection):
         raise NotImplementedError
 
     def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
-        x, y, z = points.unbind(-1)
-        v, _ = self.stretch(torch.atan2(z, self._horizontal(points)).clamp(-self.limit, self.limit))
-        return torch.stack((torch.atan2(y, x), v), -1)
+        azimuths, elevations, _ = to_spherical(points)
+        v, _ = self.stretch(elevations.clamp(-self.limit, self.limit))
+        return torch.stack((azimuths, v), -1)
 
     def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
-        x, y, z = points.unbind(-1)
-        square = (points * points).sum(-1)
-        horizontal = self._horizontal(points)
-        _, slope = self.stretch(torch.atan2(z, horizontal).clamp(-self.limit, self.limit))
-        # d azimuth = (-y, x, 0) / rho²  and  d elevation = (-z x / rho, -z y / rho, rho) / r²
-        azimuth = torch.stack((-y, x, torch.zeros_like(x)), -1) / horizontal.square()[..., None]
-        elevation = torch.stack((-z * x / horizontal, -z * y / horizontal, horizontal), -1) / square[..., None]
-        return torch.stack((azimuth, slope[..., None] * elevation), -2)
+        azimuths, elevations, distances = to_spherical(points)
+        clamped = elevations.clamp(-self.limit, self.limit)
+        _, slope = self.stretch(clamped)
+        sin, cos = torch.sin(azimuths), torch.cos(azimuths)
+        # Where azimuth grows and where elevation grows, unit vectors; how fast, per metre.
+        east = torch.stack((-sin, cos, torch.zeros_like(sin)), -1)
+        height, horizontal = torch.sin(elevations), torch.cos(elevations)
+        north = torch.stack((-height * cos, -height * sin, horizontal), -1)
+        rates = torch.stack((1 / torch.cos(clamped), slope), -1) / distances[..., None]
+        return rates[..., None] * torch.stack((east, north), -2)
 
     def plane(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"]) -> Plane:
         v, _ = self.stretch(elevations.clamp(-self.limit, self.limit))
         return Plane(azimuths[None, :], v[:, None], 2 * math.pi)
-
-    def _horizontal(self, points: Tensor) -> Tensor:
-        """Distance from the pole's axis, not below that of the elevation limit."""
-        x, y, _ = points.unbind(-1)
-        least = math.cos(self.limit) ** 2 * (points * points).sum(-1)
-        return torch.maximum(x * x + y * y, least).sqrt()

@@ -1,6 +1,5 @@
 """The rasterizer in eager torch: any device, float32 and float64."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -37,8 +36,8 @@ class TorchRasterizer:
         plane: Plane,
     ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
         """The map, and the transmittance left behind the last splat; see ``gaigs.rasterizer.Rasterizer``."""
-        order = torch.argsort(splats.depths.masked_fill(~splats.visible, math.inf), stable=True)
-        order = order[: int(splats.visible.sum())]
+        order = torch.argsort(splats.depths, stable=True)
+        order = order[splats.visible[order]]
         a, b, c, d = splats.covariances2d[:, order].flatten(-2).unbind(-1)
         conics = torch.stack((d, -(b + c) / 2, a), -1) / (a * d - b * c)[..., None]
         with torch.no_grad():
@@ -61,28 +60,31 @@ class _Tiles:
         self.down, self.across = (-(-edge // TILE) for edge in self.shape)
         u, v = (self._cut(coordinate) for coordinate in (plane.u, plane.v))
         self.u, self.v = u, v
+        self.chunks = []
+        if not len(opacities):
+            return
 
-        # The footprint falls to ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box has these halves.
+        # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box has these halves.
+        # Comparisons with NaN keep the splat, for what is broken must show.
         reach = 2 * (opacities / ALPHA_MIN).log().clamp_min(0)
         halves = (reach[..., None] * variances).amax(0).sqrt()
-        touches = (opacities.amax(0) >= ALPHA_MIN).expand(self.down * self.across, -1)
+        touches = ~(opacities.amax(0) < ALPHA_MIN).expand(self.down * self.across, -1)
         for axis, (coordinate, period) in enumerate(((u, self.period), (v, None))):
             coordinate = coordinate.flatten(1)
             low, high = coordinate.amin(1, keepdim=True), coordinate.amax(1, keepdim=True)
             offset = _nearest(means[:, axis] - (low + high) / 2, period).abs()
             # A few roundings' slack: whoever is listed in vain is sorted out pixel by pixel.
-            touches = touches & (offset <= (halves[:, axis] + (high - low) / 2) * (1 + 1e-5) + 1e-6)
+            touches = touches & ~(offset > (halves[:, axis] + (high - low) / 2) * (1 + 1e-5) + 1e-6)
         self.chunks = self._chunks(touches, len(opacities))
 
     def _cut(self, coordinate: Tensor) -> Tensor:
-        """A plane coordinate (rows or 1, columns or 1) as tiles (t, y, x), the last ones filled up by repetition."""
-        rows, columns = (
-            torch.arange(edges * TILE, device=coordinate.device).clamp_max(size - 1) if size > 1 else torch.zeros(1).long()
-            for edges, size in zip((self.down, self.across), coordinate.shape, strict=True)
-        )
-        y, x = (TILE if len(index) > 1 else 1 for index in (rows, columns))
-        cut = coordinate[rows.to(coordinate.device)][:, columns.to(coordinate.device)]
-        cut = cut.view(len(rows) // y, y, len(columns) // x, x).transpose(1, 2)
+        """A plane coordinate (rows or 1, columns or 1) as tiles (t, y or 1, x or 1), filled up by repetition."""
+        for axis, (size, tiles) in enumerate(zip(self.shape, (self.down, self.across), strict=True)):
+            if coordinate.shape[axis] == size:
+                filled = torch.arange(tiles * TILE, device=coordinate.device).clamp_max(size - 1)
+                coordinate = coordinate.index_select(axis, filled)
+        y, x = (TILE if edge > 1 else 1 for edge in coordinate.shape)
+        cut = coordinate.unflatten(1, (-1, x)).unflatten(0, (-1, y)).transpose(1, 2)
         return cut.expand(self.down, self.across, y, x).reshape(-1, y, x)
 
     def _chunks(self, touches: Tensor, transmitters: int) -> list[tuple[Tensor, Tensor]]:
@@ -114,7 +116,8 @@ class _Tiles:
         """The inverse of ``join``; pixels outside the image are 0."""
         rows, columns = self.shape
         image = torch.nn.functional.pad(image, (0, self.across * TILE - columns, 0, self.down * TILE - rows))
-        return image.unflatten(-1, (self.across, TILE)).unflatten(-3, (self.down, TILE)).transpose(-3, -2).flatten(-2).flatten(-3, -2)
+        tiled = image.unflatten(-1, (self.across, TILE)).unflatten(-3, (self.down, TILE)).transpose(-3, -2)
+        return tiled.flatten(-2).flatten(-3, -2)
 
 
 def _nearest(offset: Tensor, period: float | None) -> Tensor:
@@ -135,19 +138,21 @@ class _Weights:
     left: Tensor
 
 
-def _weigh(tiles: _Tiles, chosen: Tensor, means: Tensor, conics: Tensor, opacities: Tensor, logs: Tensor | None) -> _Weights:
-    """Footprints, opacities and transmittances of one chunk, its splats already gathered as (b, t, k)."""
-    du, dv = tiles.offsets(chosen, means)
-    uu, uv, vv = (conic[..., None, None] for conic in conics.unbind(-1))
+def _weigh(
+    tiles: _Tiles, chosen: Tensor, k: Tensor, means: Tensor, conics: Tensor, opacities: Tensor, logs: Tensor | None
+) -> _Weights:
+    """Footprints, opacities and transmittances of one chunk: tiles ``chosen`` (t,) and their splats (t, k)."""
+    du, dv = tiles.offsets(chosen, means[k])
+    uu, uv, vv = (conic[..., None, None] for conic in conics[:, k].unbind(-1))
     exponent = (-0.5 * uu * du * du) + (-0.5 * vv * dv * dv)
     exponent = exponent.addcmul_(-uv * dv, du).flatten(-2)
     footprint = exponent.exp_()
-    alpha = footprint * opacities[..., None]
+    alpha = footprint * opacities[:, k, None]
     live = alpha >= ALPHA_MIN
     alpha = alpha.clamp_max(ALPHA_MAX).mul_(live)
     passed = torch.log1p(-alpha)
     if logs is not None:
-        passed.addcmul_(footprint * live, logs[..., None])
+        passed.addcmul_(footprint * live, logs[:, k, None])
     total = passed.cumsum(-2)
     left = total[..., -1, :].exp()
     return _Weights(du, dv, footprint, alpha, live, total.sub_(passed).exp_(), left)
@@ -166,9 +171,9 @@ class _Composite(torch.autograd.Function):
         left = signal.new_ones(b, tiles.down * tiles.across, TILE * TILE)
         means, conics, signal, opacities, logs = _filled(means, conics, signal, opacities, logs)
         for chosen, k in tiles.chunks:
-            weights = _weigh(tiles, chosen, means[k], conics[:, k], opacities[:, k], None if logs is None else logs[:, k])
-            image[:, :, chosen] = (signal[:, k].mT @ weights.transmittance.mul_(weights.alpha)).transpose(1, 2)
-            left[:, chosen] = weights.left
+            w = _weigh(tiles, chosen, k, means, conics, opacities, logs)
+            image[:, :, chosen] = (signal[:, k].mT @ w.transmittance.mul_(w.alpha)).transpose(1, 2)
+            left[:, chosen] = w.left
         return tiles.join(image), tiles.join(left)
 
     @staticmethod
@@ -181,7 +186,7 @@ class _Composite(torch.autograd.Function):
         image_gradient = tiles.split(image_gradient)
         left_gradient = tiles.split(left_gradient)
         for chosen, k in tiles.chunks:
-            w = _weigh(tiles, chosen, means[k], conics[:, k], opacities[:, k], None if logs is None else logs[:, k])
+            w = _weigh(tiles, chosen, k, means, conics, opacities, logs)
             towards = image_gradient[:, :, chosen].transpose(1, 2)
             blend = w.alpha * w.transmittance
             d_signal = blend @ towards.mT
@@ -203,9 +208,8 @@ class _Composite(torch.autograd.Function):
             for gradient, part, axis in zip(gradients, found, (0, 1, 1, 1, 1), strict=True):
                 if gradient is not None:
                     gradient.index_add_(axis, k.flatten(), part.flatten(axis, axis + 1))
-        axes = (0, 1, 1, 1, 1)
-        cut = (None if g is None else g.narrow(axis, 0, g.shape[axis] - 1) for g, axis in zip(gradients, axes, strict=True))
-        return None, *cut
+        means, conics, *others = gradients  # the last splat is the filling
+        return None, means[:-1], conics[:, :-1], *(None if other is None else other[:, :-1] for other in others)
 
 
 def _filled(means, conics, signal, opacities, logs):
@@ -222,13 +226,13 @@ def _filled(means, conics, signal, opacities, logs):
 
 def _moments(d_exponent: Tensor, du: Tensor, dv: Tensor, conics: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of centres (b, t, k, 2) and conics (b, t, k, 3) from that of the exponents (b, t, k, y, x)."""
-    if du.shape[-2] == 1:  # the plane is a product of columns and rows: contract the columns first
+    if du.shape[-2] == dv.shape[-1] == 1:  # the plane is a product of columns and rows: contract the columns first
         powers = torch.cat((torch.ones_like(du), du, du * du), -2).mT
         m0, m1, m2 = (d_exponent @ powers).unbind(-1)
         dv = dv.squeeze(-1)
     else:
         m0, m1 = d_exponent.flatten(-2), (d_exponent * du).flatten(-2)
-        du, dv = du.flatten(-2), dv.flatten(-2)
+        du, dv = (offset.flatten(-2) for offset in torch.broadcast_tensors(du, dv))
         m2 = m1 * du
     u, v = m1.sum(-1), (m0 * dv).sum(-1)
     uu, uv, vv = m2.sum(-1), (m1 * dv).sum(-1), (m0 * dv * dv).sum(-1)

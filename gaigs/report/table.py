@@ -43,7 +43,8 @@ def metrics_table(metrics: Mapping) -> Table:
     best = {
         name: (max if larger_is_better(name) else min)(scores[name] for scores in models.values()) for name in names
     }
-    caption = escape(f"split {metrics['split']}, seed {metrics['seed']}, {metrics['device']}")
+    # A split's name may end with a seed of its own.
+    caption = escape(f"split {metrics['split']}\nrun with seed {metrics['seed']} on {metrics['device']}")
     table = Table("model", title="Test scores", caption=caption)
     for name in names:
         table.add_column(escape(METRICS.get(name, name)), justify="right")

@@ -22,9 +22,15 @@ class Batches:
         size: Links a batch; the last ones of a receiver may be fewer.
         seed: Of the order.
         steps: How many batches there are in all.
+
+    Raises:
+        ValueError: The size or the number of steps is less than 1.
     """
 
     def __init__(self, links: Links, index: Int[Tensor, "k"], size: int, seed: int, steps: int):
+        for option, value in (("training.batch_size", size), ("trainer.max_steps", steps)):
+            if value < 1:
+                raise ValueError(f"{option} must be at least 1, got {value}")
         self.links, self.index, self.size, self.seed, self.steps = links, index, size, seed, steps
         self.position = 0
 
@@ -32,12 +38,10 @@ class Batches:
         return self.steps
 
     def __iter__(self) -> Iterator[Batch]:
-        length = sum(-(-len(self._of(receiver)) // self.size) for receiver in range(len(self.links.receivers)))
+        length = len(_by_receiver(self.links, self.index, self.size))
         while self.position < self.steps:
             passed, within = divmod(self.position, length)
-            for chosen in self._shuffled(passed)[within:]:
-                if self.position == self.steps:
-                    return
+            for chosen in self._shuffled(passed)[within : within + self.steps - self.position]:
                 self.position += 1
                 yield take(self.links, chosen)
 
@@ -49,15 +53,10 @@ class Batches:
         """Goes on from there."""
         self.position = state["position"]
 
-    def _of(self, receiver: int) -> Tensor:
-        return self.index[self.links.receiver_index[self.index] == receiver]
-
     def _shuffled(self, passed: int) -> list[Tensor]:
         generator = torch.Generator().manual_seed(hash((self.seed, passed)) % 2**63)
-        parts = []
-        for receiver in range(len(self.links.receivers)):
-            index = self._of(receiver)
-            parts += index[torch.randperm(len(index), generator=generator)].split(self.size)
+        order = self.index[torch.randperm(len(self.index), generator=generator)]
+        parts = _by_receiver(self.links, order, self.size)
         return [parts[i] for i in torch.randperm(len(parts), generator=generator)]
 
 
@@ -72,12 +71,7 @@ class Pass:
 
     def __init__(self, links: Links, index: Int[Tensor, "k"], size: int):
         self.links = links
-        self.parts = [
-            part
-            for receiver in range(len(links.receivers))
-            for part in index[links.receiver_index[index] == receiver].split(size)
-            if len(part)
-        ]
+        self.parts = _by_receiver(links, index, size)
 
     def __len__(self) -> int:
         return len(self.parts)
@@ -90,3 +84,9 @@ def take(links: Links, index: Int[Tensor, "b"]) -> Batch:
     """Links of one receiver as a batch with labels."""
     receiver = int(links.receiver_index[index[0]])
     return Batch(links.transmitters[index], receiver, links.grid, links.labels[index])
+
+
+def _by_receiver(links: Links, index: Int[Tensor, "k"], size: int) -> list[Int[Tensor, "b"]]:
+    """Links in parts of at most a size, each of one receiver, in the order in which they come."""
+    receivers = links.receiver_index[index]
+    return [part for receiver in receivers.unique() for part in index[receivers == receiver].split(size)]

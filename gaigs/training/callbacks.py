@@ -1,11 +1,13 @@
-"""What happens between the steps: density control, and a clean stop at Ctrl-C."""
+"""What happens between the steps: density control, checkpoints that a killed run goes on from, and a line that tells how far it is."""
 
-import signal
+import math
+import time
 from pathlib import Path
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from gaigs import density
 
@@ -26,6 +28,9 @@ class DensityControl(Callback):
         most: Their number does not grow beyond this.
         seed: Of the halves' random places.
 
+    Raises:
+        ValueError: ``every`` is less than one step, or the model has no Gaussians.
+
     Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2; thresholds in docs/methods.md.
     """
 
@@ -33,7 +38,7 @@ class DensityControl(Callback):
         self, every: int, start: int, stop: int, gradient: float, wide: float, opacity: float, most: int, seed: int
     ):
         if every < 1:
-            raise ValueError(f"density.every must be at least 1 step, got {every}")
+            raise ValueError(f"training.density.every must be at least 1 step, got {every}")
         self.every, self.start, self.stop = every, start, stop
         self.gradient, self.wide, self.opacity, self.most, self.seed = gradient, wide, opacity, most, seed
         self.pull = torch.zeros(0)
@@ -44,6 +49,10 @@ class DensityControl(Callback):
 
     def load_state_dict(self, state: dict) -> None:
         self.pull, self.steps = state["pull"], state["steps"]
+
+    def on_fit_start(self, trainer, module) -> None:
+        if not hasattr(module.model, "gaussians"):
+            raise ValueError("training.density needs a model with Gaussians, and this one has none; set it to null")
 
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
         gaussians = module.model.gaussians
@@ -79,29 +88,126 @@ class DensityControl(Callback):
         return (gaussians.means.detach() - middle.to(gaussians.means)).norm(dim=-1)
 
 
-class StopCleanly(Callback):
-    """At the first Ctrl-C: finishes the step, writes the checkpoint, stops. At the second: stops at once.
+class KeepBest(Checkpoint):
+    """Writes the checkpoint of the best validation SSIM, or of the last step where nothing was validated.
 
     Args:
-        path: Where the checkpoint goes.
+        path: Where it goes.
+        patience: Validations without a better SSIM until the training stops; None: it goes on to the last step.
+
+    Raises:
+        ValueError: The patience is less than one validation.
     """
 
-    def __init__(self, path: Path):
-        self.path = path
-        self.asked = False
+    def __init__(self, path: Path, patience: int | None):
+        if patience is not None and patience < 1:
+            raise ValueError(f"training.patience must be at least 1 validation or null, got {patience}")
+        self.path, self.patience = path, patience
+        self.best, self.waited = -math.inf, 0
 
-    def on_fit_start(self, trainer, module) -> None:
-        self.before = signal.getsignal(signal.SIGINT)
-        signal.signal(signal.SIGINT, self._ask)
+    def state_dict(self) -> dict:
+        return {"best": self.best, "waited": self.waited}
 
-    def on_train_batch_end(self, trainer, module, *_) -> None:
-        if self.asked:
-            trainer.save_checkpoint(self.path)
-            raise KeyboardInterrupt
+    def load_state_dict(self, state: dict) -> None:
+        self.best, self.waited = state["best"], state["waited"]
+
+    def on_train_start(self, trainer, module) -> None:
+        self._stop_in_time(trainer)  # a run that was killed once it had stopped
+
+    def on_validation_end(self, trainer, module) -> None:
+        ssim = trainer.callback_metrics["validation/ssim"].item()
+        if ssim > self.best:
+            self.best, self.waited = ssim, 0
+            save(trainer, self.path)
+        else:
+            self.waited += 1
+        self._stop_in_time(trainer)
 
     def on_fit_end(self, trainer, module) -> None:
-        signal.signal(signal.SIGINT, self.before)
+        if self.best == -math.inf:
+            save(trainer, self.path)
 
-    def _ask(self, number, frame) -> None:
-        self.asked = True
-        signal.signal(signal.SIGINT, self.before)
+    def _stop_in_time(self, trainer) -> None:
+        if self.patience is not None and self.waited >= self.patience:
+            trainer.should_stop = True
+
+
+class KeepLast(Checkpoint):
+    """Writes the checkpoint to go on from: every so often, at Ctrl-C, and at the end.
+
+    It does so between two steps, behind the validation where one is due, and behind the other callbacks, whose state it
+    stores: from there a training goes on as if it had never stopped. At the first Ctrl-C it stops there, at the second at
+    once.
+
+    Args:
+        path: Where it goes.
+        every: Time from one to the next [s].
+    """
+
+    def __init__(self, path: Path, every: float):
+        self.path, self.every = path, every
+        self.interrupted = False
+
+    def interrupt(self, *_) -> None:
+        """The handler of the signal that Ctrl-C sends."""
+        if self.interrupted:
+            raise Interrupted("stopped within a step")
+        self.interrupted = True
+
+    def on_train_start(self, trainer, module) -> None:
+        self.saved = time.monotonic()
+
+    def on_train_batch_end(self, trainer, module, *_) -> None:
+        if not (trainer.enable_validation and trainer.global_step % trainer.val_check_batch == 0):
+            self._rest(trainer)
+
+    def on_validation_end(self, trainer, module) -> None:
+        self._rest(trainer)
+
+    def on_fit_end(self, trainer, module) -> None:
+        save(trainer, self.path)
+
+    def _rest(self, trainer) -> None:
+        if self.interrupted or time.monotonic() >= self.saved + self.every:
+            save(trainer, self.path)
+            self.saved = time.monotonic()
+        if self.interrupted:
+            raise Interrupted(f"stopped after step {trainer.global_step}")
+
+
+class Interrupted(Exception):
+    """Ctrl-C. No KeyboardInterrupt, at which Lightning would end the process."""
+
+
+def save(trainer: lightning.Trainer, path: Path) -> None:
+    """Writes a checkpoint, whole or not at all, behind the log of the steps before it."""
+    for logger in trainer.loggers:
+        logger.save()
+    part = path.with_suffix(".part")
+    trainer.save_checkpoint(part, weights_only=False)
+    part.replace(path)
+
+
+class ProgressLine(ProgressBar):
+    """Steps done, their rate, the time left, loss and validation SSIM in one line of the terminal."""
+
+    def on_train_start(self, trainer, module) -> None:
+        rate, scores = "{task.fields[rate]:.1f} steps/s", "{task.fields[scores]}"
+        self.line = Progress("training", BarColumn(None), MofNCompleteColumn(), rate, TimeRemainingColumn(), scores, expand=True)
+        self.start, self.first = time.monotonic(), trainer.global_step
+        self.task = self.line.add_task("", total=trainer.max_steps, completed=self.first, rate=0, scores="")
+        self.line.start()
+
+    def on_train_batch_end(self, trainer, module, *_) -> None:
+        step, values = trainer.global_step, trainer.progress_bar_metrics
+        rate = (step - self.first) / (time.monotonic() - self.start)
+        words = {"train/loss": "loss", "validation/ssim": "SSIM"}
+        scores = " ".join(f"{word} {values[name]:.3f}" for name, word in words.items() if name in values)
+        self.line.update(self.task, completed=step, rate=rate, scores=scores)
+
+    def on_train_end(self, trainer, module) -> None:
+        self.line.stop()
+
+    def on_exception(self, trainer, module, exception) -> None:
+        if hasattr(self, "line"):
+            self.line.stop()

@@ -18,7 +18,9 @@ class Training(lightning.LightningModule):
 
     Args:
         model: What to train.
-        identity: What ``gaigs.load`` needs beside the weights, and what a resumed run is checked against.
+        identity: What ``gaigs.load`` needs beside the weights, and the configuration and split they come from.
+        seed: Of the random rows and columns.
+        batch_size: Transmitters a step.
         stride: Rows and columns between those that a step looks at.
         ssim: Weight of the SSIM term, the paper's 1 - beta.
         penalties: Weight of each of the model's penalties, the paper's alpha.
@@ -26,7 +28,11 @@ class Training(lightning.LightningModule):
         final_rate: Every rate falls exponentially to this fraction of itself at the last step.
         warmup: Steps over which the rates rise linearly at first.
         weight_decay: AdamW's, of the group ``network``.
-        seed: Of the random rows and columns.
+        patience: Of ``KeepBest``.
+        density: Options of ``DensityControl``; None for none.
+
+    Raises:
+        ValueError: The model has a group of parameters without a learning rate.
 
     Source: GAI-GS, "Results"; optimiser and schedules after the released configuration.
     """
@@ -35,6 +41,8 @@ class Training(lightning.LightningModule):
         self,
         model: Model,
         identity: dict,
+        seed: int,
+        batch_size: int,
         stride: int,
         ssim: float,
         penalties: dict[str, float],
@@ -42,15 +50,16 @@ class Training(lightning.LightningModule):
         final_rate: float,
         warmup: int,
         weight_decay: float,
-        seed: int,
+        patience: int | None,
+        density: dict | None,
     ):
         super().__init__()
-        groups = set(model.parameter_groups())
-        if unset := groups - set(learning_rates):
+        if unset := set(model.parameter_groups()) - set(learning_rates):
             raise ValueError(f"training.learning_rates must give a rate for {', '.join(sorted(unset))}")
-        self.model, self.identity, self.stride, self.ssim = model, identity, stride, ssim
-        self.penalties, self.learning_rates, self.final_rate = penalties, learning_rates, final_rate
-        self.warmup, self.weight_decay, self.seed = warmup, weight_decay, seed
+        self.model, self.identity, self.seed, self.batch_size = model, identity, seed, batch_size
+        self.stride, self.ssim, self.penalties = stride, ssim, penalties
+        self.learning_rates, self.final_rate, self.warmup = learning_rates, final_rate, warmup
+        self.weight_decay, self.patience, self.density = weight_decay, patience, density
 
     def configure_optimizers(self):
         groups = [
@@ -79,13 +88,19 @@ class Training(lightning.LightningModule):
         terms = spectrum_loss(prediction, batch.labels, self.stride)
         loss = (1 - self.ssim) * terms["l1"] + self.ssim * terms["ssim"]
         for name, penalty in penalties.items():
+            if name not in self.penalties:
+                raise ValueError(f"training.penalties must give a weight for {name}; 0 for none")
             loss = loss + self.penalties[name] * penalty
         if not torch.isfinite(loss):
             raise ValueError(
                 f"the loss must stay finite, got {loss.item()} at step {self.global_step}; lower training.learning_rates"
             )
-        self.log_dict({f"train/{name}": term for name, term in (terms | penalties).items()})
-        self.log("train/loss", loss, prog_bar=True)
+        self.log("train/loss", loss, prog_bar=True, logger=False)
+        if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
+            # Now: Lightning would log behind the step's callbacks, and a checkpoint written there would lack the row.
+            values = {f"train/{name}": term.item() for name, term in ({"loss": loss} | terms | penalties).items()}
+            for logger in self.loggers:
+                logger.log_metrics(values, step=self.global_step)
         return loss
 
     def validation_step(self, batch: Batch, _: int) -> None:
@@ -100,8 +115,3 @@ class Training(lightning.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         checkpoint[KEY] = self.identity
-
-    def on_load_checkpoint(self, checkpoint: dict) -> None:
-        weights = checkpoint["state_dict"]
-        if (means := weights.get("model.gaussians.means")) is not None:
-            self.model.gaussians.resize(len(means))

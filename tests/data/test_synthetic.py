@@ -1,9 +1,11 @@
 """The built-in scene: repeatable, learnable, and the same from its folder."""
 
 import inspect
+import re
 import runpy
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -89,7 +91,7 @@ def test_the_scene_repeats_with_its_seed_alone(small):
     assert not torch.equal(small.transmitters, other.transmitters)
 
 
-def test_more_transmitters_begin_with_the_same_or_are_others_but_never_fewer():
+def test_there_are_as_many_places_as_asked_for():
     assert [len(place(count, 0)) for count in (2, 3, 500)] == [2, 3, 500]
 
 
@@ -219,3 +221,13 @@ def test_the_configured_scene_is_built(small):
     config.order_ = 3
     with pytest.raises(ValueError, match=r"has no option 'order_' \(did you mean 'order'\?\)"):
         registry("data").build(config)
+
+
+def test_the_documented_room_is_simulated_and_written(tmp_path, monkeypatch):
+    text = (Path(__file__).parents[2] / "docs" / "data.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    torch.manual_seed(0)
+    exec(code, {})
+    links = nerf2_spectrum.read(tmp_path / "my_room", OFFICIAL)
+    assert (len(links.split.train), len(links.split.test)) == (160, 40)

@@ -22,17 +22,21 @@ static inline job_t find_job(sizes_t sizes, int item, global const int *offsets,
 
 /* One row of a tile from or to an image; pixels beyond its edges read 0. */
 static inline lanes load_row(global const float *image, sizes_t sizes, job_t job, int row) {
-    lanes value = 0;
-    for (int x = 0; x < COLUMNS; x++)
-        if (job.y + row < sizes.height && job.x + x < sizes.width)
-            ((float *)&value)[x] = image[(job.y + row) * sizes.width + job.x + x];
-    return value;
+    global const float *pixels = image + (job.y + row) * sizes.width + job.x;
+    int inside = job.y + row < sizes.height ? sizes.width - job.x : 0;
+    if (inside >= COLUMNS) return *(global const loose_lanes *)pixels;
+    float value[COLUMNS];
+    for (int x = 0; x < COLUMNS; x++) value[x] = x < inside ? pixels[x] : 0;
+    return *(loose_lanes *)value;
 }
 
 static inline void store_row(lanes value, global float *image, sizes_t sizes, job_t job, int row) {
-    for (int x = 0; x < COLUMNS; x++)
-        if (job.y + row < sizes.height && job.x + x < sizes.width)
-            image[(job.y + row) * sizes.width + job.x + x] = ((float *)&value)[x];
+    global float *pixels = image + (job.y + row) * sizes.width + job.x;
+    int inside = job.y + row < sizes.height ? sizes.width - job.x : 0;
+    if (inside >= COLUMNS)
+        *(global loose_lanes *)pixels = value;
+    else
+        for (int x = 0; x < inside; x++) pixels[x] = ((float *)&value)[x];
 }
 
 static inline float sum(lanes v) {
@@ -53,6 +57,24 @@ static inline float largest(const lanes *rows, int count) {
     return as_float(MOST(b.lo, b.hi));
 }
 
+/* One transmitter's map over a tile, as far as it is composited. */
+typedef struct {
+    lanes transmittance[ROWS], colour[CHANNELS][ROWS];
+} map_t;
+
+/* Lays an entry under one row. */
+static inline void blend(map_t *map, int r, lanes g, global const float *look) {
+    lanes raw = g * look[0], before = map->transmittance[r];
+    masks acts = ~(raw < ALPHA_MIN);
+    lanes weight = MASKED(acts, LEAST(raw, ALPHA_MAX)) * before, after = before - weight;
+#if ATTENUATION
+    after *= power_of_two(MASKED(acts, g * look[1]));
+#endif
+    map->transmittance[r] = after;
+#pragma unroll
+    for (int c = 0; c < CHANNELS; c++) map->colour[c][r] += weight * look[1 + ATTENUATION + c];
+}
+
 kernel void forward(sizes_t sizes, global const float *u, global const float *v, global const int *offsets,
                     global const int *counts, global const uint *entries, global const float *geometry,
                     global const float *appearance, global const float *loudest, global float *image,
@@ -61,47 +83,35 @@ kernel void forward(sizes_t sizes, global const float *u, global const float *v,
     int area = sizes.height * sizes.width;
     if (sizes.sets > 1) geometry += job.first * sizes.words * 32 * GEOMETRY;
     appearance += job.first * APPEARANCE;
-    lanes transmittance[TRANSMITTERS][ROWS], colour[TRANSMITTERS][CHANNELS][ROWS];
+    map_t maps[TRANSMITTERS];
     for (int t = 0; t < job.count; t++)
         for (int r = 0; r < ROWS; r++) {
-            transmittance[t][r] = 1;
-            for (int c = 0; c < CHANNELS; c++) colour[t][c][r] = 0;
+            maps[t].transmittance[r] = 1;
+            for (int c = 0; c < CHANNELS; c++) maps[t].colour[c][r] = 0;
         }
     int done = 0, k = job.begin;
     while (k < job.end && done < job.count) {
         for (int pause = LEAST(k + 16, job.end); k < pause; k++) {
             uint entry = entries[k], i = entry & 0xffffff, first = entry >> 24 & 15, last = entry >> 28;
             view_t view = view_splat(load_splat(geometry + i * GEOMETRY), u, v, sizes, job.tile);
-            global const float *looks = appearance + i * sizes.transmitters * APPEARANCE;
-            for (uint r = first; r <= last; r++) {
-                lanes g = footprint(offsets_of(&view, r));
-                for (int t = 0; t < job.count; t++) {
-                    global const float *look = looks + t * APPEARANCE;
-                    lanes alpha = g * look[0], before = transmittance[t][r];
-                    masks acts = alpha >= ALPHA_MIN;
-                    lanes weight = MASKED(acts, LEAST(alpha, ALPHA_MAX)) * before;
-                    lanes behind = before - weight;
-#if ATTENUATION
-                    behind *= power_of_two(MASKED(acts, g * look[1]));
-#endif
-                    transmittance[t][r] = behind;
-#pragma unroll
-                    for (int c = 0; c < CHANNELS; c++) colour[t][c][r] += weight * look[1 + ATTENUATION + c];
-                }
+            lanes footprints[ROWS];
+            for (uint r = first; r <= last; r++) footprints[r] = footprint(offsets_of(&view, r));
+            for (int t = 0; t < job.count; t++) {
+                global const float *look = appearance + (i * sizes.transmitters + t) * APPEARANCE;
+                for (uint r = first; r <= last; r++) blend(maps + t, r, footprints[r], look);
             }
         }
         for (done = 0; done < job.count; done++) {
-            float most = largest(transmittance[done], ROWS);
-            if (most > NEGLIGIBLE) break;
-            if (most * loudest[job.first + done] > NEGLIGIBLE * largest(colour[done][0], CHANNELS * ROWS)) break;
+            float dark = largest(maps[done].transmittance, ROWS), bright = largest(maps[done].colour[0], CHANNELS * ROWS);
+            if (!(dark <= NEGLIGIBLE && dark * loudest[job.first + done] <= NEGLIGIBLE * bright)) break;
         }
     }
     stops[get_global_id(0)] = k;
     for (int t = 0; t < job.count; t++)
         for (int r = 0; r < ROWS; r++) {
-            store_row(transmittance[t][r], left + (job.first + t) * area, sizes, job, r);
+            store_row(maps[t].transmittance[r], left + (job.first + t) * area, sizes, job, r);
             for (int c = 0; c < CHANNELS; c++)
-                store_row(colour[t][c][r], image + ((job.first + t) * CHANNELS + c) * area, sizes, job, r);
+                store_row(maps[t].colour[c][r], image + ((job.first + t) * CHANNELS + c) * area, sizes, job, r);
         }
 }
 
@@ -130,7 +140,7 @@ typedef struct {
  * that the walk is the forward's own. */
 static inline lanes pass(state_t *state, int r, lanes g, global const float *look, found_t *found) {
     lanes raw = g * look[0], before = state->transmittance[r], d = 0;
-    masks acts = raw >= ALPHA_MIN;
+    masks acts = ~(raw < ALPHA_MIN);
     lanes alpha = MASKED(acts, LEAST(raw, ALPHA_MAX)), weight = alpha * before;
 #pragma unroll
     for (int c = 0; c < CHANNELS; c++) {
@@ -138,7 +148,7 @@ static inline lanes pass(state_t *state, int r, lanes g, global const float *loo
         found->signal[c] += state->gradient[c][r] * weight;
     }
     lanes behind = state->behind[r] - weight * d, after = before - weight;
-    lanes flow = MASKED(raw < ALPHA_MAX, alpha * (before * d - behind / (1 - alpha)));
+    lanes flow = MASKED(~(raw >= ALPHA_MAX), alpha * (before * d - behind / (1 - alpha)));
     found->opacity += flow;
 #if ATTENUATION
     lanes covered = MASKED(acts, g * behind);
@@ -157,12 +167,19 @@ typedef struct {
 } moments_t;
 
 static inline void add_moments(moments_t *moments, lanes flow, offsets_t at) {
+#if SEPARABLE
+    lanes flow_y = flow * at.y;
+    moments->s += flow;
+    moments->y += flow_y;
+    moments->yy += flow_y * at.y;
+#else
     lanes flow_s = flow * at.s, flow_y = flow * at.y;
     moments->s += flow_s;
     moments->y += flow_y;
     moments->ss += flow_s * at.s;
     moments->sy += flow_s * at.y;
     moments->yy += flow_y * at.y;
+#endif
 }
 
 kernel void backward(sizes_t sizes, global const float *u, global const float *v, global const int *offsets,
@@ -194,31 +211,25 @@ kernel void backward(sizes_t sizes, global const float *u, global const float *v
         global const float *looks = appearance + i * sizes.transmitters * APPEARANCE;
         global float *partial = partials + (size_t)k * PARTIALS;
         moments_t moments = {0, 0, 0, 0, 0};
-#if TRANSMITTERS > 1
         lanes footprints[ROWS], flows[ROWS];
         for (uint r = first; r <= last; r++) {
             footprints[r] = footprint(offsets_of(&view, r));
             flows[r] = 0;
         }
-#endif
         for (int t = 0; t < job.count; t++) {
             global const float *look = looks + t * APPEARANCE;
             found_t found = {0};
-            for (uint r = first; r <= last; r++) {
-#if TRANSMITTERS > 1
-                flows[r] += pass(states + t, r, footprints[r], look, &found);
-#else
-                offsets_t at = offsets_of(&view, r);
-                add_moments(&moments, pass(states, r, footprint(at), look, &found), at);
-#endif
-            }
+            for (uint r = first; r <= last; r++) flows[r] += pass(states + t, r, footprints[r], look, &found);
             global float *sums = partial + MOMENTS + t * APPEARANCE;
             sums[0] = sum(found.opacity);
             if (ATTENUATION) sums[1] = sum(found.attenuation);
             for (int c = 0; c < CHANNELS; c++) sums[1 + ATTENUATION + c] = sum(found.signal[c]);
         }
-#if TRANSMITTERS > 1
         for (uint r = first; r <= last; r++) add_moments(&moments, flows[r], offsets_of(&view, r));
+#if SEPARABLE
+        moments.s *= view.s;
+        moments.ss = moments.s * view.s;
+        moments.sy = moments.y * view.s;
 #endif
         partial[0] = sum(moments.s);
         partial[1] = sum(moments.y);
@@ -237,7 +248,7 @@ kernel void gather(sizes_t sizes, global const int *order, global const uint *bi
                    global const float *geometry, global const float *appearance, global const float *partials,
                    global float *means, global float *covariances, global float *signal, global float *opacities,
                    global float *attenuations) {
-    int word = get_global_id(0), rest = sizes.seen - word * 32, size = LEAST(rest, 32);
+    int word = get_global_id(0), rest = sizes.splats - word * 32, size = LEAST(rest, 32);
     int tiles = sizes.down * sizes.across, shared_set = sizes.sets == 1;
     float sums[32][PARTIALS], centres[32][2];
     for (int j = 0; j < 32; j++) centres[j][0] = centres[j][1] = 0;

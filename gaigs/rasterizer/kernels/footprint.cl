@@ -22,20 +22,19 @@
 
 typedef float8 lanes;
 typedef int8 masks;
-/* Vectors in shared buffers, which the host does not align. */
-typedef float8 __attribute__((aligned(4))) loose_lanes;
-typedef float4 __attribute__((aligned(4))) loose_span;
-typedef float16 __attribute__((aligned(4))) loose_rows;
+typedef float8 __attribute__((aligned(4))) loose_lanes; /* in buffers, where nothing aligns them */
 
 #define MASKED(mask, value) as_float8((mask) & as_int8(value))
-#define LEAST(a, b) ((a) < (b) ? (a) : (b))
-#define MOST(a, b) ((a) > (b) ? (a) : (b))
-/* Place of the lowest bit: the exponent of that power of two. */
-#define LOWEST(bits) ((as_uint((float)((bits) & -(bits))) >> 23) - 127)
+/* Here as in all comparisons NaN in `a` stays: what is broken must show. */
+#define LEAST(a, b) ((b) < (a) ? (b) : (a))
+#define MOST(a, b) ((b) > (a) ? (b) : (a))
+/* Places of the highest bit of up to 24, and of the lowest: a float's exponent. */
+#define HIGHEST(bits) ((as_uint((float)(bits)) >> 23) - 127)
+#define LOWEST(bits) HIGHEST((bits) & -(bits))
 
 typedef struct {
     int transmitters, sets, groups, group; /* sets of lists; groups of `group` transmitters, which share a work-item */
-    int splats, seen, words;               /* as handed over; visible; the latter in words of 32 bits */
+    int splats, words;                     /* the latter of 32 splats */
     int height, width, down, across;       /* of the image in pixels; in tiles */
     int entries;                           /* of all lists */
 } sizes_t;

@@ -1,0 +1,263 @@
+"""The OpenCL rasterizer against the dense float64 one, over random scenes and hard ones; its devices and its errors."""
+
+import math
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from reference import margin, rasterize
+
+from gaigs.geometry import Pose
+from gaigs.projection import Plane, Splats
+from gaigs.projection.direction_cosine import DirectionCosine
+from gaigs.projection.equirectangular import Equirectangular
+from gaigs.projection.mercator import Mercator
+
+opencl = pytest.importorskip("gaigs.rasterizer.opencl", exc_type=ImportError)
+
+VALUES, GRADIENTS = 2e-6, 1e-5
+"""Tolerances, of the image's largest value and of each parameter's largest gradient."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """The dense rasterizer's many small steps are faster without waiting for each other's threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@dataclass
+class Scene:
+    splats: Splats
+    signal: torch.Tensor
+    opacities: torch.Tensor
+    attenuations: torch.Tensor | None
+    plane: Plane
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        names = {"means2d": self.splats.means2d, "covariances2d": self.splats.covariances2d}
+        names |= {"signal": self.signal, "opacities": self.opacities, "attenuations": self.attenuations}
+        return {name: tensor for name, tensor in names.items() if tensor is not None}
+
+
+def grid(projection, rows=37, columns=60) -> Plane:
+    """A plane whose rows and columns fill no whole number of tiles."""
+    return projection.plane(torch.linspace(0.02, 1.45, rows), torch.arange(columns) * (2 * math.pi / columns))
+
+
+def random_scene(n=60, b=3, c=2, own=False, attenuations=None, plane=None, spread=(0.05, 0.6), opacities=(0.0, 0.95), seed=0):
+    """Splats all over the plane; ``spread`` bounds the standard deviations, log-uniform, along two random axes."""
+    generator = torch.Generator().manual_seed(seed)
+    uniform = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
+    plane = plane or grid(Mercator(0.1))
+    u = uniform(plane.u.min(), plane.u.max(), n)
+    if plane.period is not None:
+        u = (u + math.pi).remainder(plane.period) - math.pi  # as atan2 gives azimuths, whatever the grid counts from
+    angles = uniform(0, math.pi, b if own else 1, n)
+    axes = torch.stack((angles.cos(), -angles.sin(), angles.sin(), angles.cos()), -1).unflatten(-1, (2, 2))
+    half = axes * uniform(*map(math.log, spread), len(angles), n, 2).exp()[..., None, :]
+    splats = Splats(
+        torch.stack((u, uniform(plane.v.min(), plane.v.max(), n)), -1),
+        half @ half.mT,
+        uniform(0.5, 5, n),
+        uniform(0, 1, n) > 0.05,
+    )
+    signal = torch.randn(b, n, c, generator=generator)
+    return Scene(splats, signal, uniform(*opacities, b, n), attenuations and uniform(*attenuations, b, n), plane)
+
+
+def at_the_seam() -> Scene:
+    scene = random_scene(spread=(0.02, 0.3))
+    scene.splats.means2d[:, 0] = torch.linspace(-0.3, 0.3, 60).sub(math.pi).remainder(2 * math.pi).sub(math.pi)
+    return replace(scene, plane=Plane(scene.plane.u - math.pi, scene.plane.v, scene.plane.period))
+
+
+def at_the_pole() -> Scene:
+    projection = Equirectangular(0.1)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(40, 3, generator=generator) * 0.1 + torch.tensor([0.0, 0.0, 2.0])
+    pose = Pose(torch.zeros(3), torch.eye(3))
+    splats = projection.project(points, 0.02 * torch.eye(3).expand(1, 40, 3, 3), pose)
+    return replace(random_scene(n=40, plane=grid(projection)), splats=splats)
+
+
+def needles() -> Scene:
+    """Diagonal splats forty times as long as wide: the covariance's determinant is a small difference of products."""
+    scene = random_scene()
+    half = math.sqrt(0.5) * torch.tensor([[1.0, -1.0], [1.0, 1.0]]) * torch.tensor([0.8, 0.02])
+    return replace(scene, splats=replace(scene.splats, covariances2d=(half @ half.mT).repeat(1, 60, 1, 1)))
+
+
+def equal_depths() -> Scene:
+    scene = random_scene()
+    scene.splats.depths[:] = scene.splats.depths.round()
+    return scene
+
+
+def invisible_garbage() -> Scene:
+    scene = random_scene()
+    scene.splats.covariances2d[:, ~scene.splats.visible] = torch.nan
+    scene.splats.means2d[~scene.splats.visible] = torch.inf
+    return scene
+
+
+def loud_behind_walls() -> Scene:
+    """Every layer lets 0.3 through and the next is four times as loud: what is behind matters however dark it is."""
+    scene = random_scene(n=24, b=1, spread=(20.0, 20.0), opacities=(0.7, 0.7))
+    scene.splats.depths[:] = torch.arange(24.0)
+    return replace(scene, signal=scene.signal * (4.0 ** torch.arange(24))[:, None])
+
+
+def unsorted_plane() -> Scene:
+    plane = grid(Mercator(0.1))
+    shuffle = torch.Generator().manual_seed(0)
+    u, v = plane.u[:, torch.randperm(60, generator=shuffle)], plane.v[torch.randperm(37, generator=shuffle)]
+    return random_scene(plane=Plane(u, v, plane.period))
+
+
+SCENES = {
+    "random": random_scene,
+    "another": lambda: random_scene(n=150, spread=(0.02, 0.1), seed=1),
+    "own covariances": lambda: random_scene(own=True),
+    "no period": lambda: random_scene(plane=replace(grid(Mercator(0.1)), period=None)),
+    "equirectangular": lambda: random_scene(plane=grid(Equirectangular(0.1)), own=True, attenuations=(0.5, 1)),
+    "direction cosines": lambda: random_scene(plane=grid(DirectionCosine(0.1))),
+    "direction cosines, own": lambda: random_scene(plane=grid(DirectionCosine(0.1)), own=True, attenuations=(0.1, 1)),
+    "attenuation": lambda: random_scene(attenuations=(0.3, 1.0)),
+    "strong attenuation": lambda: random_scene(attenuations=(1e-6, 1e-2)),
+    "no attenuation left": lambda: random_scene(attenuations=(1.0, 1.0)),
+    "one channel": lambda: random_scene(c=1),
+    "eight channels": lambda: random_scene(c=8),
+    "one transmitter": lambda: random_scene(b=1),
+    "many transmitters": lambda: random_scene(n=30, b=19),
+    "one splat": lambda: random_scene(n=1),
+    "no transmitter": lambda: random_scene(b=0),
+    "nothing visible": lambda: random_scene(opacities=(0.0, 0.0)),
+    "invisible garbage": invisible_garbage,
+    "equal depths": equal_depths,
+    "empty tiles": lambda: random_scene(n=5, spread=(0.03, 0.05)),
+    "narrower than a pixel": lambda: random_scene(n=150, spread=(0.005, 0.05)),
+    "wider than the plane": lambda: random_scene(spread=(3.0, 30.0)),
+    "needles": needles,
+    "narrow and wide": lambda: random_scene(spread=(0.02, 2.0), seed=2),
+    "opaque": lambda: random_scene(n=120, spread=(0.3, 2.0), opacities=(1.0, 1.0)),
+    "nearly opaque": lambda: random_scene(n=120, spread=(0.3, 2.0), opacities=(0.8, 0.99), attenuations=(0.1, 1.0)),
+    "loud behind walls": loud_behind_walls,
+    "at the seam": at_the_seam,
+    "at the pole": at_the_pole,
+    "unsorted plane": unsorted_plane,
+    "one pixel": lambda: random_scene(plane=grid(Mercator(0.1), 1, 1)),
+    "one row": lambda: random_scene(plane=grid(Mercator(0.1), 1, 50)),
+    "one column": lambda: random_scene(plane=grid(DirectionCosine(0.1), 50, 1)),
+}
+
+
+def render(rasterizer, scene: Scene, pixels: torch.Tensor):
+    """Map, transmittance, and the gradients of a random function of both at ``pixels``."""
+    parameters = {name: tensor.clone().requires_grad_() for name, tensor in scene.parameters().items()}
+    image, left = rasterizer(
+        replace(scene.splats, means2d=parameters["means2d"], covariances2d=parameters["covariances2d"]),
+        parameters["signal"],
+        parameters["opacities"],
+        parameters.get("attenuations"),
+        scene.plane,
+    )
+    generator = torch.Generator().manual_seed(0)
+    image_gradient, left_gradient = (torch.randn(tensor.shape, generator=generator) for tensor in (image, left))
+    (image * image_gradient * pixels[:, None]).sum().add((left * left_gradient * pixels).sum()).backward()
+    return image.detach(), left.detach(), {name: tensor.grad for name, tensor in parameters.items()}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_agrees_with_the_dense_float64_rasterizer(name):
+    scene = SCENES[name]()
+    # Where a G meets one of its bounds to within rounding, the two may decide differently.
+    pixels = (margin(scene.splats, scene.opacities, scene.plane) > 1e-5).float()
+    assert pixels.mean() > 0.99 or not pixels.numel()
+    image, left, gradients = render(opencl.OpenCLRasterizer(), scene, pixels)
+    true_image, true_left, true_gradients = render(rasterize, scene, pixels)
+    assert image.dtype == left.dtype == torch.float32
+    torch.testing.assert_close(image * pixels[:, None], (true_image * pixels[:, None]).float(), rtol=0, atol=VALUES * largest(true_image))
+    torch.testing.assert_close(left * pixels, (true_left * pixels).float(), rtol=0, atol=VALUES)
+    for parameter, true_gradient in true_gradients.items():
+        tolerance = GRADIENTS * largest(true_gradient)
+        torch.testing.assert_close(gradients[parameter], true_gradient, rtol=0, atol=tolerance, msg=lambda m, p=parameter: f"{p}: {m}")
+
+
+def largest(tensor: torch.Tensor) -> float:
+    return tensor.abs().max().item() if tensor.numel() else 0.0
+
+
+def test_no_splat_leaves_an_empty_map():
+    scene = random_scene(n=0)
+    image, left, gradients = render(opencl.OpenCLRasterizer(), scene, torch.ones(3, *scene.plane.shape))
+    assert torch.equal(image, torch.zeros(3, 2, *scene.plane.shape))
+    assert torch.equal(left, torch.ones(3, *scene.plane.shape))
+    assert all(gradient.numel() == 0 for gradient in gradients.values())
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_two_runs_give_the_same_bits(own):
+    scene = random_scene(n=400, b=5, own=own, attenuations=(0.3, 1.0))
+    pixels = torch.ones(5, *scene.plane.shape)
+    first, second = (render(opencl.OpenCLRasterizer(), scene, pixels) for _ in range(2))
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1], second[1])
+    assert all(torch.equal(first[2][name], second[2][name]) for name in first[2])
+
+
+def test_reads_tensors_of_any_layout():
+    scene = random_scene(plane=grid(DirectionCosine(0.1)))
+    pixels = torch.ones(3, *scene.plane.shape)
+    image, left, gradients = render(opencl.OpenCLRasterizer(), scene, pixels)
+    strided = lambda tensor: tensor.mT.contiguous().mT
+    scene.signal, scene.opacities = strided(scene.signal), strided(scene.opacities)
+    scene.splats = replace(scene.splats, means2d=strided(scene.splats.means2d), depths=scene.splats.depths.repeat_interleave(2)[::2])
+    scene.plane = replace(scene.plane, u=strided(scene.plane.u), v=strided(scene.plane.v))
+    same_image, same_left, same_gradients = render(opencl.OpenCLRasterizer(), scene, pixels)
+    assert torch.equal(image, same_image)
+    assert torch.equal(left, same_left)
+    assert all(torch.equal(gradients[name], same_gradients[name]) for name in gradients)
+
+
+def test_lists_a_device_and_takes_it_by_any_part_of_its_name(monkeypatch):
+    name = opencl.devices()[0]
+    opencl.OpenCLRasterizer(device=name[3:-3].upper())
+    monkeypatch.setenv("GAIGS_OPENCL_DEVICE", name)
+    opencl.OpenCLRasterizer()
+
+
+def test_an_unknown_device_is_an_error_that_lists_those_there_are(monkeypatch):
+    with pytest.raises(ValueError, match="no OpenCL device is called 'abacus'; there are: .*PU"):
+        opencl.OpenCLRasterizer(device="abacus")
+    monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "slide rule")
+    with pytest.raises(ValueError, match="'slide rule'"):
+        opencl.OpenCLRasterizer()
+
+
+def test_no_driver_is_an_error_that_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(opencl.cl, "get_platforms", lambda: [])
+    with pytest.raises(RuntimeError, match=r"needs an OpenCL driver: pip install 'pyopencl\[pocl\]'"):
+        opencl.devices()
+
+
+def test_kernels_that_do_not_build_are_an_error_that_names_the_device(monkeypatch):
+    monkeypatch.setattr(opencl, "_literal", lambda value: "(")
+    scene = random_scene()
+    with pytest.raises(RuntimeError, match="cannot build the kernels; use rasterizer=torch"):
+        render(opencl.OpenCLRasterizer(), scene, torch.ones(3, *scene.plane.shape))
+
+
+def test_tensors_it_cannot_read_are_errors_that_say_what_to_do():
+    rasterizer, scene = opencl.OpenCLRasterizer(), random_scene()
+    call = lambda **changes: rasterizer(*vars(replace(scene, **changes)).values())
+    with pytest.raises(TypeError, match=r"float32 on the CPU, got signal as torch.float64 on cpu; use rasterizer=torch"):
+        call(signal=scene.signal.double())
+    with pytest.raises(TypeError, match="got opacities as torch.float32 on meta"):
+        call(opacities=scene.opacities.to("meta"))
+    with pytest.raises(ValueError, match=r"opacities must be \(3, 60\) where signal is \(3, 60, 2\), got \(3, 59\)"):
+        call(opacities=scene.opacities[:, 1:])
+    with pytest.raises(ValueError, match="1 to 8 channels, got 9"):
+        call(signal=torch.zeros(3, 60, 9))
