@@ -2,7 +2,6 @@
 
 import logging
 import sys
-import warnings
 from pathlib import Path
 
 import hydra
@@ -47,9 +46,6 @@ def run(config: DictConfig) -> None:
 
 def main() -> None:
     """The console script ``gaigs``."""
-    # Hydra writes into the run folder before Lightning looks whether it is empty; the others are advice on what we do not do.
-    for message in (".*exists and is not empty", ".*LeafSpec", ".*does not have many workers"):
-        warnings.filterwarnings("ignore", message)
     configuration.install()
     hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import torch
+from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 
 from gaigs.data import Scene
 from gaigs.model import Model
@@ -47,11 +48,11 @@ def load(path: str | Path) -> Model:
     """
     content = read(path)
     model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(content[KEY]["scene"]))
-    prefix = "model."
-    weights = {key.removeprefix(prefix): value for key, value in content["state_dict"].items() if key.startswith(prefix)}
+    weights = content["state_dict"]
+    consume_prefix_in_state_dict_if_present(weights, "model.")
     try:
         model.load_state_dict(weights)
     except RuntimeError as error:  # one line a tensor
         defects = " ".join(str(error).split())
-        raise ValueError(f"{path} holds weights that do not fit its configuration in this version: {defects}") from error
+        raise ValueError(f"{path} must hold the weights of its configuration, and does not: {defects}") from error
     return model.eval()

@@ -6,6 +6,7 @@ import platform
 import signal
 import statistics
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -144,7 +145,7 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
     module = call("training", Training, config["training"], model=model, identity=identity, seed=config["seed"])
     last, best = folder / "last.ckpt", folder / "best.ckpt"
     timer, keep_last = Timer(), KeepLast(last, config["save_every"])
-    callbacks = [timer, KeepBest(best, module.patience), keep_last]
+    callbacks = [timer, KeepBest(best, module.patience), keep_last]  # Lightning puts the last two behind all others
     if module.density is not None:
         callbacks.append(call("training.density", DensityControl, module.density, seed=config["seed"]))
     if config["trainer"].get("enable_progress_bar", True):
@@ -154,8 +155,9 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
         loggers.append(tensorboard_logger(folder))
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
     trainer = call("trainer", lightning.Trainer, config["trainer"], **context)
-    if trainer.world_size > 1:
-        raise ValueError(f"trainer.devices must be 1, got {trainer.world_size}; batches are not shared among processes")
+    for option, count in (("devices", trainer.world_size), ("accumulate_grad_batches", trainer.accumulate_grad_batches)):
+        if count != 1:
+            raise ValueError(f"trainer.{option} must be 1, got {count}; a step is one batch of training.batch_size")
     batches = Batches(links, links.split.train, module.batch_size, config["seed"], trainer.max_steps)
     validation = Pass(links, links.split.validation, module.batch_size) if len(links.split.validation) else None
     resume = None
@@ -164,15 +166,19 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
         log.info("going on after step %d", checkpoint.read(last)["global_step"])
     handler = signal.signal(signal.SIGINT, keep_last.interrupt)
     try:
-        trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
+        with warnings.catch_warnings():
+            # Of Lightning's own dealings with torch, and of a split without validation links.
+            for message in (".*LeafSpec", "You defined a `validation_step` but have no `val_dataloader`"):
+                warnings.filterwarnings("ignore", message)
+            trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     except Interrupted as stop:
         raise KeyboardInterrupt(str(stop)) from None
     finally:
         signal.signal(signal.SIGINT, handler)
-    seconds, steps = timer.time_elapsed("train"), trainer.global_step
-    rate = steps / seconds
-    log.info("trained %d steps of %d transmitters in %.0f s: %.1f steps/s", steps, module.batch_size, seconds, rate)
-    return checkpoint.load(best).to(trainer.strategy.root_device), seconds
+    seconds, steps, size = timer.time_elapsed("train"), trainer.global_step, module.batch_size
+    log.info("trained %d steps of %d transmitters in %.0f s: %.1f steps/s", steps, size, seconds, steps / seconds)
+    module.load_state_dict(checkpoint.read(best)["state_dict"])
+    return model.eval().to(trainer.strategy.root_device), seconds
 
 
 def test(model: Model, name: str, links: Links, folder: Path) -> dict[str, dict[str, float]]:

@@ -43,18 +43,23 @@ class TokenLinear(nn.Module):
     def __init__(self, tokens: tuple[int, int, int], width: int, hidden: int = 0):
         super().__init__()
         scene, gaussian, transmitter = tokens
-        self.links = nn.utils.skip_init(nn.Linear, scene + transmitter, width)
-        self.gaussians = nn.Linear(gaussian, width, bias=False) if gaussian else None
-        self.hidden = nn.Linear(hidden, width, bias=False) if hidden else None
+        self.bias = nn.Parameter(torch.empty(width))
+        self.links, self.gaussians, self.hidden = (
+            nn.Linear(part, width, bias=False) if part else None for part in (scene + transmitter, gaussian, hidden)
+        )
         bound = max(scene + gaussian + transmitter + hidden, 1) ** -0.5
         for parameter in self.parameters():  # as one layer over the whole concatenation would start
             nn.init.uniform_(parameter, -bound, bound)
 
     def forward(self, tokens: Tokens, hidden: Float[Tensor, "b n h"] | None = None) -> Float[Tensor, "b n width"]:
-        result = self.links(torch.cat((tokens.scene, tokens.transmitters), -1))[:, None]
+        result = self.bias
+        if self.links is not None:
+            result = result + self.links(torch.cat((tokens.scene, tokens.transmitters), -1))[:, None]
         if self.gaussians is not None:
             result = result + self.gaussians(tokens.gaussians)
-        return result if hidden is None else result + self.hidden(hidden)
+        if self.hidden is not None:
+            result = result + self.hidden(hidden)
+        return result.expand(len(tokens.scene), len(tokens.gaussians), -1)
 
 
 class ResidualLayer(nn.Module):

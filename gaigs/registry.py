@@ -182,7 +182,7 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
         what: Whose options they are, as errors call it.
         function: Its parameters are the options.
         options: By name.
-        context: What the caller knows and no configuration says; passed where the function has a parameter of that name.
+        context: What the caller knows and no configuration says; passed where the function has such a parameter.
 
     Raises:
         TypeError: The options are no mapping.

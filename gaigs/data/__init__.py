@@ -2,8 +2,10 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gaigs.geometry import Pose
@@ -57,6 +59,7 @@ class Scene:
     Attributes:
         receivers: Who hears.
         lower, upper: Corners of the box that holds the training transmitters, world frame (3,) [m].
+        spacing: Median distance from a training transmitter to the next one elsewhere [m].
         grid: Directions of the label's pixels; None where the label is no spectrum.
         normalisation: How the labels were scaled, in words of docs/data.md.
     """
@@ -64,6 +67,7 @@ class Scene:
     receivers: tuple[Receiver, ...]
     lower: Float[Tensor, "3"]
     upper: Float[Tensor, "3"]
+    spacing: float
     grid: Grid | None
     normalisation: str
 
@@ -73,6 +77,7 @@ class Scene:
             "receivers": [[r.name, r.pose.position, r.pose.rotation] for r in self.receivers],
             "lower": self.lower,
             "upper": self.upper,
+            "spacing": self.spacing,
             "grid": None if self.grid is None else [self.grid.elevations, self.grid.azimuths],
             "normalisation": self.normalisation,
         }
@@ -82,7 +87,7 @@ class Scene:
         """The inverse of ``state``."""
         receivers = tuple(Receiver(name, Pose(position, rotation)) for name, position, rotation in state["receivers"])
         grid = None if state["grid"] is None else Grid(*state["grid"])
-        return cls(receivers, state["lower"], state["upper"], grid, state["normalisation"])
+        return cls(receivers, state["lower"], state["upper"], state["spacing"], grid, state["normalisation"])
 
 
 @dataclass(frozen=True)
@@ -131,6 +136,14 @@ class Links:
 
     @property
     def scene(self) -> Scene:
-        """What a model is built from."""
-        train = self.transmitters[self.split.train]
-        return Scene(self.receivers, train.amin(0), train.amax(0), self.grid, self.normalisation)
+        """What a model is built from.
+
+        Raises:
+            ValueError: All training transmitters stand at one point.
+        """
+        train = self.transmitters[self.split.train].unique(dim=0)
+        if len(train) < 2:
+            raise ValueError(f"training takes transmitters at two points or more, got {len(train)}; check the split")
+        distances, _ = cKDTree(train.double().numpy()).query(train.double().numpy(), k=2)
+        spacing = float(np.median(distances[:, 1]))
+        return Scene(self.receivers, train.amin(0), train.amax(0), spacing, self.grid, self.normalisation)

@@ -255,10 +255,10 @@ class _Render:
 
     def _share(self, values):
         """The host's memory as the device sees it, on a CPU the same; nothing is the null pointer."""
-        if isinstance(values, Tensor):
-            values = values.detach().contiguous().numpy()
-        if values is None or not values.size:
+        if values is None or not len(values):
             return None
+        if isinstance(values, Tensor):
+            values = values.detach().numpy()
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
         return cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(values))
 
@@ -283,7 +283,7 @@ def _rest(value: float) -> str:
 
 def _front_to_back(depths: Tensor) -> np.ndarray:
     """Indices by depth, ties by index: sorted as integers, whose low half is the index."""
-    bits = depths.detach().contiguous().numpy().view(np.int32)
+    bits = np.ascontiguousarray(depths.detach().numpy()).view(np.int32)
     bits = bits ^ (bits >> 31 & 0x7FFFFFFF)  # integers in the order of the floats, negative ones too
     keys = (bits.astype(np.int64) << 32) + np.arange(len(bits))
     keys.sort()

@@ -80,7 +80,8 @@ def room(
         if cloud is not None:
             label = f"|signal| × opacity, {len(cloud.means):,} strongest of {count:,} Gaussians"
             figure.colorbar(gaussians, ax=(plan, side), label=label, aspect=30, shrink=0.7, extend="max")
-        figure.legend(*plan.get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=1.5)
+        columns = 3 if figure.get_figwidth() > 5.5 else 2
+        figure.legend(*plan.get_legend_handles_labels(), loc="outside lower center", ncols=columns, markerscale=1.5)
     return figure
 
 

@@ -10,6 +10,10 @@ from gaigs.data import Scene
 from gaigs.registry import register
 from gaigs.tokenizer import Tokens
 
+PERIOD = 16
+"""The shortest period of the transmitter's features over the distance between neighbouring training transmitters; chosen on
+validation parts of rfid-s23-200 and the built-in room."""
+
 
 @register("tokenizer", "euclidean")
 class EuclideanTokenizer(nn.Module):
@@ -20,7 +24,8 @@ class EuclideanTokenizer(nn.Module):
     Args:
         scene: Positions are taken relative to the middle of the transmitters' box, and of the receivers.
         gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a metre.
-        transmitter_octaves: The same for the transmitter. Its spectrum changes within half a wavelength.
+        transmitter_octaves: The same for the transmitter; None takes those that the training transmitters can teach, see
+            ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
         width: Width of E(P_TX).
 
@@ -33,7 +38,7 @@ class EuclideanTokenizer(nn.Module):
         self,
         scene: Scene,
         gaussian_octaves: tuple[int, int],
-        transmitter_octaves: tuple[int, int],
+        transmitter_octaves: tuple[int, int] | None,
         hidden: int,
         width: int,
     ):
@@ -42,6 +47,7 @@ class EuclideanTokenizer(nn.Module):
         self.register_buffer("receivers_middle", positions.mean(0))
         self.register_buffer("transmitters_middle", (scene.lower + scene.upper) / 2)
         self.register_buffer("gaussian_frequencies", octaves("gaussian_octaves", *gaussian_octaves))
+        transmitter_octaves = transmitter_octaves or learnable_octaves(scene)
         self.register_buffer("transmitter_frequencies", octaves("transmitter_octaves", *transmitter_octaves))
         self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
         self.transmitter_width = width
@@ -55,6 +61,17 @@ class EuclideanTokenizer(nn.Module):
         gaussians = fourier_features(means - self.receivers_middle, self.gaussian_frequencies)
         features = fourier_features(transmitters - self.transmitters_middle, self.transmitter_frequencies)
         return Tokens(transmitters.new_zeros(len(transmitters), 0), gaussians, self.network(features))
+
+
+def learnable_octaves(scene: Scene) -> tuple[int, int]:
+    """Lowest and highest octave of features of the transmitter, as far as the training transmitters bear them out.
+
+    Periods go from twice the box's longest edge down to ``PERIOD`` distances between neighbouring transmitters: the network
+    multiplies frequencies, so what it is given must be well below what these sample.
+    """
+    edge = (scene.upper - scene.lower).max().item()
+    highest = round(-math.log2(PERIOD * scene.spacing))
+    return min(highest, math.floor(-math.log2(2 * edge))), highest
 
 
 def octaves(option: str, lowest: int, highest: int) -> Float[Tensor, "octaves"]:

@@ -1,4 +1,4 @@
-"""Batches of links: shuffled for training, such that a run can stop anywhere and go on exactly there; in order for scores."""
+"""Batches of links: shuffled for training, such that a run can stop anywhere and go on there; in order for scores."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""What happens between the steps: density control, checkpoints that a killed run goes on from, and a line that tells how far it is."""
+"""What happens between the steps: density control, checkpoints to go on from, a line that tells how far it is."""
 
 import math
 import time
@@ -16,8 +16,8 @@ class DensityControl(Callback):
     """Prunes, clones and splits Gaussians on a schedule.
 
     A Gaussian that the loss pulls at, though it is already where it should be, is too few: its mean positional gradient
-    since the last time, times its distance to the receivers' middle (a pull per radian seen from there), is compared with
-    ``gradient``. Wide ones split, narrow ones are cloned.
+    since the last time, times its distance to the receivers' middle (a pull per radian seen from there), is compared
+    with ``gradient``. Wide ones split, narrow ones are cloned.
 
     Args:
         every: Steps between two rounds.
@@ -136,8 +136,8 @@ class KeepLast(Checkpoint):
     """Writes the checkpoint to go on from: every so often, at Ctrl-C, and at the end.
 
     It does so between two steps, behind the validation where one is due, and behind the other callbacks, whose state it
-    stores: from there a training goes on as if it had never stopped. At the first Ctrl-C it stops there, at the second at
-    once.
+    stores: from there a training goes on as if it had never stopped. At the first Ctrl-C it stops there, at the second
+    at once.
 
     Args:
         path: Where it goes.
@@ -192,8 +192,9 @@ class ProgressLine(ProgressBar):
     """Steps done, their rate, the time left, loss and validation SSIM in one line of the terminal."""
 
     def on_train_start(self, trainer, module) -> None:
+        bar, count, left = BarColumn(None), MofNCompleteColumn(), TimeRemainingColumn()
         rate, scores = "{task.fields[rate]:.1f} steps/s", "{task.fields[scores]}"
-        self.line = Progress("training", BarColumn(None), MofNCompleteColumn(), rate, TimeRemainingColumn(), scores, expand=True)
+        self.line = Progress("training", bar, count, rate, left, scores, expand=True)
         self.start, self.first = time.monotonic(), trainer.global_step
         self.task = self.line.add_task("", total=trainer.max_steps, completed=self.first, rate=0, scores="")
         self.line.start()

@@ -13,8 +13,8 @@ from gaigs.training.metrics import spectrum_scores
 class Training(lightning.LightningModule):
     """The paper's loss, a learning rate for each group of parameters, and what a checkpoint must hold.
 
-    Loss: (1 - ssim) L_MAE + ssim L_SSIM + sum of weight times penalty, on every ``stride``-th row and column of the label,
-    from a random one on: neighbouring pixels of a spectrum are far closer than the array resolves.
+    Loss: (1 - ssim) L_MAE + ssim L_SSIM + sum of weight times penalty, on every ``stride``-th row and column of the
+    label, from a random one on: neighbouring pixels of a spectrum are far closer than the array resolves.
 
     Args:
         model: What to train.
@@ -93,7 +93,7 @@ class Training(lightning.LightningModule):
             loss = loss + self.penalties[name] * penalty
         if not torch.isfinite(loss):
             raise ValueError(
-                f"the loss must stay finite, got {loss.item()} at step {self.global_step}; lower training.learning_rates"
+                f"the loss must stay finite, got {loss:g} at step {self.global_step}; lower training.learning_rates"
             )
         self.log("train/loss", loss, prog_bar=True, logger=False)
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:

@@ -208,6 +208,18 @@ def test_two_runs_give_the_same_bits(own):
     assert all(torch.equal(first[2][name], second[2][name]) for name in first[2])
 
 
+@pytest.mark.parametrize("name", ["means2d", "covariances2d", "signal", "opacities", "attenuations"])
+@pytest.mark.parametrize("own", [False, True])
+def test_what_is_broken_shows(name, own):
+    scene = random_scene(own=own, attenuations=(0.5, 1.0))
+    nearest = torch.where(scene.splats.visible, scene.splats.depths, torch.inf).argmin()
+    broken = scene.parameters()[name]
+    (broken[nearest] if name == "means2d" else broken[1 if own or len(broken) > 1 else 0, nearest]).fill_(torch.nan)
+    image, _, gradients = render(opencl.OpenCLRasterizer(), scene, torch.ones(3, *scene.plane.shape))
+    assert image[1].isnan().any()
+    assert any(gradient.isnan().any() for gradient in gradients.values())
+
+
 def test_reads_tensors_of_any_layout():
     scene = random_scene(plane=grid(DirectionCosine(0.1)))
     pixels = torch.ones(3, *scene.plane.shape)

@@ -13,7 +13,7 @@ both = pytest.mark.parametrize("algebra", ["projective", "spacetime"])
 def make_scene(shift=0.0, scale=1.0):
     place = lambda *coordinates: scale * torch.tensor(coordinates) + shift
     receiver = Receiver("gateway", Pose(place(5.0, 0.3, 1.0), torch.eye(3)))
-    return Scene((receiver,), place(0.0, 0.0, 0.0), place(4.0, 3.0, 2.0), None, "none")
+    return Scene((receiver,), place(0.0, 0.0, 0.0), place(4.0, 3.0, 2.0), 0.1, None, "none")
 
 
 @pytest.fixture(autouse=True)
@@ -141,6 +141,6 @@ def test_impossible_options_are_refused(options, message):
 
 
 def test_a_room_of_one_point_is_refused():
-    scene = Scene((Receiver("gateway", Pose(torch.ones(3), torch.eye(3))),), torch.ones(3), torch.ones(3), None, "none")
+    scene = Scene((Receiver("gateway", Pose(torch.ones(3), torch.eye(3))),), torch.ones(3), torch.ones(3), 0.1, None, "none")
     with pytest.raises(ValueError, match="one point"):
         GATokenizer(scene)

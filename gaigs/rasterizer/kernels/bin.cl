@@ -29,7 +29,7 @@ kernel void prepare(sizes_t sizes, global const int *order, global const float *
             global float *look = appearance + (i * sizes.transmitters + t) * APPEARANCE;
             int at = t * sizes.splats + from;
             look[0] = opacities[at];
-            opacity = opacity >= look[0] ? opacity : opacity + look[0] - opacity; /* the largest, or NaN */
+            opacity = opacity >= look[0] || opacity != opacity ? opacity : look[0]; /* the largest, or NaN */
 #if ATTENUATION
             look[1] = log2(attenuations[at]);
 #endif

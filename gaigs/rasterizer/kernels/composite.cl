@@ -94,16 +94,16 @@ kernel void forward(sizes_t sizes, global const float *u, global const float *v,
         for (int pause = LEAST(k + 16, job.end); k < pause; k++) {
             uint entry = entries[k], i = entry & 0xffffff, first = entry >> 24 & 15, last = entry >> 28;
             view_t view = view_splat(load_splat(geometry + i * GEOMETRY), u, v, sizes, job.tile);
+            global const float *looks = appearance + i * sizes.transmitters * APPEARANCE;
             lanes footprints[ROWS];
             for (uint r = first; r <= last; r++) footprints[r] = footprint(offsets_of(&view, r));
-            for (int t = 0; t < job.count; t++) {
-                global const float *look = appearance + (i * sizes.transmitters + t) * APPEARANCE;
-                for (uint r = first; r <= last; r++) blend(maps + t, r, footprints[r], look);
-            }
+            for (int t = 0; t < job.count; t++)
+                for (uint r = first; r <= last; r++) blend(maps + t, r, footprints[r], looks + t * APPEARANCE);
         }
         for (done = 0; done < job.count; done++) {
-            float dark = largest(maps[done].transmittance, ROWS), bright = largest(maps[done].colour[0], CHANNELS * ROWS);
-            if (!(dark <= NEGLIGIBLE && dark * loudest[job.first + done] <= NEGLIGIBLE * bright)) break;
+            float dark = largest(maps[done].transmittance, ROWS);
+            if (!(dark <= NEGLIGIBLE)) break;
+            if (!(dark * loudest[job.first + done] <= NEGLIGIBLE * largest(maps[done].colour[0], CHANNELS * ROWS))) break;
         }
     }
     stops[get_global_id(0)] = k;

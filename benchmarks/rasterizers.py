@@ -1,0 +1,286 @@
+"""Times every registered rasterizer on one scene, interleaved in one process, beside the processor's own ceiling.
+
+    python benchmarks/rasterizers.py
+    python benchmarks/rasterizers.py --scene training --splats 200 1000
+    python benchmarks/rasterizers.py --device cuda --splats 20000 200000
+
+A pair is a splat, a pixel and a transmitter where the splat's opacity reaches ALPHA_MIN. The ceiling is what the OpenCL
+kernels' arithmetic does with every lane live and every operand at hand: no lists, no rows that miss, no tiles to load.
+Times are medians; judge them by their ratios within one run, as other work on the machine slows all of them.
+"""
+
+import argparse
+import math
+import multiprocessing
+import re
+import statistics
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from gaigs.projection import Plane, Splats
+from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, Rasterizer, opencl
+from gaigs.rasterizer.torch import TorchRasterizer
+from gaigs.registry import registry
+
+CEILING = """
+/* One splat that covers a whole tile, passed over and over; memory holds its opacity and signal, all small. */
+static inline view_t still(global const float *memory) {
+    view_t view;
+    view.s = view.square = view.skew = memory[0];
+    for (int r = 0; r < ROWS; r++) view.height[r] = memory[r];
+    return view;
+}
+
+kernel void ceiling_forward(global float *memory, int passes) {
+    view_t view = still(memory);
+    map_t map;
+    lanes footprints[ROWS], all = 0;
+    for (int r = 0; r < ROWS; r++)
+        for (int c = 0; c < CHANNELS; c++) map.colour[c][r] = 0;
+    for (int k = 0; k < passes; k++, view.square += 1e-6f) {
+        if (k % 64 == 0)
+            for (int r = 0; r < ROWS; r++) map.transmittance[r] = 1;
+        for (int r = 0; r < ROWS; r++) footprints[r] = footprint(offsets_of(&view, r));
+        for (int r = 0; r < ROWS; r++) blend(&map, r, footprints[r], memory);
+    }
+    for (int r = 0; r < ROWS; r++)
+        for (int c = 0; c < CHANNELS; c++) all += map.colour[c][r];
+    memory[64 + get_global_id(0)] = sum(all);
+}
+
+kernel void ceiling_backward(global float *memory, int passes) {
+    view_t view = still(memory);
+    state_t state;
+    found_t found = {0};
+    moments_t moments = {0};
+    lanes footprints[ROWS], flows[ROWS];
+    for (int r = 0; r < ROWS; r++)
+        for (int c = 0; c < CHANNELS; c++) state.gradient[c][r] = memory[c];
+    for (int k = 0; k < passes; k++, view.square += 1e-6f) {
+        if (k % 64 == 0)
+            for (int r = 0; r < ROWS; r++) state.transmittance[r] = state.behind[r] = 1;
+        for (int r = 0; r < ROWS; r++) footprints[r] = footprint(offsets_of(&view, r));
+        for (int r = 0; r < ROWS; r++) flows[r] = pass(&state, r, footprints[r], memory, &found);
+        for (int r = 0; r < ROWS; r++) add_moments(&moments, flows[r], offsets_of(&view, r));
+    }
+    lanes all = found.opacity + found.attenuation + moments.s + moments.y + moments.yy;
+    for (int c = 0; c < CHANNELS; c++) all += found.signal[c];
+    memory[64 + get_global_id(0)] = sum(all);
+}
+"""
+
+Scene = tuple[Splats, Tensor, Tensor, Tensor | None, Plane]
+"""A rasterizer's arguments."""
+
+
+def common(n: int, device="cpu", dtype=torch.float32) -> Scene:
+    """360 x 90 pixels, standard deviations log-uniform in 1.5..8 pixels, opacities uniform in 0.05..0.6, 3 channels."""
+    uniform = _uniform(device, dtype)
+    means = torch.stack((uniform(0, 360, n), uniform(0, 90, n)), -1)
+    splats = _splats(means, uniform(math.log(1.5), math.log(8), 1, n, 2).exp(), uniform)
+    plane = Plane(torch.arange(360).to(means)[None] + 0.5, torch.arange(90).to(means)[:, None] + 0.5, None)
+    return splats, uniform(0, 1, 1, n, 3), uniform(0.05, 0.6, 1, n), None, plane
+
+
+def training(n: int, device="cpu", dtype=torch.float32) -> Scene:
+    """16 transmitters that deform splats of 5 to 15 degrees and attenuate; 2 channels, 90 x 360 directions."""
+    uniform = _uniform(device, dtype)
+    means = torch.stack((uniform(-math.pi, math.pi, n), uniform(0, math.pi / 2, n)), -1)
+    splats = _splats(means, torch.deg2rad(uniform(5, 15, 16, n, 2)), uniform)
+    degrees = lambda count: torch.deg2rad(torch.arange(count).to(means))
+    plane = Plane(degrees(360)[None], degrees(90)[:, None], 2 * math.pi)
+    return splats, uniform(-1, 1, 16, n, 2), uniform(0, 0.6, 16, n), uniform(0.5, 1, 16, n), plane
+
+
+SCENES = {"common": common, "training": training}
+
+
+def _uniform(device, dtype):
+    generator = torch.Generator().manual_seed(0)
+    return lambda low, high, *shape: (low + (high - low) * torch.rand(*shape, generator=generator)).to(device, dtype)
+
+
+def _splats(means: Tensor, deviations: Tensor, uniform) -> Splats:
+    angles, depths = uniform(0, math.pi, *deviations.shape[:2]), uniform(1, 5, len(means))
+    axes = torch.stack((angles.cos(), -angles.sin(), angles.sin(), angles.cos()), -1).unflatten(-1, (2, 2))
+    half = axes * deviations[..., None, :]
+    return Splats(means, half @ half.mT, depths, depths > 0)
+
+
+def inspect(scene: Scene) -> tuple[int, Tensor]:
+    """How many pairs act, and which pixels (b, rows, columns) are no matter of rounding: no pair is near a bound."""
+    splats, _, opacities, _, plane = scene
+    pairs, clear = 0, torch.ones(len(opacities), *plane.shape, dtype=torch.bool, device=opacities.device)
+    for i in torch.arange(len(splats.means2d), device=opacities.device).split(16):
+        du, dv = plane.u - splats.means2d[i, 0, None, None], plane.v - splats.means2d[i, 1, None, None]
+        if plane.period is not None:
+            du = du - plane.period * (du / plane.period).round()
+        a, b, _, d = torch.linalg.inv(splats.covariances2d[:, i]).flatten(-2)[..., None, None].unbind(2)
+        product = opacities[:, i, None, None] * torch.exp(-0.5 * (a * du * du + 2 * b * du * dv + d * dv * dv))
+        pairs += int((product >= ALPHA_MIN).sum())
+        for bound in (ALPHA_MIN, ALPHA_MAX):
+            clear &= ((product / bound - 1).abs() > 1e-4).all(1)
+    return pairs, clear
+
+
+def run(rasterizer: Rasterizer, scene: Scene, pixels: Tensor) -> tuple[float, float, Tensor, list[Tensor]]:
+    """Times of the forward and the backward pass [s], the map, and the gradients of a sum over ``pixels``."""
+    splats, *parameters, plane = scene
+    parameters = [splats.means2d, splats.covariances2d, *parameters]
+    parameters = [None if tensor is None else tensor.clone().requires_grad_() for tensor in parameters]
+    means2d, covariances2d, signal, opacities, attenuations = parameters
+    splats = Splats(means2d, covariances2d, splats.depths, splats.visible)
+    outputs = pixels[:, None].repeat(1, signal.shape[-1], 1, 1), pixels
+    start = _now(signal.device)
+    image, left = rasterizer(splats, signal, opacities, attenuations, plane)
+    between = _now(signal.device)
+    torch.autograd.backward((image, left), outputs)
+    end = _now(signal.device)
+    gradients = [tensor.grad for tensor in parameters if tensor is not None]
+    return between - start, end - between, image.detach(), gradients
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def time_compositing(rasterizer: Rasterizer, scene: Scene) -> float | None:
+    """Time of the forward pass without sorting and binning [s], for the one rasterizer that has them apart."""
+    if not isinstance(rasterizer, opencl.OpenCLRasterizer):
+        return None
+    splats, signal, opacities, attenuations, plane = scene
+    render = opencl._Render(opencl._queue(rasterizer.device), splats, signal, opacities, attenuations, plane)
+    start = time.perf_counter()
+    render.forward()
+    return time.perf_counter() - start
+
+
+class Ceiling:
+    """The OpenCL kernels' arithmetic alone, on all cores."""
+
+    def __init__(self, channels: int, attenuation: bool):
+        self.queue = opencl._queue(None)
+        macros = {"CHANNELS": channels, "ATTENUATION": int(attenuation), "TRANSMITTERS": 1, "SEPARABLE": 1}
+        macros |= {"ALPHA_MIN": opencl._literal(ALPHA_MIN), "ALPHA_MAX": opencl._literal(ALPHA_MAX)}
+        kernels = Path(opencl.__file__).parent / "kernels"
+        source = "".join((kernels / f"{name}.cl").read_text() for name in ("footprint", "composite")) + CEILING
+        options = ["-w", *(f"-D{macro}={value}" for macro, value in macros.items())]
+        program = cl.Program(self.queue.context, source).build(options)
+        self.kernels = {way: cl.Kernel(program, f"ceiling_{way}") for way in ("forward", "backward")}
+        self.items = 4 * self.queue.device.max_compute_units
+        values = np.full(64 + self.items, 0.01, np.float32)
+        self.memory = cl.Buffer(self.queue.context, cl.mem_flags.COPY_HOST_PTR, hostbuf=values)
+
+    def time_pair(self, way: str) -> float:
+        """Time a pair, "forward" or "backward" [s]."""
+        passes = 2000
+        start = time.perf_counter()
+        self.kernels[way](self.queue, (self.items,), (1,), self.memory, np.int32(passes)).wait()
+        return (time.perf_counter() - start) / (self.items * passes * opencl.ROWS * opencl.COLUMNS)
+
+
+def peak_memory(name: str, scene: str, n: int, device: str) -> float:
+    """What one forward and backward pass adds to the memory in use at most [MB]; to be called in a fresh process."""
+    rasterizer = registry("rasterizer").get(name)()
+    for count in (32, n):  # the first one loads and compiles
+        arguments = SCENES[scene](count, device)
+        pixels = torch.ones(len(arguments[1]), *arguments[-1].shape, device=device)
+        if device == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+            before = torch.cuda.memory_allocated()
+        else:
+            Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+            before = _status("VmRSS")
+        run(rasterizer, arguments, pixels)
+        peak = torch.cuda.max_memory_allocated() if device == "cuda" else _status("VmHWM")
+    return (peak - before) / 1e6
+
+
+def _status(key: str) -> int:
+    """A figure of this process [bytes]."""
+    return 1024 * int(re.search(rf"{key}:\s*(\d+)", Path("/proc/self/status").read_text())[1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", choices=SCENES, default="common")
+    parser.add_argument("--splats", type=int, nargs="+", default=[1000, 5000, 20000])
+    parser.add_argument("--rasterizers", nargs="+", default=registry("rasterizer").names())
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--device", default="cpu", help="torch device of the tensors")
+    options = parser.parse_args()
+    make_scene = SCENES[options.scene]
+
+    console = Console()
+    console.print(f"{options.scene}: {make_scene.__doc__}")
+    console.print(f"{torch.get_num_threads()} threads; tensors on {options.device}; OpenCL on {opencl.devices()[0]}")
+    rasterizers = {}
+    small = make_scene(32, options.device)
+    for name in options.rasterizers:
+        try:
+            rasterizer = registry("rasterizer").get(name)()
+            run(rasterizer, small, torch.ones(len(small[1]), *small[-1].shape, device=options.device))
+            rasterizers[name] = rasterizer
+        except (RuntimeError, TypeError) as error:
+            console.print(f"{name} is left out: {error}")
+    ceiling = Ceiling(small[1].shape[-1], small[3] is not None)
+
+    table = Table("splats", "pairs", "rasterizer", "forward [ms]", "composited [ms]", "of ceiling", "backward [ms]")
+    for column in ("of ceiling", "peak [MB]", "error of map", "of gradients"):
+        table.add_column(column, justify="right")
+    for n in options.splats:
+        scene = make_scene(n, options.device)
+        pairs, clear = inspect(scene)
+        pixels = clear.to(scene[1])
+        times = defaultdict(list)
+        for repeat in range(options.repeats + 1):
+            for name, rasterizer in rasterizers.items():
+                forward, backward, *_ = run(rasterizer, scene, pixels)
+                found = {"forward": forward, "backward": backward, "composited": time_compositing(rasterizer, scene)}
+                for part, seconds in found.items():
+                    if repeat and seconds is not None:  # the first repeat warms up
+                        times[name, part].append(1e3 * seconds)
+            for part, way in (("composited", "forward"), ("backward", "backward")):
+                times["ceiling", part].append(1e3 * pairs * ceiling.time_pair(way))
+        medians = {key: statistics.median(milliseconds) for key, milliseconds in times.items()}
+        least, least_backward = medians["ceiling", "composited"], medians["ceiling", "backward"]
+        table.add_row(f"{n:,}", f"{pairs:,}", "ceiling", "", f"{least:.2f}", "", f"{least_backward:.2f}")
+        double = make_scene(n, options.device, torch.float64)
+        _, _, truth, true_gradients = run(TorchRasterizer(), double, clear.double())
+        for name, rasterizer in rasterizers.items():
+            _, _, image, gradients = run(rasterizer, scene, pixels)
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                memory = pool.apply(peak_memory, (name, options.scene, n, options.device))
+            parts = "forward", "backward", "composited"
+            forward, backward, composited = (medians.get((name, part)) for part in parts)
+            table.add_row(
+                *("", "", name),
+                f"{forward:.2f}",
+                f"{composited:.2f}" if composited else "",
+                f"{least / (composited or forward):.0%}",
+                f"{backward:.2f}",
+                f"{least_backward / backward:.0%}",
+                f"{memory:.0f}",
+                f"{_error(image * clear[:, None], truth * clear[:, None]):.1e}",
+                f"{max(map(_error, gradients, true_gradients)):.1e}",
+            )
+    console.print(table)
+
+
+def _error(found: Tensor, truth: Tensor) -> float:
+    """The largest deviation, relative to the largest value."""
+    return float((found - truth).abs().max() / truth.abs().max())
+
+
+if __name__ == "__main__":
+    main()

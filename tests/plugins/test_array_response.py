@@ -1,0 +1,120 @@
+"""The plug-in of this repository, found as a user finds it: from the working directory, by name."""
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from gaigs.data import Grid
+from gaigs.data.synthetic.image_source import bartlett, min_max
+from gaigs.model import Batch
+from gaigs.registry import registry
+from gaigs.testing import check_model, example_links
+
+ROOT = Path(__file__).parents[2]
+OPTIONS = {"rows": 4, "columns": 4, "pitch": 0.5, "octaves": [-1, 1], "width": 16, "layers": 1}
+
+
+@pytest.fixture
+def build(monkeypatch):
+    """Builds the model with other options, or for other links."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "path", sys.path[:])  # the registry appends to it
+
+    def build(links=None, **options):
+        torch.manual_seed(0)
+        scene = (links or example_links()).scene
+        return registry("model").build({"name": "array_response"} | OPTIONS | options, scene=scene)
+
+    return build
+
+
+def answering(model, fields):
+    """The model, its network made to answer with given fields (elements,) at every receiver."""
+    last = model.network[-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.copy_(torch.cat((fields.real, fields.imag)).expand(model.fields).flatten())
+    return model
+
+
+def test_it_keeps_the_contract_of_models(build):
+    check_model(build(), example_links())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_label_is_the_simulators_for_the_same_fields(build, seed):
+    links = replace(example_links(), grid=Grid.degrees())
+    fields = torch.randn(16, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed))
+    predicted = answering(build(links), fields).predict(links.transmitters[:1])
+    expected = min_max(bartlett(fields[None, :, None], links.grid)).float()
+    torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-5)
+
+
+def test_columns_lie_along_x_and_rows_along_y(build):
+    grid = Grid.degrees(range(1, 90, 8), range(0, 360, 15))
+    links = replace(example_links(), grid=grid)
+    fields = torch.randn(5, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    along_x, along_y = (
+        answering(build(links, rows=rows, columns=columns), fields).predict(links.transmitters[:1])[0]
+        for rows, columns in ((1, 5), (5, 1))
+    )
+    # A line of elements cannot tell a direction from its mirror image across the line: az -> -az, az -> 180 deg - az.
+    torch.testing.assert_close(along_x, along_x.flip(1).roll(1, 1), rtol=0, atol=1e-5)
+    torch.testing.assert_close(along_y, along_y.flip(1).roll(13, 1), rtol=0, atol=1e-5)
+    assert (along_x - along_x.flip(1).roll(13, 1)).abs().max() > 0.1
+
+
+def test_at_a_pitch_of_one_wavelength_lobes_repeat(build):
+    # cos az cos el is 1/2 and -1/2 there: one period of the pattern, 1 / pitch, apart.
+    links = replace(example_links(), grid=Grid.degrees([60, 1, 90], [0, 90, 180]))
+    fields = torch.randn(16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    spectra = [answering(build(links, pitch=p), fields).predict(links.transmitters[:1])[0] for p in (1.0, 0.5)]
+    apart = [abs(float(spectrum[0, 0] - spectrum[0, 2])) for spectrum in spectra]
+    assert apart[0] < 1e-5 < 0.1 < apart[1]
+
+
+def test_the_gradient_is_that_of_the_plain_formula(build):
+    links = example_links()
+    model = build(links).double()
+    grid = Grid(links.grid.elevations.double(), links.grid.azimuths.double())
+    batch = Batch(links.transmitters[:3].double(), 1, grid)
+    weights = torch.randn(3, *links.grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+    outputs = []
+    hook = model.network.register_forward_hook(lambda module, inputs, output: outputs.append(output))
+    label = model(batch).label
+    hook.remove()
+    (found,) = torch.autograd.grad((label * weights).sum(), outputs[0])
+
+    again = outputs[0].detach().requires_grad_()
+    fields = torch.complex(*again.unflatten(1, (2, 2, 16))[:, 1].unbind(1))
+    elevations, azimuths = torch.meshgrid(grid.elevations, grid.azimuths, indexing="ij")
+    steps = torch.arange(4, dtype=torch.float64) - 1.5
+    along_x = torch.exp(-1j * math.pi * steps[:, None, None] * azimuths.cos() * elevations.cos())
+    along_y = torch.exp(-1j * math.pi * steps[:, None, None] * azimuths.sin() * elevations.cos())
+    plain = min_max(torch.einsum("bij,iac,jac->bac", fields.unflatten(1, (4, 4)), along_x, along_y).abs())
+    (expected,) = torch.autograd.grad((plain * weights).sum(), again)
+    torch.testing.assert_close(label, plain, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rows": 1, "columns": 1}, "at least 2 elements, got model.rows=1, model.columns=1"),
+        ({"rows": 0}, "at least 2 elements"),
+        ({"octaves": [2, 1]}, r"\[lowest, highest\], got \[2, 1\]"),
+    ],
+)
+def test_options_out_of_range(build, options, message):
+    with pytest.raises(ValueError, match=message):
+        build(**options)
+
+
+def test_labels_that_are_no_spectra(build):
+    with pytest.raises(ValueError, match="predicts spectra"):
+        build(replace(example_links(), grid=None))

@@ -1,0 +1,29 @@
+"""The magnitude of a real or complex map."""
+
+import pytest
+import torch
+
+from gaigs.pooling.spectrum import Spectrum
+
+
+def test_two_channels_are_the_magnitude_of_a_complex_number():
+    image = torch.randn(3, 2, 4, 5)
+    torch.testing.assert_close(Spectrum(2)(image), torch.complex(image[:, 0], image[:, 1]).abs())
+
+
+def test_one_channel_is_its_magnitude():
+    image = torch.randn(3, 1, 4, 5)
+    assert torch.equal(Spectrum(1)(image), image[:, 0].abs())
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_silence_has_a_finite_gradient(channels):
+    image = torch.zeros(2, channels, 3, 3, requires_grad=True)
+    Spectrum(channels)(image).sum().backward()
+    assert torch.equal(image.grad, torch.zeros_like(image))
+
+
+@pytest.mark.parametrize("channels", [0, 3, -1])
+def test_other_numbers_of_channels_are_refused(channels):
+    with pytest.raises(ValueError, match=f"1 real or 2 complex channels, got channels={channels}"):
+        Spectrum(channels)

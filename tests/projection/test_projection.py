@@ -1,0 +1,152 @@
+"""All projections: the receiver's frame, footprints against samples, the seam, the pole, and what is not drawn."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from gaigs.data import Grid
+from gaigs.geometry import Pose, from_spherical
+from gaigs.projection.direction_cosine import DirectionCosine
+from gaigs.projection.equirectangular import Equirectangular
+from gaigs.projection.mercator import Mercator
+from gaigs.rasterizer.torch import TorchRasterizer
+
+PIXEL = math.radians(1)
+HERE = Pose(torch.zeros(3), torch.eye(3))
+every = pytest.mark.parametrize("kind", [Mercator, Equirectangular, DirectionCosine])
+with_a_seam = pytest.mark.parametrize("kind", [Mercator, Equirectangular])
+
+
+def ball(n, radius, dtype=torch.float32):
+    """Covariances of round Gaussians."""
+    return (radius**2 * torch.eye(3, dtype=dtype)).expand(1, n, 3, 3)
+
+
+def direction(azimuth, elevation, dtype=torch.float32):
+    return from_spherical(*torch.tensor([azimuth, elevation], dtype=dtype).deg2rad())
+
+
+def draw(projection, means, covariances, pose=HERE, grid=None):
+    """The map of Gaussians that all send 1 at opacity 0.5."""
+    grid = grid or Grid.degrees()
+    n = len(means)
+    plane = projection.plane(grid.elevations, grid.azimuths)
+    splats = projection.project(means, covariances, pose)
+    image, _ = TorchRasterizer()(splats, torch.ones(1, n, 1), torch.full((1, n), 0.5), None, plane)
+    return image[0, 0]
+
+
+@every
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 45), (37, 12), (180, 60), (251, 80), (359, 30)])
+def test_a_gaussian_peaks_at_the_pixel_of_its_direction_in_the_receivers_frame(kind, azimuth, elevation):
+    turn = Rotation.from_euler("zyx", [110, -35, 70], degrees=True)
+    pose = Pose.from_xyzw((3.0, -1.0, 2.0), turn.as_quat())
+    seen = torch.from_numpy(turn.apply(direction(azimuth, elevation, torch.float64))).float()
+    image = draw(kind(PIXEL), torch.tensor([[3.0, -1.0, 2.0]]) + 4 * seen, ball(1, 0.1), pose)
+    row, column = divmod(int(image.argmax()), 360)
+    assert (row + 1, column) == (elevation, azimuth)
+    assert image.max() > 0.49
+
+
+@every
+@pytest.mark.parametrize("place", [(0, 10), (60, 0), (-130, 45), (179, 70), (20, -30)])
+def test_footprints_are_the_covariances_of_projected_samples(kind, place):
+    generator = torch.Generator().manual_seed(0)
+    mean = 3 * direction(*place, torch.float64)
+    axes = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))[0]
+    half = axes * torch.tensor([0.01, 0.03, 0.005], dtype=torch.float64)
+    samples = mean + torch.randn(100_000, 3, generator=generator, dtype=torch.float64) @ half.mT
+    projection = kind(1e-9)
+    splats = projection.project(mean[None], (half @ half.mT)[None, None], HERE)
+    off = projection.coordinates(samples) - splats.means2d
+    if kind is not DirectionCosine:
+        off[:, 0] = (off[:, 0] + math.pi).remainder(math.tau) - math.pi
+    expected = off.mT @ off / len(off)
+    footprint = splats.covariances2d[0, 0]
+    torch.testing.assert_close(footprint, expected, rtol=0, atol=0.02 * expected.diagonal().max().item())
+
+
+@every
+def test_a_pixels_variance_is_added(kind):
+    means, covariances = 3 * torch.randn(9, 3, dtype=torch.float64), ball(9, 0.1, torch.float64)
+    narrow, wide = (kind(pixel).project(means, covariances, HERE).covariances2d for pixel in (1e-9, 0.3))
+    square = torch.full((1, 9, 2, 2), 0.3**2 / 12, dtype=torch.float64) * torch.eye(2)
+    torch.testing.assert_close(wide - narrow, square)
+
+
+@with_a_seam
+def test_a_turn_about_the_vertical_rolls_the_map(kind):
+    generator = torch.Generator().manual_seed(0)
+    azimuths, elevations = torch.rand(2, 15, generator=generator) * torch.tensor([[math.tau], [1.5]])
+    columns = 175
+    grid = Grid.degrees(range(2, 91, 4))
+    images = [
+        draw(kind(PIXEL), 3 * from_spherical(azimuths + turn, elevations), ball(15, 0.3), grid=grid)
+        for turn in (0, math.radians(columns))
+    ]
+    assert images[0][:, 0].max() > 0.1  # somebody stands at the seam
+    torch.testing.assert_close(images[1], images[0].roll(columns, 1), rtol=0, atol=2e-4)
+
+
+@with_a_seam
+def test_a_gaussian_at_the_seam_is_seen_on_both_sides(kind):
+    image = draw(kind(PIXEL), 3 * direction(0, 20)[None], ball(1, 0.2))
+    torch.testing.assert_close(image[:, 1:20], image[:, -19:].flip(1), rtol=0, atol=1e-4)
+    assert image[19, 359] > 0.4
+
+
+@every
+def test_around_the_zenith_a_gaussian_at_the_pole_is_seen_in_all_directions(kind):
+    image = draw(kind(PIXEL), torch.tensor([[0.0, 0.0, 3.0]]), ball(1, 0.8))
+    assert image[84:].min() > 0.2
+    assert image[84:].max() <= 0.5
+    beside = draw(kind(PIXEL), 3 * direction(0, 86)[None], ball(1, 0.8))
+    assert (beside[84:] - image[84:]).abs().max() < 0.2
+
+
+@every
+def test_a_hidden_gaussian_changes_nothing(kind):
+    pose = Pose.from_xyzw((1.0, 2.0, 0.5), (0.6, 0, 0, 0.8))
+    means = torch.tensor([[1.0, 2.0, 3.5], [1.0, 2.0, 0.5], [2.0, 3.0, 1.0]])
+    splats = kind(PIXEL).project(means, ball(3, 0.2), pose)
+    assert splats.visible.tolist() == [True, False, True]
+    assert splats.covariances2d.isfinite().all()
+    seen = means[[0, 2]]
+    assert torch.equal(draw(kind(PIXEL), means, ball(3, 0.2), pose), draw(kind(PIXEL), seen, ball(2, 0.2), pose))
+
+
+@every
+def test_a_centre_that_is_nan_is_not_hidden(kind):
+    means = torch.tensor([[1.0, 2.0, math.nan], [1.0, 2.0, 3.0]])
+    assert kind(PIXEL).project(means, ball(2, 0.2), HERE).visible.all()
+    assert draw(kind(PIXEL), means, ball(2, 0.2)).isnan().all()
+
+
+@every
+def test_gradients_of_a_projected_gaussian_are_those_of_finite_differences(kind):
+    pose = replace(HERE, position=torch.tensor([0.1, 0.2, 0.3]))
+    means = torch.tensor([[1.0, 2, 3], [-2, 0.1, 0.5], [-0.3, -2, 2]], dtype=torch.float64, requires_grad=True)
+    half = torch.randn(2, 3, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+
+    def project(means, half):
+        splats = kind(PIXEL).project(means, half @ half.mT, pose)
+        return splats.means2d, splats.covariances2d
+
+    assert torch.autograd.gradcheck(project, (means, half))
+
+
+@every
+@pytest.mark.parametrize("pixel", [0, -0.1, math.nan])
+def test_a_pixel_of_no_width_is_refused(kind, pixel):
+    with pytest.raises(ValueError, match=f"wider than 0 rad, got {pixel}"):
+        kind(pixel)
+
+
+@with_a_seam
+@pytest.mark.parametrize("limit", [0, 90, -5, 180, math.nan])
+def test_a_limit_at_the_pole_or_beyond_is_refused(kind, limit):
+    with pytest.raises(ValueError, match=f"between 0 and 90 degrees, got {limit}"):
+        kind(PIXEL, limit)

@@ -1,0 +1,230 @@
+"""The torch rasterizer against its formula where Gaussians are hard, its memory, and what must not vanish.
+
+``gaigs.testing.check_rasterizer``, which tests/test_contracts.py runs, holds it against the formula over many more scenes.
+"""
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from reference import margin, rasterize
+
+from gaigs.data import Grid
+from gaigs.geometry import Pose, from_spherical
+from gaigs.projection import Plane, Splats
+from gaigs.projection.direction_cosine import DirectionCosine
+from gaigs.projection.equirectangular import Equirectangular
+from gaigs.projection.mercator import Mercator
+from gaigs.rasterizer import torch as module
+from gaigs.rasterizer.torch import TorchRasterizer
+from gaigs.testing import rasterize_densely
+
+GRID = Grid.degrees(range(1, 91, 3), [0.3 + 6 * k for k in range(60)])
+HERE = Pose(torch.zeros(3), torch.eye(3))
+PLACES = {
+    "anywhere": lambda uniform, n: from_spherical(uniform(0, math.tau, n), uniform(-0.5, 1.57, n)),
+    "at the seam": lambda uniform, n: from_spherical(uniform(-0.2, 0.2, n), uniform(0, 1.5, n)),
+    "at the pole": lambda uniform, n: from_spherical(uniform(0, math.tau, n), uniform(1.45, math.pi / 2, n)),
+    "at the horizon": lambda uniform, n: from_spherical(uniform(0, math.tau, n), uniform(-0.1, 0.1, n)),
+    "on the pole": lambda uniform, n: torch.tensor([[0.0, 0.0, 1.0]]).expand(n, 3),
+}
+NAMES = ("means2d", "covariances2d", "signal", "opacities", "attenuations")
+PROJECTIONS = {"mercator": Mercator, "equirectangular": Equirectangular, "direction_cosine": DirectionCosine}
+
+
+def scene(
+    place="anywhere", projection="mercator", n=40, b=2, own=False, attenuations=True, opacity=(0.0, 1.0), size=0.3
+):
+    """Arguments of a rasterizer: Gaussians about a receiver, on its plane."""
+    generator = torch.Generator().manual_seed(n)
+    uniform = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
+    projection = PROJECTIONS[projection](GRID.pitch)
+    means = PLACES[place](uniform, n) * uniform(0.5, 4, n, 1)
+    half = size * torch.randn(b if own else 1, n, 3, 3, generator=generator)
+    splats = projection.project(means, half @ half.mT, HERE)
+    plane = projection.plane(GRID.elevations, GRID.azimuths)
+    signal = torch.randn(b, n, 2, generator=generator)
+    return splats, signal, uniform(*opacity, b, n), uniform(0.2, 1, b, n) if attenuations else None, plane
+
+
+def render(rasterizer, arguments, pixels, dtype=torch.float64):
+    """Map, transmittance, and the gradients of a random function of both at ``pixels``."""
+    splats, *others, plane = arguments
+    leaves = [None if leaf is None else leaf.to(dtype) for leaf in (splats.means2d, splats.covariances2d, *others)]
+    leaves = [None if leaf is None else leaf.detach().clone().requires_grad_() for leaf in leaves]
+    splats = replace(splats, means2d=leaves[0], covariances2d=leaves[1])
+    results = rasterizer(splats, *leaves[2:], plane)
+    generator = torch.Generator().manual_seed(0)
+    image, left = (result * at for result, at in zip(results, (pixels[:, None], pixels), strict=True))
+    total = sum((result * torch.randn(result.shape, generator=generator)).sum() for result in (image, left))
+    leaves = {name: leaf for name, leaf in zip(NAMES, leaves, strict=True) if leaf is not None}
+    gradients = torch.autograd.grad(total, [*leaves.values()])
+    return {"image": image.detach(), "left": left.detach(), **dict(zip(leaves, gradients, strict=True))}
+
+
+def assert_agrees(arguments):
+    """With the formula, in both precisions, off the jumps where rounding decides on a splat."""
+    splats, _, opacities, _, plane = arguments
+    pixels = margin(splats, opacities, plane) > 1e-5
+    assert pixels.double().mean() > 0.98
+    truth = render(rasterize_densely, arguments, pixels)
+    for dtype, values, gradients in ((torch.float64, 1e-10, 1e-9), (torch.float32, 1e-5, 1e-4)):
+        found = render(TorchRasterizer(), arguments, pixels, dtype)
+        for (name, true), tolerance in zip(truth.items(), [values] * 2 + [gradients] * 5, strict=False):
+            assert found[name].dtype == dtype
+            tolerance *= max(true.abs().max().item(), 1.0)
+            torch.testing.assert_close(found[name].double(), true, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("attenuations", [False, True])
+@pytest.mark.parametrize("projection", ["mercator", "direction_cosine"])
+def test_the_formula_is_that_of_the_loop_over_splats(projection, attenuations):
+    arguments = scene("at the seam", projection, n=12, own=True, attenuations=attenuations)
+    pixels = torch.ones(2, *GRID.shape)
+    loop = render(rasterize, arguments, pixels)
+    for name, found in render(rasterize_densely, arguments, pixels).items():
+        torch.testing.assert_close(found, loop[name], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+@pytest.mark.parametrize("place", PLACES)
+def test_values_and_gradients_are_those_of_the_formula(place, projection):
+    assert_agrees(scene(place, projection))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"attenuations": False},
+        {"own": True},
+        {"own": True, "projection": "direction_cosine"},
+        {"n": 1, "b": 1},
+        {"size": 4.0},
+        {"size": 0.01},
+        {"opacity": (1.0, 1.0), "size": 1.0},
+        {"opacity": (0.0, 0.01)},
+        {"n": 120, "size": 0.1},
+    ],
+    ids=str,
+)
+def test_other_scenes(options):
+    assert_agrees(scene(**options))
+
+
+def test_whole_tiles_of_nothing():
+    splats, *others = scene(n=6, size=0.02)
+    image, left = TorchRasterizer()(splats, *others)
+    assert_agrees((splats, *others))
+    assert (image == 0).double().mean() > 0.8
+    assert (left == 1).double().mean() > 0.8
+
+
+@pytest.mark.parametrize(("n", "b"), [(0, 2), (5, 0), (0, 0)])
+def test_nothing_gives_an_empty_map(n, b):
+    image, left = TorchRasterizer()(*scene(n=n, b=b))
+    assert torch.equal(image, torch.zeros(b, 2, *GRID.shape))
+    assert torch.equal(left, torch.ones(b, *GRID.shape))
+
+
+@pytest.mark.parametrize("projection", ["mercator", "direction_cosine"])
+@pytest.mark.parametrize("own", [False, True])
+def test_gradients_are_those_of_finite_differences(projection, own):
+    splats, signal, opacities, attenuations, plane = scene(n=6, own=own, projection=projection, size=0.5)
+    plane = Plane(plane.u[::7, ::9], plane.v[::7, ::9], plane.period)
+
+    def rasterize_half(means, halves, *others):
+        return TorchRasterizer()(replace(splats, means2d=means, covariances2d=halves @ halves.mT), *others, plane)
+
+    halves = torch.linalg.cholesky(splats.covariances2d.double())
+    inputs = (splats.means2d, halves, signal, 0.9 * opacities, attenuations)
+    leaves = tuple(leaf.detach().double().requires_grad_() for leaf in inputs)
+    assert torch.autograd.gradcheck(rasterize_half, leaves, fast_mode=True)
+
+
+@pytest.mark.parametrize("chunk", [1, 3000, 2**40])
+@pytest.mark.parametrize("projection", ["mercator", "direction_cosine"])
+def test_how_tiles_are_chunked_does_not_matter(monkeypatch, chunk, projection):
+    arguments = scene(n=60, projection=projection)
+    pixels = torch.ones(2, *GRID.shape)
+    usual = render(TorchRasterizer(), arguments, pixels)
+    monkeypatch.setattr(module, "CHUNK", chunk)
+    for name, found in render(TorchRasterizer(), arguments, pixels).items():
+        torch.testing.assert_close(found, usual[name], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("depths", "order"),
+    [((1, 2, 3), (0, 1, 2)), ((3, 1, 2), (1, 2, 0)), ((2, 2, 1), (2, 0, 1)), ((2, math.inf, 2), (0, 2, 1))],
+)
+def test_depth_decides_and_among_equals_the_index(depths, order):
+    splats = Splats(torch.zeros(3, 2), torch.eye(2).expand(1, 3, 2, 2), torch.tensor(depths), torch.ones(3).bool())
+    signal = torch.tensor([[[1.0], [10.0], [100.0]]])
+    image, left = TorchRasterizer()(splats, signal, torch.full((1, 3), 0.9), None, Plane(*torch.zeros(2, 1, 1), None))
+    assert image.item() == pytest.approx(sum(0.9 * 0.1**k * 10**i for k, i in enumerate(order)), rel=1e-5)
+    assert left.item() == pytest.approx(1e-3, rel=1e-5)
+
+
+def test_what_is_invisible_does_nothing_and_gets_no_gradient():
+    splats, *others = scene()
+    hidden = torch.arange(40) % 3 == 0
+    splats = replace(splats, visible=~hidden)
+    splats.means2d[hidden], splats.covariances2d[:, hidden] = torch.inf, torch.nan
+    pixels = torch.ones(2, *GRID.shape)
+    found = render(TorchRasterizer(), (splats, *others), pixels)
+    assert found["image"].isfinite().all()
+    assert found["left"].isfinite().all()
+    for name in NAMES:
+        of_hidden = found[name].index_select(int(name != "means2d"), hidden.nonzero().flatten())
+        assert not of_hidden.any()
+        assert found[name].any()
+
+
+@pytest.mark.parametrize("name", ["means2d", "covariances2d", "variance", "signal", "opacities", "attenuations"])
+def test_nan_shows_in_the_map(name):
+    splats, signal, opacities, attenuations, plane = scene(own=True)
+    front = int(splats.depths.argmin())
+    opacities[1, front] = 0.5
+    broken = {"variance": splats.covariances2d[..., 0, 0], "covariances2d": splats.covariances2d, "signal": signal}
+    broken |= {"opacities": opacities, "attenuations": attenuations, "means2d": splats.means2d.expand(2, -1, -1)}
+    broken[name][1, front] = torch.nan
+    image, left = TorchRasterizer()(splats, signal, opacities, attenuations, plane)
+    assert image[1].isnan().any()
+    if name in ("opacities", "variance", "covariances2d"):
+        assert not image[0].isnan().any()
+        assert left[1].isnan().any()
+
+
+MEMORY = """
+import resource, torch
+from gaigs.data import Grid
+from gaigs.gaussians import fibonacci_lattice
+from gaigs.geometry import Pose
+from gaigs.projection.mercator import Mercator
+from gaigs.rasterizer.torch import TorchRasterizer
+
+n, grid = 20_000, Grid.degrees()
+projection = Mercator(grid.pitch)
+points = (3 * fibonacci_lattice(n, 0.0, 1.57)).requires_grad_()
+width = 3 * (2 * torch.pi / n) ** 0.5  # to the next Gaussian
+covariances = (width**2 * torch.eye(3)).expand(1, n, 3, 3)
+splats = projection.project(points, covariances, Pose(torch.zeros(3), torch.eye(3)))
+opacities, signal = torch.full((1, n), 0.1, requires_grad=True), torch.randn(1, n, 2, requires_grad=True)
+attenuations = torch.full((1, n), 0.9, requires_grad=True)
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 2**10
+before = peak()
+plane = projection.plane(grid.elevations, grid.azimuths)
+image, left = TorchRasterizer()(splats, signal, opacities, attenuations, plane)
+(image.square().sum() + left.sum()).backward()
+assert opacities.grad.isfinite().all() and opacities.grad.any()
+print(peak() - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems count the peak memory in other units, or not")
+def test_memory_does_not_grow_with_pairs_of_splats_and_pixels():
+    done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) < 2 * 2**30  # one float32 for each pair of 20,000 splats and 32,400 pixels would be 2.4 GiB

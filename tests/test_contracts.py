@@ -1,0 +1,338 @@
+"""Every registered name of every kind keeps its contract, with the options of its configuration file."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from torch import nn
+
+from gaigs import configuration
+from gaigs.data import nerf2_spectrum
+from gaigs.model import Model, Prediction
+from gaigs.pooling.spectrum import Spectrum
+from gaigs.projection.equirectangular import Equirectangular
+from gaigs.projection.mercator import Mercator
+from gaigs.rasterizer.torch import TorchRasterizer
+from gaigs.registry import registry
+from gaigs.testing import (
+    check_data,
+    check_model,
+    check_pooling,
+    check_projection,
+    check_rasterizer,
+    check_tokenizer,
+    example_links,
+)
+from gaigs.tokenizer import Tokens
+from gaigs.tokenizer.euclidean import EuclideanTokenizer
+
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")),
+]
+SMALL = {"synthetic": ["data.transmitters=12", "data.order=1"], "gaigs": ["gaussians.count=60", "mapping.width=16"]}
+"""What makes a component quick to check."""
+
+every = lambda kind: pytest.mark.parametrize("name", registry(kind).names())
+on_every_device = pytest.mark.parametrize("device", DEVICES)
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    torch.manual_seed(0)
+
+
+def configured(kind, name, *overrides):
+    """The configuration of a name as the command line would have it."""
+    configuration.install()
+    with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
+        config = compose("config", [f"{kind}={name}", *SMALL.get(name, []), *overrides])
+    return OmegaConf.to_container(config[kind], resolve=True)
+
+
+# --- the contracts ---
+
+
+@every("data")
+def test_data(name, tmp_path):
+    overrides = []
+    if name == "nerf2_spectrum":
+        links = registry("data").build(configured("data", "synthetic"))
+        nerf2_spectrum.write(tmp_path, links)
+        overrides = [f"data.root={tmp_path}"]
+    check_data(registry("data").build(configured("data", name, *overrides)))
+
+
+@every("tokenizer")
+@on_every_device
+def test_tokenizer(name, device):
+    scene = example_links().scene
+    check_tokenizer(registry("tokenizer").build(configured("tokenizer", name), scene=scene), scene, device)
+
+
+@every("projection")
+@on_every_device
+def test_projection(name, device):
+    check_projection(registry("projection").build(configured("projection", name), pixel=math.radians(1)), device)
+
+
+@every("rasterizer")
+@on_every_device
+def test_rasterizer(name, device):
+    if name == "opencl" and device != "cpu":
+        pytest.skip("works on the CPU's tensors")
+    try:
+        rasterizer = registry("rasterizer").build(configured("rasterizer", name))
+    except RuntimeError as error:
+        if "needs an OpenCL driver" not in str(error):
+            raise
+        pytest.skip(str(error))
+    check_rasterizer(rasterizer, device)
+
+
+@every("pooling")
+@on_every_device
+def test_pooling(name, device):
+    check_pooling(registry("pooling").build(configured("pooling", name)), device)
+
+
+@every("model")
+@on_every_device
+def test_model(name, device):
+    config = configured("model", name)
+    check_model(lambda scene: registry("model").build(config, scene=scene), example_links(), device)
+
+
+# --- and the checks can fail ---
+
+
+class Skewed(Mercator):
+    def jacobian(self, points):
+        return super().jacobian(points) * torch.tensor([[1.0], [1.001]]).to(points)
+
+
+class Unclamped(Equirectangular):
+    def jacobian(self, points):
+        return super().jacobian(points) / points[..., :2].norm(dim=-1)[..., None, None]
+
+
+class Shifted(Equirectangular):
+    def plane(self, elevations, azimuths):
+        plane = super().plane(elevations, azimuths)
+        return replace(plane, v=plane.v + 1e-6)
+
+
+class Hiding(Mercator):
+    def project(self, means, covariances, receiver):
+        splats = super().project(means, covariances, receiver)
+        return replace(splats, visible=splats.depths < 100)
+
+
+@pytest.mark.parametrize(
+    ("projection", "message"),
+    [
+        (Skewed, "jacobian must be the derivative of coordinates"),
+        (Unclamped, "must be finite"),
+        (Shifted, "plane.v must be coordinates' v"),
+        (Hiding, "only what sits on the receiver is hidden"),
+    ],
+)
+def test_a_broken_projection_is_found(projection, message):
+    with pytest.raises(AssertionError, match=message):
+        check_projection(projection(0.02))
+
+
+def unwrapped(splats, signal, opacities, attenuations, plane):
+    return TorchRasterizer()(splats, signal, opacities, attenuations, replace(plane, period=None))
+
+
+def unsorted(splats, *others):
+    return TorchRasterizer()(replace(splats, depths=torch.zeros_like(splats.depths)), *others)
+
+
+def clear(splats, signal, opacities, attenuations, plane):
+    return TorchRasterizer()(splats, signal, opacities, None, plane)
+
+
+def frozen(splats, *others):
+    return TorchRasterizer()(replace(splats, means2d=splats.means2d.detach()), *others)
+
+
+def culling(splats, signal, opacities, attenuations, plane):
+    return TorchRasterizer()(splats, signal.nan_to_num(), opacities, attenuations, plane)
+
+
+def single(splats, signal, opacities, *others):
+    return (result.float() for result in TorchRasterizer()(splats, signal, opacities, *others))
+
+
+def mixing(splats, signal, opacities, *others):
+    image, left = TorchRasterizer()(splats, signal, opacities, *others)
+    return image + 0 * left[:, None] + (image - image.detach().mean(0)) * 0 + 1e-2 * (len(image) - 2), left
+
+
+@pytest.mark.parametrize(
+    ("rasterizer", "message"),
+    [
+        (unwrapped, "random: map must be that of the formula"),
+        (unsorted, "random: map must be that of the formula"),
+        (clear, "attenuations: map must be that of the formula"),
+        (frozen, "random: gradient of means2d must be that of the formula"),
+        (culling, "NaN in signal must show as NaN in the map"),
+        (single, r"random: map must be torch.float64 as its input, got torch.float32"),
+        (mixing, "random: a map must not depend on other transmitters"),
+    ],
+)
+def test_a_broken_rasterizer_is_found(rasterizer, message):
+    with pytest.raises(AssertionError, match=message):
+        check_rasterizer(rasterizer)
+
+
+class Normalising(EuclideanTokenizer):
+    def forward(self, means, opacities, transmitters):
+        tokens = super().forward(means, opacities, transmitters)
+        return tokens._replace(transmitters=tokens.transmitters - tokens.transmitters.mean(0))
+
+
+class Deaf(EuclideanTokenizer):
+    def forward(self, means, opacities, transmitters):
+        return super().forward(means, opacities, 0 * transmitters)
+
+
+class Swapped(EuclideanTokenizer):
+    def forward(self, means, opacities, transmitters):
+        scene, gaussians, transmitters = super().forward(means, opacities, transmitters)
+        return Tokens(transmitters, gaussians, scene)
+
+
+class Noisy(EuclideanTokenizer):
+    def forward(self, means, opacities, transmitters):
+        return super().forward(means + torch.rand_like(means), opacities, transmitters)
+
+
+@pytest.mark.parametrize(
+    ("tokenizer", "message"),
+    [
+        (Normalising, "the token transmitters must not depend on the other transmitters"),
+        (Deaf, "tokens must tell two transmitters apart"),
+        (Swapped, r"the token scene must be of shape \(3, 0\), got \(3, 8\)"),
+        (Noisy, "two calls must give the same tokens"),
+    ],
+)
+def test_a_broken_tokenizer_is_found(tokenizer, message):
+    scene = example_links().scene
+    options = {"gaussian_octaves": (-1, 1), "transmitter_octaves": (-1, 1), "hidden": 8, "width": 8}
+    with pytest.raises(AssertionError, match=message):
+        check_tokenizer(tokenizer(scene, **options), scene)
+
+
+class Root(Spectrum):
+    def forward(self, image):
+        return image.square().sum(1).sqrt()
+
+
+class Relative(Spectrum):
+    def forward(self, image):
+        return super().forward(image) / image.abs().max()
+
+
+class Flat(Spectrum):
+    def forward(self, image):
+        return super().forward(image).flatten(1)
+
+
+@pytest.mark.parametrize(
+    ("pooling", "message"),
+    [
+        (Root, "the gradient of a silent map must be finite"),
+        (Relative, "a label must not depend on the other maps"),
+        (Flat, r"the label must be of shape \(3, 5, 8\), got \(3, 40\)"),
+    ],
+)
+def test_a_broken_pooling_is_found(pooling, message):
+    with pytest.raises(AssertionError, match=message):
+        check_pooling(pooling(2))
+
+
+class Grey(Model):
+    """The same grey in all directions, learnt."""
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.grey = nn.Parameter(torch.full((), 0.5))
+
+    def forward(self, batch):
+        return Prediction(self.grey * batch.transmitters.new_ones(len(batch.transmitters), *batch.grid.shape), {})
+
+
+class Stuck(Grey):
+    def parameter_groups(self):
+        return {"network": []}
+
+
+class Fixed(Grey):
+    def forward(self, batch):
+        return Prediction(self.grey.new_ones(len(batch.transmitters), *self.scene.grid.shape) * self.grey, {})
+
+
+class Forgetful(Grey):
+    def fit(self, links):
+        self.level = links.labels.mean()
+
+    def forward(self, batch):
+        return Prediction(super().forward(batch).label * getattr(self, "level", 1.0), {})
+
+
+class Crowded(Grey):
+    def forward(self, batch):
+        return Prediction(super().forward(batch).label * len(batch.transmitters), {})
+
+
+class Silent(Grey):
+    def forward(self, batch):
+        return Prediction(
+            (self.grey * batch.transmitters.new_zeros(()).expand(len(batch.transmitters), 18, 36)).sqrt(), {}
+        )
+
+
+class Trusting(Grey):
+    def predict(self, transmitters, receiver=0, batch_size=16):
+        return torch.full((len(transmitters), 18, 36), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (Stuck, "each parameter must stand in one of parameter_groups"),
+        (Fixed, "fewer directions must get the same values"),
+        (Forgetful, "all that predict needs must be in the state dict"),
+        (Crowded, "the batch size must not change predictions"),
+        (Silent, "the gradient of grey must be finite"),
+        (Trusting, "transmitters with one axis must be a ValueError"),
+    ],
+)
+def test_a_broken_model_is_found(model, message):
+    check_model(Grey, example_links())
+    with pytest.raises(AssertionError, match=message):
+        check_model(model, example_links())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"transmitters": torch.zeros(24, 3, dtype=torch.float64)}, "transmitters must be torch.float32"),
+        ({"transmitters": torch.full((24, 3), torch.nan)}, "transmitters must be finite"),
+        ({"receiver_index": torch.full((24,), 2)}, "receiver_index must point into receivers"),
+        ({"labels": torch.full((24, 18, 36), 1.5)}, r"spectra must lie in \[0, 1\]"),
+        ({"labels": torch.zeros(24, 36, 18)}, r"labels must be of shape \(9, 18, 36\), got \(9, 36, 18\)"),
+        ({"split": replace(example_links().split, test=torch.arange(3))}, "no link may stand twice"),
+        ({"split": replace(example_links().split, test=torch.arange(24, 26))}, "must point at the 24 links"),
+    ],
+)
+def test_broken_links_are_found(changes, message):
+    check_data(example_links())
+    with pytest.raises(AssertionError, match=message):
+        check_data(replace(example_links(), **changes))

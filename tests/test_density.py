@@ -1,0 +1,200 @@
+"""Prune, clone and split: what stays keeps its optimizer state, and the picture changes only as it should."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gaigs import density
+from gaigs.gaussians import Gaussians
+from gaigs.projection.mercator import Mercator
+from gaigs.rasterizer import ALPHA_MIN
+from gaigs.rasterizer.torch import TorchRasterizer
+from gaigs.testing import example_links
+
+N = 20
+CHANGES = {
+    "prune": lambda gaussians, optimizer, chosen: density.prune(gaussians, optimizer, chosen),
+    "clone": lambda gaussians, optimizer, chosen: density.clone(gaussians, optimizer, chosen),
+    "split": lambda gaussians, optimizer, chosen: density.split(gaussians, optimizer, chosen, torch.Generator()),
+}
+
+
+@pytest.fixture
+def scene():
+    scene = example_links().scene
+    return replace(scene, receivers=scene.receivers[:1])
+
+
+@pytest.fixture
+def gaussians(scene):
+    torch.manual_seed(0)
+    return Gaussians(scene, channels=2, count=N, near=2.0, far=5.0, spread=0.5, opacity=0.1, signal=1.0)
+
+
+@pytest.fixture
+def chosen():
+    return torch.arange(N) % 3 == 0
+
+
+def optimizer_of(gaussians, kind=torch.optim.AdamW):
+    groups = [
+        {"params": [parameter], "lr": 1e-2 * (i + 1), "name": name}
+        for i, (name, parameter) in enumerate(gaussians.named_parameters())
+    ]
+    other = torch.nn.Parameter(torch.ones(3))
+    return kind([*groups, {"params": [other], "lr": 1.0, "name": "network"}])
+
+
+def render(gaussians, scene):
+    projection = Mercator(scene.grid.pitch)
+    splats = projection.project(gaussians.means, gaussians.covariances[None], scene.receivers[0].pose)
+    signal, opacities = gaussians.signal.squeeze(-1)[None], gaussians.opacities[None]
+    plane = projection.plane(scene.grid.elevations, scene.grid.azimuths)
+    return TorchRasterizer()(splats, signal, opacities, None, plane)[0]
+
+
+def train(gaussians, optimizer, scene, steps=3):
+    for _ in range(steps):
+        optimizer.zero_grad()
+        render(gaussians, scene).square().mean().backward()
+        optimizer.step()
+
+
+@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize("kind", [torch.optim.AdamW, torch.optim.SGD])
+def test_the_optimizer_keeps_its_memory_of_those_that_stay(gaussians, scene, chosen, name, kind):
+    optimizer = optimizer_of(gaussians, kind)
+    train(gaussians, optimizer, scene)
+    old = dict(gaussians.named_parameters())
+    memories = {name: dict(optimizer.state[parameter]) for name, parameter in old.items()}
+    CHANGES[name](gaussians, optimizer, chosen)
+
+    origin = torch.arange(N)[~chosen] if name == "prune" else torch.cat((torch.arange(N), torch.arange(N)[chosen]))
+    kept = min(N, len(origin))
+    new = dict(gaussians.named_parameters())
+    assert {id(p) for p in optimizer.state} & {id(p) for p in old.values()} == set()
+    for group, (parameter_name, parameter) in zip(optimizer.param_groups, new.items(), strict=False):
+        assert group["name"] == parameter_name
+        assert len(group["params"]) == 1
+        assert group["params"][0] is parameter
+        for key, memory in memories[parameter_name].items():
+            now = optimizer.state[parameter][key]
+            if key == "step":
+                assert now == memory == 3
+                continue
+            assert now.shape == parameter.shape
+            assert memory.any()
+            assert torch.equal(now[:kept], memory[origin[:kept]])
+            assert not now[kept:].any()
+    assert optimizer.param_groups[-1]["name"] == "network"
+
+
+@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize("steps", [0, 3])
+def test_training_goes_on(gaussians, scene, chosen, name, steps):
+    optimizer = optimizer_of(gaussians)
+    train(gaussians, optimizer, scene, steps)
+    CHANGES[name](gaussians, optimizer, chosen)
+    before = {name: parameter.detach().clone() for name, parameter in gaussians.named_parameters()}
+    train(gaussians, optimizer, scene, 2)
+    for parameter_name, parameter in gaussians.named_parameters():
+        assert parameter.isfinite().all()
+        assert not torch.equal(parameter, before[parameter_name]), parameter_name
+    assert len(gaussians) == (N - 7 if name == "prune" else N + 7)
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_is_frozen_stays_frozen(gaussians, chosen, name):
+    gaussians.means.requires_grad_(False)
+    CHANGES[name](gaussians, optimizer_of(gaussians), chosen)
+    assert not gaussians.means.requires_grad
+    assert gaussians.signal.requires_grad
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_nobody_chosen_changes_nothing(gaussians, name):
+    before = {key: value.clone() for key, value in gaussians.state_dict().items()}
+    CHANGES[name](gaussians, optimizer_of(gaussians), torch.zeros(N, dtype=torch.bool))
+    assert all(torch.equal(value, before[key]) for key, value in gaussians.state_dict().items())
+
+
+def test_pruned_are_gone_and_the_others_as_they_were(gaussians, chosen):
+    before = {key: value.clone() for key, value in gaussians.state_dict().items()}
+    density.prune(gaussians, optimizer_of(gaussians), chosen)
+    assert all(torch.equal(value, before[key][~chosen]) for key, value in gaussians.state_dict().items())
+
+
+def test_pruning_all_is_refused(gaussians):
+    with pytest.raises(ValueError, match="must leave a Gaussian, and all 20 would go"):
+        density.prune(gaussians, optimizer_of(gaussians), torch.ones(N, dtype=torch.bool))
+    assert len(gaussians) == N
+
+
+def test_a_clone_and_its_original_cover_what_one_did(gaussians, chosen):
+    with torch.no_grad():
+        gaussians.opacity_logits.copy_(torch.linspace(-12, 40, N))  # 40: float32 can no longer tell 1 - a from 0
+    logits = gaussians.opacity_logits.detach().double()
+    density.clone(gaussians, optimizer_of(gaussians), chosen)
+    originals, clones = gaussians.opacity_logits[:N][chosen], gaussians.opacity_logits[N:]
+    assert torch.equal(originals, clones)
+    # 1 - a is the sigmoid of the negative logit.
+    missed = torch.sigmoid(-originals.detach().double()).square()
+    torch.testing.assert_close(missed, torch.sigmoid(-logits[chosen]), rtol=1e-4, atol=0)
+    covered = -torch.log1p(-torch.sigmoid(originals.detach().double())) * 2
+    torch.testing.assert_close(covered, torch.nn.functional.softplus(logits[chosen]), rtol=1e-4, atol=0)
+    assert torch.equal(gaussians.opacity_logits[:N][~chosen].double(), logits[~chosen])
+    assert torch.equal(gaussians.means[N:], gaussians.means[:N][chosen])
+    assert torch.equal(gaussians.signal[N:], gaussians.signal[:N][chosen])
+
+
+def test_cloning_leaves_the_image_to_first_order(gaussians, scene):
+    only = torch.zeros(N, dtype=torch.bool)
+    only[7] = True
+    with torch.no_grad():
+        gaussians.signal.zero_()
+        gaussians.signal[7, 0] = 1
+        gaussians.opacity_logits.fill_(-20)
+        gaussians.opacity_logits[7] = math.log(0.2 / 0.8)
+    before = render(gaussians, scene)[0, 0]
+    density.clone(gaussians, optimizer_of(gaussians), only)
+    after = render(gaussians, scene)[0, 0]
+    # Of A = a G the two make A + a² (G - G²) / 4 + ..., where neither is cut off.
+    whole = before > 2.2 * ALPHA_MIN
+    assert whole.sum() > 10
+    change = (after - before)[whole].abs().max().item()
+    assert 0.1 * 0.2**2 / 16 < change < 1.3 * 0.2**2 / 16
+
+
+def test_halves_are_smaller_and_drawn_from_the_whole(gaussians):
+    chosen = torch.zeros(N, dtype=torch.bool)
+    chosen[5] = True
+    with torch.no_grad():
+        gaussians.log_scales[5] = torch.tensor([0.5, 0.1, 2.0]).log()
+    before = {key: value.clone() for key, value in gaussians.state_dict().items()}
+    density.split(gaussians, optimizer_of(gaussians), chosen, torch.Generator().manual_seed(1))
+    halves = torch.tensor([5, N])
+    torch.testing.assert_close(gaussians.scales[halves] * density.SHRINK, before["log_scales"][[5, 5]].exp())
+    for key in ("quats", "opacity_logits", "signal"):
+        assert torch.equal(gaussians.state_dict()[key][halves], before[key][[5, 5]])
+    others = torch.arange(N) != 5
+    assert all(torch.equal(value[:N][others], before[key][others]) for key, value in gaussians.state_dict().items())
+    assert (gaussians.means[halves] - before["means"][5]).norm(dim=-1).min() > 0.05
+    assert (gaussians.means[5] - gaussians.means[N]).norm() > 0.05
+
+
+def test_the_places_of_halves_follow_the_whole(scene):
+    count = 4000
+    gaussians = Gaussians(scene, channels=1, count=count, near=2.0, far=5.0, spread=0.5, opacity=0.1, signal=1.0)
+    with torch.no_grad():
+        for name, value in (("means", [1.0, 2, 3]), ("quats", [0.3, -1.0, 0.5, 0.2]), ("log_scales", [0.0, -1, -2])):
+            getattr(gaussians, name).copy_(torch.tensor(value).expand(count, -1))
+    covariance = gaussians.covariances[0].detach()
+    everyone = torch.ones(count, dtype=torch.bool)
+
+    density.split(gaussians, optimizer_of(gaussians), everyone, torch.Generator().manual_seed(0))
+    places = gaussians.means.detach()
+    # Of 8,000 draws a covariance is known to a fraction sqrt(2 / 8000) = 1.6 % of the largest variance.
+    torch.testing.assert_close(places.T.cov(), covariance, rtol=0, atol=0.08 * covariance.max().item())
+    torch.testing.assert_close(places.mean(0), torch.tensor([1.0, 2, 3]), rtol=0, atol=0.06)

@@ -1,0 +1,377 @@
+import hashlib
+import json
+import os
+import shutil
+import signal
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from PIL import Image
+
+import gaigs
+from gaigs import experiment
+from gaigs.configuration import conf_dir
+from gaigs.data.nerf2_spectrum import write
+from gaigs.registry import registry
+from gaigs.report.curves import read_curves
+from gaigs.training.module import Training
+
+SMALL = (
+    "data.transmitters=30",
+    "tokenizer=euclidean",
+    "rasterizer=torch",
+    "gaussians.count=30",
+    "training.batch_size=7",  # 22 links train: batches of 7, 7, 7 and 1
+    "training.stride=8",
+    "trainer.accelerator=cpu",
+    "trainer.max_steps=14",
+    "trainer.val_check_interval=5",
+    "trainer.log_every_n_steps=1",
+    "trainer.enable_progress_bar=false",
+)
+CASES = {
+    "validation": (),
+    "no validation": ("data.split.validation=0",),
+    "no validation in time": ("trainer.val_check_interval=100",),
+    "density control": (
+        "training.density={every: 3, start: 3, stop: 9, gradient: 1.0e-4, wide: 0.3, opacity: 0.005, most: 50}",
+    ),
+    "early stop": (  # the first step drives all opacities to 0 or 1, so the second validation is as good as the first
+        "trainer.val_check_interval=3",
+        "training.patience=1",
+        "training.learning_rates={means: 0, quats: 0, log_scales: 0, opacity_logits: 1.0e+5, signal: 0, network: 0}",
+    ),
+}
+METRICS = [
+    "split",
+    "seed",
+    "device",
+    "rasterizer",
+    "train_seconds",
+    "inference_ms",
+    "render_ms",
+    "num_gaussians",
+    "num_gaussians_start",
+    "num_parameters",
+    "checkpoint_bytes",
+    "models",
+]
+
+
+def configure(*overrides):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return OmegaConf.to_container(compose("config", [*SMALL, *overrides]), resolve=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_figures():
+    """Figures take longer than all else; the tests of gaigs.report and of the command line draw them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment, "write_figures", lambda *_: None)
+        yield
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request, tmp_path_factory):
+    """A configuration and the folder of its run, which nothing interrupted."""
+    config = configure(*CASES[request.param])
+    folder = tmp_path_factory.mktemp("whole")
+    return config, folder, experiment.run(config, folder)
+
+
+def interrupt(monkeypatch, at, times=1):
+    """Presses Ctrl-C within a step."""
+    training_step = Training.training_step
+
+    def interrupted(self, batch, index):
+        if self.global_step + 1 == at:
+            for _ in range(times):
+                os.kill(os.getpid(), signal.SIGINT)
+        return training_step(self, batch, index)
+
+    monkeypatch.setattr(Training, "training_step", interrupted)
+
+
+def assert_same(a, b, where):
+    """Two parts of a checkpoint hold the same numbers, bit for bit."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_same(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b), where
+        for i, pair in enumerate(zip(a, b, strict=True)):
+            assert_same(*pair, f"{where}[{i}]")
+    else:
+        assert torch.equal(a, b) if torch.is_tensor(a) else a == b, where
+
+
+def assert_same_run(metrics, folder, others, other):
+    """Two runs ended alike."""
+    assert metrics["models"] == others["models"]
+    for name in ("best.ckpt", "last.ckpt"):
+        a, b = (torch.load(path / name, weights_only=True) for path in (folder, other))
+        for part in ("state_dict", "optimizer_states", "lr_schedulers", "global_step", "gaigs"):
+            assert_same(a[part], b[part], f"{name}: {part}")
+    curves, resumed = (read_curves(sorted(path.glob("log/*/metrics.csv"))) for path in (folder, other))
+    assert curves.keys() == resumed.keys()
+    for name in curves:
+        np.testing.assert_array_equal(curves[name], resumed[name], name)
+
+
+@pytest.mark.parametrize("at", [3, 5, 6])  # within a pass; before a validation; before a density round or early stop
+def test_an_interrupted_run_ends_as_if_it_had_not_been(case, at, tmp_path, monkeypatch):
+    config, folder, metrics = case
+    handler = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patch:
+        interrupt(patch, at)
+        with pytest.raises(KeyboardInterrupt, match=f"stopped after step {at}$"):
+            experiment.run(config, tmp_path)
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == at
+    assert not (tmp_path / "metrics.json").exists()
+    assert_same_run(metrics, folder, experiment.run(config, tmp_path), tmp_path)
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_a_run_goes_on_from_a_save_every_step_and_after_several_interruptions(case, tmp_path, monkeypatch):
+    config, folder, metrics = case
+    config = config | {"save_every": 0}
+    for at in (1, 2, 4):
+        with monkeypatch.context() as patch:
+            interrupt(patch, at)
+            with pytest.raises(KeyboardInterrupt):
+                experiment.run(config, tmp_path)
+    others = experiment.run(config, tmp_path)
+    assert metrics["models"] == others["models"]
+    for name in ("best.ckpt", "last.ckpt"):
+        a, b = (torch.load(path / name, weights_only=True)["state_dict"] for path in (folder, tmp_path))
+        assert_same(a, b, name)
+
+
+def test_the_cases_are_what_they_are_called(case):
+    config, folder, metrics = case
+    best, last = (torch.load(folder / f"{name}.ckpt", weights_only=True) for name in ("best", "last"))
+    changed = metrics["num_gaussians"] != metrics["num_gaussians_start"]
+    assert changed == (config["training"]["density"] is not None)
+    assert metrics["num_gaussians"] == len(best["state_dict"]["model.gaussians.means"])
+    patience = config["training"]["patience"]
+    assert last["global_step"] == (14 if patience is None else 6)
+    assert best["global_step"] <= last["global_step"]
+    if not config["data"]["split"]["validation"] or config["trainer"]["val_check_interval"] == 100:
+        assert best["global_step"] == 14
+    else:
+        assert best["global_step"] % config["trainer"]["val_check_interval"] == 0
+
+
+def test_a_second_ctrl_c_stops_within_the_step(tmp_path, monkeypatch):
+    interrupt(monkeypatch, at=3, times=2)
+    with pytest.raises(KeyboardInterrupt, match="stopped within a step"):
+        experiment.run(configure(), tmp_path)
+    assert not (tmp_path / "last.ckpt").exists()
+
+
+# --- the run folder ---
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    config, folder = configure("trainer.max_steps=3"), tmp_path_factory.mktemp("finished")
+    return config, folder, experiment.run(config, folder)
+
+
+def digest(folder):
+    """What is in a folder, and when it was written."""
+    return {
+        path: (hashlib.sha256(path.read_bytes()).hexdigest(), path.stat().st_mtime_ns)
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_metrics(finished):
+    _, folder, metrics = finished
+    assert json.loads((folder / "metrics.json").read_text()) == metrics
+    assert list(metrics) == METRICS
+    assert metrics["split"] == "official, validation 0.1, seed 0"
+    assert (metrics["seed"], metrics["rasterizer"]) == (0, "torch")
+    assert metrics["num_gaussians"] == metrics["num_gaussians_start"] == 30
+    assert metrics["checkpoint_bytes"] == (folder / "best.ckpt").stat().st_size
+    assert metrics["num_parameters"] == sum(p.numel() for p in gaigs.load(folder / "best.ckpt").parameters())
+    assert min(metrics[time] for time in ("train_seconds", "inference_ms", "render_ms")) > 0
+    assert list(metrics["models"]) == ["gaigs", "mean", "knn"]
+    for scores in metrics["models"].values():
+        assert list(scores) == ["ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae"]
+
+
+def test_the_folder_holds_what_it_should_and_no_half_written_file(finished):
+    _, folder, _ = finished
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        "config.yaml", "best.ckpt", "last.ckpt", "log", "predictions.npz", "gaussians.ply", "metrics.json"
+    }  # fmt: skip
+
+
+def test_the_stored_configuration_gives_the_same_run(finished, tmp_path):
+    config, folder, metrics = finished
+    stored = yaml.safe_load((folder / "config.yaml").read_text())
+    assert stored == config
+    assert_same_run(metrics, folder, experiment.run(stored, tmp_path), tmp_path)
+
+
+def test_predictions_belong_to_the_test_links(finished):
+    config, folder, metrics = finished
+    links = registry("data").build(config["data"])
+    with np.load(folder / "predictions.npz") as file:
+        stored = dict(file)
+    assert stored["link"].tolist() == links.split.test.tolist()
+    np.testing.assert_array_equal(stored["transmitters"], links.transmitters[links.split.test])
+    np.testing.assert_allclose(stored["labels"], links.labels[links.split.test], atol=5e-4)
+    assert np.median(stored["ssim_gaigs"]) == pytest.approx(metrics["models"]["gaigs"]["ssim_median"])
+
+
+def test_a_finished_run_started_again_ends_at_once(finished, monkeypatch):
+    config, folder, metrics = finished
+    before = digest(folder)
+    monkeypatch.setattr(experiment, "train_and_test", None)
+    assert experiment.run(config, folder) == metrics
+    assert digest(folder) == before
+
+
+def test_a_run_killed_behind_its_training_only_tests_anew(finished, tmp_path, monkeypatch):
+    config, folder, metrics = finished
+    with monkeypatch.context() as patch:
+        patch.setattr(experiment, "test", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            experiment.run(config, tmp_path)
+    monkeypatch.setattr(Training, "training_step", lambda *_: 1 / 0)
+    trained = torch.load(tmp_path / "last.ckpt", weights_only=True)["callbacks"]["Timer"]["time_elapsed"]["train"]
+    others = experiment.run(config, tmp_path)
+    assert_same_run(metrics, folder, others, tmp_path)
+    assert others["train_seconds"] == trained
+
+
+def test_another_configuration_in_the_same_folder_is_refused(finished):
+    config, folder, _ = finished
+    before = digest(folder)
+    other = config | {"seed": 1, "gaussians": config["gaussians"] | {"count": 31}}
+    other["model"] = config["model"] | {"gaussians": other["gaussians"]}
+    with pytest.raises(ValueError, match="of the same configuration") as error:
+        experiment.run(other, folder)
+    assert "but gaussians.count was 30, is 31; seed was 0, is 1; choose another folder" in str(error.value)
+    assert digest(folder) == before
+
+
+def test_a_folder_with_nothing_to_go_on_from_is_free(tmp_path):
+    (tmp_path / "config.yaml").write_text("seed: 5\n")
+    experiment.run(configure("trainer.max_steps=1"), tmp_path)
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["seed"] == 0
+
+
+def test_a_damaged_checkpoint_is_refused(finished, tmp_path):
+    config, folder, _ = finished
+    (tmp_path / "config.yaml").write_text((folder / "config.yaml").read_text())
+    (tmp_path / "last.ckpt").write_bytes((folder / "last.ckpt").read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"last\.ckpt must be a checkpoint of gaigs, and is damaged"):
+        experiment.run(config, tmp_path)
+
+
+@pytest.mark.parametrize(("model", "others"), [("knn", ["mean"]), ("mean", ["knn"])])
+def test_look_ups_run_without_training(model, others, finished, tmp_path):
+    metrics = experiment.run(configure(f"model={model}"), tmp_path)
+    assert list(metrics) == METRICS
+    assert list(metrics["models"]) == [model, *others]
+    assert metrics["models"][model] == finished[2]["models"][model], "as beside any other model"
+    assert (metrics["num_gaussians"], metrics["num_gaussians_start"], metrics["num_parameters"]) == (0, 0, 0)
+    for key in ("rasterizer", "train_seconds", "render_ms", "checkpoint_bytes"):
+        assert metrics[key] is None
+    assert {path.name for path in tmp_path.iterdir()} == {"config.yaml", "predictions.npz", "metrics.json"}
+
+
+def test_tensorboard_logs_beside_the_csv(tmp_path):
+    pytest.importorskip("tensorboard")
+    experiment.run(configure("tensorboard=true", "trainer.max_steps=2"), tmp_path)
+    assert list(tmp_path.glob("tensorboard/*/events*"))
+    assert list(tmp_path.glob("log/*/metrics.csv"))
+
+
+# --- what is refused ---
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["+tokenizer.widht=3"], r"tokenizer 'euclidean' has no option 'widht' \(did you mean 'width'\?\); it has: "),
+        (["+gaussians.conut=3"], r"gaussians has no option 'conut' \(did you mean 'count'\?\); it has: count, near"),
+        (["+mapping.header=[]"], r"mapping has no option 'header' \(did you mean 'heads'\?\); it has: width"),
+        (["+training.batchsize=3"], r"training has no option 'batchsize' \(did you mean 'batch_size'\?\)"),
+        (["~training.stride"], r"training needs option stride; it has: batch_size"),
+        (["training.density={evry: 3}"], r"training.density has no option 'evry' \(did you mean 'every'\?\)"),
+        (["training.density=3"], r"training.density must be a mapping of options, got 3"),
+        (["+trainer.max_step=3"], r"trainer has no option 'max_step' \(did you mean 'max_steps'\?\)"),
+        (["+trainer.callbacks=[]"], r"trainer has no option 'callbacks'"),
+        (["+trainer.accumulate_grad_batches=2"], r"trainer.accumulate_grad_batches must be 1, got 2"),
+        (["trainer.devices=2"], r"trainer.devices must be 1, got 2"),
+        (["trainer.max_steps=-1"], r"trainer.max_steps must be at least 1, got -1"),
+        (["data.split.protocol=blcks"], r"unknown split protocol 'blcks'"),
+    ],
+)
+def test_a_wrong_option_is_named(overrides, message, tmp_path):
+    with pytest.raises((ValueError, TypeError), match=message):
+        experiment.run(configure(*overrides), tmp_path)
+    assert not list(tmp_path.glob("*.ckpt"))
+
+
+@pytest.fixture(scope="module")
+def rfid(tmp_path_factory):
+    """A small data set in the folder layout of NeRF²."""
+    folder = tmp_path_factory.mktemp("rfid") / "data"
+    write(folder, registry("data").build(configure("data.transmitters=12")["data"]))
+    return folder
+
+
+def nan_position(folder):
+    lines = (folder / "tx_pos.csv").read_text().splitlines()
+    lines[3] = "0.5,nan,1.0"
+    (folder / "tx_pos.csv").write_text("\n".join(lines))
+    return r"tx_pos\.csv, line 4, column y: expected a finite number, got 'nan'"
+
+
+def wide_image(folder):
+    Image.fromarray(np.zeros((90, 361), np.uint8)).save(folder / "spectrum" / "00004.png")
+    return r"00004\.png: expected 90 x 360 pixels, got 90 x 361"
+
+
+def missing_image(folder):
+    (folder / "spectrum" / "00004.png").unlink()
+    return r"00004\.png: missing"
+
+
+def measured(folder):
+    """A configuration of measured spectra."""
+    config = configure("trainer.max_steps=2")
+    return config | {"data": {"name": "nerf2_spectrum", "root": str(folder), "split": config["data"]["split"]}}
+
+
+@pytest.mark.parametrize("damage", [nan_position, wide_image, missing_image])
+def test_damaged_data_are_refused_and_left_alone(damage, rfid, tmp_path):
+    data = shutil.copytree(rfid, tmp_path / "data")
+    message = damage(data)
+    before = digest(data)
+    with pytest.raises(ValueError, match=message):
+        experiment.run(measured(data), tmp_path / "run")
+    assert digest(data) == before
+
+
+def test_data_are_only_read(rfid, tmp_path):
+    before = digest(rfid)
+    experiment.run(measured(rfid), tmp_path)
+    assert digest(rfid) == before
+
+
+def test_data_that_are_not_there_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere must be the folder of a data set"):
+        experiment.run(measured(tmp_path / "nowhere"), tmp_path)

@@ -1,0 +1,190 @@
+"""Where Gaussians start, what they are activated to, and that files and checkpoints bring them back."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from plyfile import PlyData
+from scipy.spatial import cKDTree
+from torch import nn
+
+from gaigs.gaussians import Gaussians, fibonacci_lattice
+from gaigs.geometry import to_spherical
+from gaigs.testing import example_links
+
+OPTIONS = {"channels": 2, "count": 41, "near": 2.0, "far": 5.0, "spread": 0.5, "opacity": 0.1, "signal": 1.0}
+
+
+@pytest.fixture
+def scene():
+    return example_links().scene
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    torch.manual_seed(0)
+
+
+def gaussians_of(scene, **options):
+    return Gaussians(scene, **(OPTIONS | options))
+
+
+# --- where they start ---
+
+
+@pytest.mark.parametrize(("low", "high"), [(-math.pi / 2, math.pi / 2), (0.0, math.pi / 2), (0.2, 0.6)])
+def test_the_lattice_is_even(low, high):
+    count = 2000
+    points = fibonacci_lattice(count, low, high)
+    azimuths, elevations, distances = to_spherical(points)
+    torch.testing.assert_close(distances, torch.ones(count))
+    assert elevations.min() > low
+    assert elevations.max() < high
+    # Within the zone every patch of the same solid angle holds as many.
+    heights = (points[:, 2] - math.sin(low)) / (math.sin(high) - math.sin(low))
+    patches = (heights * 10).long() * 8 + ((azimuths / math.tau + 0.5) * 8).long().clamp(0, 7)
+    assert (patches.bincount(minlength=80) - count / 80).abs().max() <= 5
+    # And none stands much nearer to its neighbour than evenness allows.
+    pitch = math.sqrt(math.tau * (math.sin(high) - math.sin(low)) / count)
+    nearest = cKDTree(points.numpy()).query(points.numpy(), 2)[0][:, 1]
+    assert nearest.min() > 0.7 * pitch
+    assert nearest.max() < 1.3 * pitch
+
+
+def test_every_receiver_gets_its_share_in_the_directions_that_its_label_shows(scene):
+    gaussians = gaussians_of(scene)
+    assert len(gaussians) == 41
+    shares = gaussians.means.split((21, 20))
+    for receiver, means in zip(scene.receivers, shares, strict=True):
+        azimuths, elevations, distances = to_spherical(receiver.pose.local(means))
+        assert elevations.min() >= scene.grid.elevations.min() - 1e-5
+        assert elevations.max() <= scene.grid.elevations.max() + 1e-5
+        assert distances.min() >= 2 - 1e-5
+        assert distances.max() <= 5 + 1e-5
+        assert azimuths.max() - azimuths.min() > 5
+
+
+def test_they_start_as_wide_as_to_meet_their_neighbours(scene):
+    scene = replace(scene, receivers=scene.receivers[:1])
+    gaussians = gaussians_of(scene, count=500)
+    points = scene.receivers[0].pose.local(gaussians.means.detach())
+    distances = points.norm(dim=-1)
+    directions = (points / distances[:, None]).numpy()
+    angles = cKDTree(directions).query(directions, 2)[0][:, 1].mean()
+    torch.testing.assert_close(gaussians.scales.detach(), (gaussians.scales[:, :1]).expand(-1, 3).detach())
+    assert (gaussians.scales[:, 0] / distances).mean().item() == pytest.approx(0.5 * angles, rel=0.1)
+
+
+def test_without_a_grid_they_surround_the_receiver(scene):
+    gaussians = gaussians_of(replace(scene, grid=None, receivers=scene.receivers[:1]), count=200)
+    _, elevations, _ = to_spherical(scene.receivers[0].pose.local(gaussians.means))
+    assert elevations.min() < -1
+    assert elevations.max() > 1
+
+
+def test_activations(scene):
+    gaussians = gaussians_of(scene)
+    torch.testing.assert_close(gaussians.opacities, torch.full((41,), 0.1))
+    torch.testing.assert_close(gaussians.unit_quats.norm(dim=-1), torch.ones(41))
+    torch.testing.assert_close(
+        torch.linalg.eigvalsh(gaussians.covariances).sqrt(), gaussians.scales.sort(-1).values, rtol=1e-3, atol=1e-5
+    )
+    assert gaussians.signal.shape == (41, 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"count": 1}, r"at least one a receiver \(2\), got 1"),
+        ({"near": 0.0}, "0 < near <= far, got 0.0 and 5.0 m"),
+        ({"near": 6.0}, "0 < near <= far"),
+        ({"opacity": 1.0}, "between 0 and 1, got 1.0"),
+        ({"opacity": 0.0}, "between 0 and 1"),
+    ],
+)
+def test_impossible_options_are_refused(scene, options, message):
+    with pytest.raises(ValueError, match=message):
+        gaussians_of(scene, **options)
+
+
+# --- another number of them ---
+
+
+def test_a_state_dict_of_another_number_is_taken_over(scene):
+    trained, fresh = gaussians_of(scene, count=70), gaussians_of(scene)
+    holder = nn.ModuleDict({"gaussians": fresh})
+    holder.load_state_dict({f"gaussians.{name}": value for name, value in trained.state_dict().items()})
+    assert len(fresh) == 70
+    for name in Gaussians.PARAMETERS:
+        assert torch.equal(getattr(fresh, name), getattr(trained, name))
+        assert isinstance(getattr(fresh, name), nn.Parameter)
+
+
+def test_resizing_keeps_what_is_frozen_frozen(scene):
+    gaussians = gaussians_of(scene)
+    gaussians.means.requires_grad_(False)
+    gaussians.resize(5)
+    assert [parameter.shape[0] for parameter in gaussians.parameters()] == [5] * 5
+    assert [name for name, parameter in gaussians.named_parameters() if not parameter.requires_grad] == ["means"]
+
+
+# --- .ply ---
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 5])
+def test_a_ply_brings_them_back_bit_by_bit(scene, tmp_path, channels):
+    saved, loaded = gaussians_of(scene, channels=channels), gaussians_of(scene, channels=channels, count=7)
+    saved.save_ply(tmp_path / "room.ply")
+    loaded.load_ply(tmp_path / "room.ply")
+    assert len(loaded) == 41
+    for name in Gaussians.PARAMETERS:
+        assert torch.equal(getattr(loaded, name), getattr(saved, name)), name
+
+
+def test_a_ply_has_the_columns_that_splatting_viewers_read(scene, tmp_path):
+    gaussians = gaussians_of(scene)
+    gaussians.save_ply(tmp_path / "room.ply")
+    ply = PlyData.read(tmp_path / "room.ply")
+    assert not ply.text
+    assert ply.byte_order == "<"
+    vertices = ply["vertex"]
+    columns = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    assert [(p.name, p.val_dtype) for p in vertices.properties] == [(column, "f4") for column in columns]
+    fourth = {name: float(vertices[name][4]) for name in columns}
+    assert [fourth[c] for c in "xyz"] == gaussians.means[4].tolist()
+    assert fourth["opacity"] == gaussians.opacity_logits[4].item()
+    assert [fourth[f"scale_{i}"] for i in range(3)] == gaussians.log_scales[4].tolist()
+    assert [fourth[f"rot_{i}"] for i in range(4)] == gaussians.quats[4].tolist()
+    assert [fourth[f"f_dc_{i}"] for i in range(3)] == [*gaussians.signal[4, :, 0].tolist(), 0]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"solid cube\n", "room.ply must be a whole .ply file with an element 'vertex': line 1: expected 'ply'"),
+        (b"ply\nformat ascii 1.0\nelement face 0\nproperty float x\nend_header\n", "with an element 'vertex'"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n12",
+            "early end-of-file",
+        ),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n0 0\n",
+            "splats with 2 signal channels; it lacks z, f_dc_0, f_dc_1, f_dc_2, opacity, scale_0",
+        ),
+    ],
+)
+def test_a_file_that_holds_no_splats_is_refused(scene, tmp_path, content, message):
+    (tmp_path / "room.ply").write_bytes(content)
+    gaussians = gaussians_of(scene)
+    with pytest.raises(ValueError, match=message):
+        gaussians.load_ply(tmp_path / "room.ply")
+    assert len(gaussians) == 41
+
+
+def test_a_ply_of_too_few_channels_is_refused(scene, tmp_path):
+    gaussians_of(scene, channels=2).save_ply(tmp_path / "room.ply")
+    with pytest.raises(ValueError, match="with 5 signal channels; it lacks f_rest_0, f_rest_1"):
+        gaussians_of(scene, channels=5).load_ply(tmp_path / "room.ply")
+    with pytest.raises(FileNotFoundError):
+        gaussians_of(scene).load_ply(tmp_path / "hall.ply")

@@ -1,0 +1,100 @@
+"""Rotations and poses against scipy, covariances and spherical coordinates against their definitions."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from gaigs.geometry import Pose, covariances, from_spherical, quaternions_to_rotations, to_spherical
+
+
+@pytest.fixture
+def quats():
+    """Quaternions (w, x, y, z) of various lengths."""
+    return 3 * torch.randn(20, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+
+def test_quaternions_rotate_as_scipys_do_whatever_their_length(quats):
+    expected = Rotation.from_quat(quats.roll(-1, -1).numpy()).as_matrix()
+    torch.testing.assert_close(quaternions_to_rotations(quats), torch.from_numpy(expected))
+
+
+def test_the_length_of_a_quaternion_gets_no_gradient(quats):
+    assert torch.autograd.gradcheck(quaternions_to_rotations, quats.requires_grad_())
+    weights = torch.arange(9.0, dtype=torch.float64).view(3, 3)
+    (gradient,) = torch.autograd.grad((quaternions_to_rotations(quats) * weights).sum(), quats)
+    torch.testing.assert_close((gradient * quats).sum(-1), torch.zeros(20, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+def test_covariances_have_the_scales_along_the_rotated_axes(quats):
+    scales = torch.rand(20, 3, dtype=torch.float64) + 0.1
+    matrices = covariances(quats, scales)
+    axes = torch.from_numpy(Rotation.from_quat(quats.roll(-1, -1).numpy()).as_matrix())
+    torch.testing.assert_close(matrices @ axes, axes * scales.square()[:, None, :])
+    torch.testing.assert_close(matrices, matrices.mT)
+
+
+def test_a_pose_reads_scalar_last_quaternions():
+    turn = Rotation.from_euler("zyx", [40, -25, 100], degrees=True)
+    pose = Pose.from_xyzw([1, 2, 3], turn.as_quat())
+    np.testing.assert_allclose(pose.rotation, turn.as_matrix(), atol=1e-6)
+    assert pose.position.tolist() == [1, 2, 3]
+    assert pose.position.dtype == pose.rotation.dtype == torch.float32
+
+
+def test_a_point_on_an_axis_of_the_array_is_seen_there():
+    turn = Rotation.from_euler("xyz", [10, 80, -30], degrees=True)
+    pose = Pose.from_xyzw((4, 5, 6), turn.as_quat())
+    for axis in range(3):
+        point = torch.tensor(np.array([4, 5, 6]) + 2 * turn.as_matrix()[:, axis], dtype=torch.float32)
+        torch.testing.assert_close(pose.local(point), 2 * torch.eye(3)[axis], rtol=0, atol=1e-5)
+    points = torch.randn(7, 2, 3)
+    torch.testing.assert_close(pose.world(pose.local(points)), points, rtol=0, atol=1e-5)
+
+
+def test_a_pose_takes_dtype_and_device_of_a_tensor():
+    pose = Pose.from_xyzw((1, 2, 3), (0, 0, 0, 1)).to(torch.zeros(1, dtype=torch.float64, device="meta"))
+    assert {(t.dtype, t.device.type) for t in (pose.position, pose.rotation)} == {(torch.float64, "meta")}
+
+
+@pytest.mark.parametrize(
+    ("position", "quaternion", "message"),
+    [
+        ((0, 0, 0), (0, 0, 0, 1.01), r"length 1, got 1.01 for \[0.0, 0.0, 0.0, 1.01\]; normalise it"),
+        ((0, 0, 0), (0, 0, 0, 0), "length 1, got 0 "),
+        ((0, math.nan, 0), (0, 0, 0, 1), r"must be finite, got \[0.0, nan, 0.0\]"),
+        ((0, 0, 0), (0, 0, math.inf, 1), "must be finite"),
+        ((0, 0), (0, 0, 0, 1), r"3 and a quaternion of 4 numbers, got \(2,\) and \(4,\)"),
+        ((0, 0, 0), torch.eye(3), r"got \(3,\) and \(3, 3\)"),
+    ],
+)
+def test_impossible_poses_are_refused(position, quaternion, message):
+    with pytest.raises(ValueError, match=message):
+        Pose.from_xyzw(position, quaternion)
+
+
+def test_spherical_coordinates_there_and_back():
+    points = torch.randn(50, 3, dtype=torch.float64)
+    azimuths, elevations, distances = to_spherical(points)
+    torch.testing.assert_close(elevations, torch.asin(points[:, 2] / distances))
+    torch.testing.assert_close(distances[:, None] * from_spherical(azimuths, elevations), points)
+
+
+def test_directions_have_the_angles_of_the_convention():
+    points = torch.tensor([[2.0, 0, 0], [0, 3, 0], [-1, 0, 0], [0, -1, 0], [1, 1, math.sqrt(2)], [0, 0, 5], [0, 0, -5]])
+    azimuths, elevations, distances = to_spherical(points)
+    torch.testing.assert_close(azimuths.rad2deg(), torch.tensor([0.0, 90, 180, -90, 45, 0, 0]))
+    torch.testing.assert_close(elevations.rad2deg(), torch.tensor([0.0, 0, 0, 0, 45, 90, -90]))
+    torch.testing.assert_close(distances, torch.tensor([2.0, 3, 1, 1, 2, 5, 5]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("offset", [0.0, 1e-30, 1e-12, 1e-5])
+def test_gradients_are_finite_on_the_axis_and_beside_it(dtype, offset):
+    points = torch.tensor([[offset, -offset, 2], [0, offset, -2]], dtype=dtype, requires_grad=True)
+    for coordinate in to_spherical(points):
+        (gradient,) = torch.autograd.grad(coordinate.sum(), points, retain_graph=True)
+        assert gradient.isfinite().all()
+    assert (to_spherical(points)[1].abs().rad2deg() > 89.999).all()

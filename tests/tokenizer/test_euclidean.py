@@ -1,0 +1,69 @@
+"""Fourier features against numpy, and what they are taken relative to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gaigs.testing import example_links
+from gaigs.tokenizer.euclidean import EuclideanTokenizer, fourier_features, octaves
+
+OPTIONS = {"gaussian_octaves": (-3, 2), "transmitter_octaves": (-2, 4), "hidden": 16, "width": 8}
+
+
+@pytest.fixture
+def scene():
+    return example_links().scene
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    torch.manual_seed(0)
+
+
+def test_features_are_position_sine_and_cosine_of_whole_octaves():
+    points = torch.randn(5, 3, dtype=torch.float64)
+    features = fourier_features(points, octaves("gaussian_octaves", -1, 2).double())
+    x = points.numpy()
+    for i, cycles in enumerate((0.5, 1, 2, 4)):
+        np.testing.assert_allclose(features[:, 3 + i : 15 : 4], np.sin(2 * np.pi * cycles * x), atol=1e-5)
+        np.testing.assert_allclose(features[:, 15 + i : 27 : 4], np.cos(2 * np.pi * cycles * x), atol=1e-5)
+    np.testing.assert_array_equal(features[:, :3], x)
+    assert features.shape == (5, 27)
+
+
+def test_a_gaussians_token_is_its_features_about_the_receivers_middle(scene):
+    tokenizer = EuclideanTokenizer(scene, **OPTIONS)
+    means = torch.randn(7, 3)
+    tokens = tokenizer(means, torch.rand(7), torch.rand(2, 3))
+    middle = (scene.receivers[0].pose.position + scene.receivers[1].pose.position) / 2
+    assert torch.equal(tokens.gaussians, fourier_features(means - middle, octaves("gaussian_octaves", -3, 2)))
+    assert tokens.gaussians.shape == (7, tokenizer.gaussian_width) == (7, 39)
+    assert tokens.transmitters.shape == (2, tokenizer.transmitter_width) == (2, 8)
+    assert tokens.scene.shape == (2, tokenizer.scene_width) == (2, 0)
+
+
+def test_moving_the_whole_scene_changes_no_token(scene):
+    shift = torch.tensor([8.0, -4, 2])
+    receivers = tuple(replace(r, pose=replace(r.pose, position=r.pose.position + shift)) for r in scene.receivers)
+    moved = replace(scene, receivers=receivers, lower=scene.lower + shift, upper=scene.upper + shift)
+    here, there = EuclideanTokenizer(scene, **OPTIONS), EuclideanTokenizer(moved, **OPTIONS)
+    there.network.load_state_dict(here.network.state_dict())
+    means, opacities, transmitters = torch.randn(7, 3), torch.rand(7), torch.rand(2, 3)
+    expected, found = here(means, opacities, transmitters), there(means + shift, opacities, transmitters + shift)
+    for token, other in zip(expected, found, strict=True):
+        torch.testing.assert_close(other, token, rtol=0, atol=1e-4)
+
+
+def test_a_checkpoint_brings_the_middles_along(scene):
+    moved = replace(scene, lower=scene.lower + 1, receivers=scene.receivers[:1])
+    tokenizer, other = EuclideanTokenizer(scene, **OPTIONS), EuclideanTokenizer(moved, **OPTIONS)
+    other.load_state_dict(tokenizer.state_dict())
+    inputs = torch.randn(7, 3), torch.rand(7), torch.rand(2, 3)
+    assert all(map(torch.equal, tokenizer(*inputs), other(*inputs)))
+
+
+def test_an_empty_range_of_octaves_is_refused(scene):
+    with pytest.raises(ValueError, match=r"transmitter_octaves must be \[lowest, highest\], got \[3, 2\]"):
+        EuclideanTokenizer(scene, **(OPTIONS | {"transmitter_octaves": (3, 2)}))

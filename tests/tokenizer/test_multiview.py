@@ -1,0 +1,47 @@
+"""The two views beside one another."""
+
+import pytest
+import torch
+
+from gaigs.registry import registry
+from gaigs.testing import example_links
+from gaigs.tokenizer.multiview import MultiviewTokenizer
+
+GA = {"name": "ga", "width": 5}
+EUCLIDEAN = {
+    "name": "euclidean",
+    "gaussian_octaves": [-3, 2],
+    "transmitter_octaves": [-2, 4],
+    "hidden": 16,
+    "width": 8,
+}
+
+
+@pytest.fixture
+def tokenizer():
+    torch.manual_seed(0)
+    return MultiviewTokenizer(example_links().scene, ga=GA, euclidean=EUCLIDEAN)
+
+
+def test_it_takes_the_scene_of_the_one_and_the_positions_of_the_other(tokenizer):
+    inputs = torch.randn(30, 3), torch.rand(30), torch.rand(2, 3)
+    tokens = tokenizer(*inputs)
+    assert torch.equal(tokens.scene, tokenizer.ga(*inputs).scene)
+    assert torch.equal(tokens.gaussians, tokenizer.euclidean(*inputs).gaussians)
+    assert torch.equal(tokens.transmitters, tokenizer.euclidean(*inputs).transmitters)
+    assert (tokenizer.scene_width, tokenizer.gaussian_width, tokenizer.transmitter_width) == (5, 39, 8)
+
+
+def test_both_are_trained(tokenizer):
+    tokens = tokenizer(torch.randn(30, 3), torch.rand(30), torch.rand(2, 3))
+    sum(token.square().sum() for token in tokens).backward()
+    assert all(parameter.grad.any() for parameter in tokenizer.parameters())
+
+
+def test_an_unknown_part_is_refused():
+    scene = example_links().scene
+    with pytest.raises(ValueError, match=r"unknown tokenizer 'euclid' \(did you mean 'euclidean'\?\)"):
+        MultiviewTokenizer(scene, ga=GA, euclidean={"name": "euclid"})
+    config = {"name": "multiview", "ga": {**GA, "depth": 1}, "euclidean": EUCLIDEAN}
+    with pytest.raises(ValueError, match="tokenizer 'ga' has no option 'depth'"):
+        registry("tokenizer").build(config, scene=scene)

@@ -1,0 +1,273 @@
+import math
+import re
+import signal
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import nn
+
+from gaigs.data import Grid, Receiver, Scene
+from gaigs.gaussians import Gaussians
+from gaigs.geometry import Pose
+from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine, save
+
+MIDDLE = (1.0, 2.0, 0.5)
+
+
+@pytest.fixture
+def module():
+    """What density control sees of it: six Gaussians 2 m from the receiver, the third wide, the sixth faint."""
+    scene = Scene(
+        receivers=(Receiver("gateway1", Pose.from_xyzw(MIDDLE, (0.0, 0.0, 0.0, 1.0))),),
+        lower=torch.zeros(3),
+        upper=torch.ones(3),
+        spacing=0.1,
+        grid=Grid.degrees(),
+        normalisation="none",
+    )
+    gaussians = Gaussians(scene, channels=2, count=6, near=2.0, far=2.0, spread=1.0, opacity=0.5, signal=1.0)
+    with torch.no_grad():
+        gaussians.log_scales.fill_(math.log(0.1))
+        gaussians.log_scales[2, 1] = math.log(1.0)
+        gaussians.opacity_logits[5] = -9
+    optimizer = torch.optim.AdamW(gaussians.parameters(), lr=1e-9)
+    return SimpleNamespace(model=SimpleNamespace(gaussians=gaussians, scene=scene), optimizer=optimizer)
+
+
+def control(**options):
+    given = {"every": 2, "start": 2, "stop": 6, "gradient": 1.0, "wide": 0.2, "opacity": 0.01, "most": 100, "seed": 0}
+    return DensityControl(**(given | options))
+
+
+def step(callback, module, number, pulls):
+    """One optimizer step at which the loss pulls at the Gaussians' means with these gradients [loss/m]."""
+    gaussians = module.model.gaussians
+    for parameter in gaussians.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    gaussians.means.grad[: len(pulls), 1] = torch.tensor(pulls)
+    callback.on_before_optimizer_step(None, module, module.optimizer)
+    module.optimizer.step()
+    callback.on_train_batch_end(SimpleNamespace(global_step=number, optimizers=[module.optimizer]), module)
+    return len(gaussians)
+
+
+def test_density_control_clones_the_narrow_splits_the_wide_and_prunes_the_faint(module):
+    callback = control()
+    before = module.model.gaussians.scales.detach().clone()
+    # The bound is 1 per radian, 0.5 per metre at 2 m: the mean pull counts, so of the two steps 0.6 is what decides.
+    assert step(callback, module, 1, [0.0, 0.9, 0.9, 0.45, 0.0, 0.0]) == 6
+    assert step(callback, module, 2, [0.0, 0.3, 0.3, 0.45, 0.0, 0.0]) == 7
+    scales = module.model.gaussians.scales
+    assert torch.equal(scales[[0, 1, 3, 4]], before[[0, 1, 3, 4]])
+    assert torch.equal(scales[5], before[1]), "the clone"
+    torch.testing.assert_close(scales[[2, 6]], before[[2, 2]] / 1.6)
+    for parameter in module.model.gaussians.parameters():
+        assert module.optimizer.state[parameter]["exp_avg"].shape == parameter.shape
+
+
+def test_density_control_keeps_its_schedule(module):
+    callback = control(start=4, stop=6)
+    counts = [step(callback, module, number, [9.0]) for number in range(1, 10)]
+    assert counts == [6, 6, 6, 6, 6, 7, 7, 7, 7], "at 4 one is cloned and one pruned, at 6 one cloned"
+
+
+def test_density_control_forgets_the_pull_after_a_round(module):
+    callback = control()
+    step(callback, module, 1, [9.0])
+    assert step(callback, module, 2, [9.0]) == 6
+    step(callback, module, 3, [0.0])
+    assert step(callback, module, 4, [0.0]) == 6
+
+
+def test_density_control_grows_to_the_bound_by_the_hardest_pulled(module):
+    module.model.gaussians.opacity_logits.data[5] = 0
+    marks = torch.arange(6.0)
+    module.model.gaussians.signal.data[:, 0, 0] = marks
+    step(control(every=1, start=1, most=8), module, 1, [2.0, 5.0, 1.0, 4.0, 3.0, 0.0])
+    assert sorted(module.model.gaussians.signal[:, 0, 0].tolist()) == sorted([*marks.tolist(), 1, 3])
+
+
+def test_density_control_goes_on_from_its_state(module):
+    first, second = control(), control()
+    step(first, module, 1, [9.0])
+    second.load_state_dict(first.state_dict())
+    assert step(second, module, 2, [0.0]) == 6, "half of 9 is above the bound: one cloned, one pruned"
+
+
+def test_density_control_refuses():
+    with pytest.raises(ValueError, match=r"density\.every must be at least 1 step, got 0"):
+        control(every=0)
+    with pytest.raises(ValueError, match="density needs a model with Gaussians"):
+        control().on_fit_start(None, SimpleNamespace(model=nn.Linear(1, 1)))
+
+
+# --- checkpoints ---
+
+
+class Trainer(SimpleNamespace):
+    """What the checkpoint callbacks see of Lightning's trainer; a checkpoint is the number of its step."""
+
+    def __init__(self, **state):
+        state = {"loggers": [], "should_stop": False, "enable_validation": True, "val_check_batch": 5} | state
+        super().__init__(global_step=0, **state)
+
+    def save_checkpoint(self, path, weights_only):
+        assert not weights_only, "the optimizer's state belongs to it"
+        path.write_text(str(self.global_step))
+
+    def validate(self, callback, ssim):
+        self.global_step += 1
+        self.callback_metrics = {"validation/ssim": torch.tensor(ssim)}
+        callback.on_validation_end(self, None)
+
+
+def test_the_best_checkpoint_is_that_of_the_highest_ssim(tmp_path):
+    path, trainer = tmp_path / "best.ckpt", Trainer()
+    callback = KeepBest(path, patience=None)
+    saved = []
+    for ssim in (0.3, 0.5, 0.4, 0.5, 0.6, float("nan"), 0.1):
+        trainer.validate(callback, ssim)
+        saved.append(path.read_text())
+    callback.on_fit_end(trainer, None)
+    assert saved == ["1", "2", "2", "2", "5", "5", "5"]
+    assert path.read_text() == "5"
+    assert not trainer.should_stop
+
+
+def test_without_validation_the_last_step_is_the_best(tmp_path):
+    path, trainer = tmp_path / "best.ckpt", Trainer(enable_validation=False)
+    trainer.global_step = 7
+    KeepBest(path, patience=None).on_fit_end(trainer, None)
+    assert path.read_text() == "7"
+
+
+@pytest.mark.parametrize("kill", range(6))
+def test_patience_counts_validations_without_a_better_ssim(tmp_path, kill):
+    callback, trainer = KeepBest(tmp_path / "best.ckpt", patience=2), Trainer()
+    stops = []
+    for number, ssim in enumerate((0.3, 0.2, 0.4, 0.4, 0.1)):
+        if number == kill:
+            state = callback.state_dict()
+            callback = KeepBest(tmp_path / "best.ckpt", patience=2)
+            callback.load_state_dict(state)
+        trainer.validate(callback, ssim)
+        stops.append(trainer.should_stop)
+    assert stops == [False, False, False, False, True]
+    resumed, again = KeepBest(tmp_path / "best.ckpt", patience=2), Trainer()
+    resumed.load_state_dict(callback.state_dict())
+    resumed.on_train_start(again, None)
+    assert again.should_stop, "a run that had stopped stays so"
+
+
+def test_patience_refuses():
+    with pytest.raises(ValueError, match="patience must be at least 1 validation or null, got 0"):
+        KeepBest(None, patience=0)
+
+
+def run(callback, trainer, steps):
+    """Steps, with a validation behind every ``val_check_batch``-th."""
+    callback.on_train_start(trainer, None)
+    for _ in range(steps):
+        trainer.global_step += 1
+        yield "within"
+        callback.on_train_batch_end(trainer, None)
+        yield "step"
+        if trainer.enable_validation and trainer.global_step % trainer.val_check_batch == 0:
+            callback.on_validation_end(trainer, None)
+            yield "validation"
+
+
+@pytest.mark.parametrize("validation", [True, False])
+def test_the_last_checkpoint_is_never_written_between_a_step_and_its_validation(tmp_path, validation):
+    path = tmp_path / "last.ckpt"
+    trainer = Trainer(enable_validation=validation)
+    saved = []
+    for moment in run(KeepLast(path, every=0), trainer, 11):
+        if path.is_file():
+            saved.append((moment, int(path.read_text())))
+            path.unlink()
+    at = [("validation" if validation and number % 5 == 0 else "step", number) for number in range(1, 12)]
+    assert saved == at
+
+
+def test_the_last_checkpoint_waits_for_its_time(tmp_path, monkeypatch):
+    path, now = tmp_path / "last.ckpt", [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    trainer, written = Trainer(enable_validation=False), []
+    for moment in run(KeepLast(path, every=15), trainer, 11):
+        if moment == "within":
+            now[0] += 4
+        elif path.is_file():
+            written.append(trainer.global_step)
+            path.unlink()
+    assert written == [4, 8], "at 116 s and 132 s, the first steps 15 s after the start and after the write before"
+
+
+@pytest.mark.parametrize(("step", "moments"), [(1, ["within"]), (4, ["within"]), (5, ["within", "step"])])
+def test_ctrl_c_finishes_the_step_and_its_validation(tmp_path, step, moments):
+    path, trainer = tmp_path / "last.ckpt", Trainer()
+    callback = KeepLast(path, every=1e9)
+    seen = []
+
+    def go_on():
+        for moment in run(callback, trainer, 20):
+            if trainer.global_step == step:
+                seen.append(moment)
+                if moment == "within":
+                    callback.interrupt(signal.SIGINT, None)
+
+    with pytest.raises(Interrupted, match=f"stopped after step {step}$"):
+        go_on()
+    assert seen == moments
+    assert path.read_text() == str(step)
+
+
+def test_a_second_ctrl_c_stops_at_once(tmp_path):
+    callback = KeepLast(tmp_path / "last.ckpt", every=0)
+    callback.interrupt(signal.SIGINT, None)
+    with pytest.raises(Interrupted, match="within a step"):
+        callback.interrupt(signal.SIGINT, None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_is_written_whole_or_not_at_all(tmp_path):
+    events = []
+
+    class Full(Trainer):
+        def save_checkpoint(self, path, weights_only):
+            events.append("checkpoint")
+            path.write_text("ha")
+            raise OSError("no space left")
+
+    path = tmp_path / "last.ckpt"
+    path.write_text("whole")
+    with pytest.raises(OSError, match="no space left"):
+        save(Full(loggers=[SimpleNamespace(save=lambda: events.append("log"))]), path)
+    assert path.read_text() == "whole"
+    assert events == ["log", "checkpoint"], "else a kill in between loses rows of the log"
+
+
+# --- the progress line ---
+
+
+def test_the_progress_line_fits_80_columns_and_counts_from_where_the_training_goes_on(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    trainer = SimpleNamespace(global_step=1200, max_steps=1500, progress_bar_metrics={"train/loss": 0.25, "v_num": 3})
+    line = ProgressLine()
+    line.on_train_start(trainer, None)
+    trainer.global_step = 1499
+    trainer.progress_bar_metrics["validation/ssim"] = 0.5
+    line.on_train_batch_end(trainer, None)
+    line.on_train_end(trainer, None)
+    (shown,) = capsys.readouterr().out.strip().splitlines()
+    assert len(shown) <= 80
+    assert re.fullmatch(r"training \S+ +1499/1500 [\d.]+ steps/s \S+ loss 0\.250 SSIM 0\.500", shown), shown
+
+
+def test_the_progress_line_gives_the_terminal_back_after_an_error():
+    line = ProgressLine()
+    line.on_exception(None, None, ValueError())
+    line.on_train_start(SimpleNamespace(global_step=0, max_steps=3), None)
+    line.on_exception(None, None, ValueError())
+    assert not line.line.live.is_started
