@@ -173,7 +173,7 @@ class Ceiling:
         macros = {"CHANNELS": channels, "ATTENUATION": int(attenuation), "TRANSMITTERS": 1, "SEPARABLE": 1}
         macros |= {"ALPHA_MIN": opencl._literal(ALPHA_MIN), "ALPHA_MAX": opencl._literal(ALPHA_MAX)}
         kernels = Path(opencl.__file__).parent / "kernels"
-        source = "".join((kernels / f"{name}.cl").read_text() for name in ("footprint", "composite")) + CEILING
+        source = "".join((kernels / f"{name}.cl").read_text() for name in ("footprint", "composite", "gradient")) + CEILING
         options = ["-w", *(f"-D{macro}={value}" for macro, value in macros.items())]
         program = cl.Program(self.queue.context, source).build(options)
         self.kernels = {way: cl.Kernel(program, f"ceiling_{way}") for way in ("forward", "backward")}

@@ -21,8 +21,10 @@ def run(config: DictConfig) -> None:
         CompactHydraException: What a user can mend, as one message; Hydra prints it without the traceback and exits
             with 1, after the other jobs of a multirun.
     """
-    if missing := sorted(OmegaConf.missing_keys(config)):
-        raise CompactHydraException(f"gaigs: {', '.join(missing)} must be set, e.g. {missing[0]}=VALUE")
+    try:
+        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:  # whose message Hydra adds
+        raise CompactHydraException("gaigs: the configuration is not complete") from error
     # Slow to import: here, once the configuration has proved good.
     from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
@@ -32,15 +34,13 @@ def run(config: DictConfig) -> None:
         logging.getLogger(name).setLevel(logging.WARNING)
     settings = HydraConfig.get()
     try:
-        experiment.run(OmegaConf.to_container(config, resolve=True), Path(settings.runtime.output_dir))
+        experiment.run(plain, Path(settings.runtime.output_dir))
     except KeyboardInterrupt as stop:
         mode = "sweep" if settings.mode is RunMode.MULTIRUN else "run"
         folder = f"hydra.{mode}.dir={settings[mode].dir}"
         print(f"gaigs: {str(stop) or 'stopped'}; the same command with {folder} goes on", file=sys.stderr)
         raise SystemExit(130) from None  # as shells report Ctrl-C
-    except (
-        ValueError, TypeError, OSError, ImportError, RuntimeError, OmegaConfBaseException, MisconfigurationException
-    ) as error:  # fmt: skip
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError, MisconfigurationException) as error:
         raise CompactHydraException(f"gaigs: {error}") from error
 
 

@@ -155,9 +155,8 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
         loggers.append(tensorboard_logger(folder))
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
     trainer = call("trainer", lightning.Trainer, config["trainer"], **context)
-    for option, count in (("devices", trainer.world_size), ("accumulate_grad_batches", trainer.accumulate_grad_batches)):
-        if count != 1:
-            raise ValueError(f"trainer.{option} must be 1, got {count}; a step is one batch of training.batch_size")
+    if trainer.world_size > 1 or trainer.accumulate_grad_batches > 1:
+        raise ValueError("trainer.devices and accumulate_grad_batches must be 1; training.batch_size says what a step is")
     batches = Batches(links, links.split.train, module.batch_size, config["seed"], trainer.max_steps)
     validation = Pass(links, links.split.validation, module.batch_size) if len(links.split.validation) else None
     resume = None

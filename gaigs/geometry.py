@@ -35,7 +35,9 @@ class Pose:
                 f"{tuple(quaternion.shape)}"
             )
         if not (torch.isfinite(position).all() and torch.isfinite(quaternion).all()):
-            raise ValueError(f"a pose must be finite, got {position.tolist()} and quaternion {quaternion.tolist()}")
+            raise ValueError(
+                f"a pose must be finite, got position {position.tolist()}, quaternion {quaternion.tolist()}"
+            )
         norm = float(quaternion.norm())
         if abs(norm - 1) > 1e-3:
             raise ValueError(

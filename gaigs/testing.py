@@ -123,9 +123,8 @@ def check_projection(projection: Projection, device: torch.device | str = "cpu")
         AssertionError: It breaks the contract of ``gaigs.projection.Projection``.
     """
     degrees = lambda *range_: torch.arange(*range_, dtype=torch.float64, device=device).deg2rad()
-    directions = from_spherical(*torch.meshgrid(degrees(-175, 180, 25), degrees(-55, 60, 10), indexing="xy")).flatten(
-        0, 1
-    )
+    azimuths, elevations = torch.cartesian_prod(degrees(-175, 180, 25), degrees(-55, 60, 10)).unbind(1)
+    directions = from_spherical(azimuths, elevations)
     points = 3 * directions
     coordinates = projection.coordinates(points)
     _check_tensor("coordinates", coordinates, (len(points), 2), torch.float64, device)
@@ -190,11 +189,8 @@ def check_pooling(pooling: nn.Module, device: torch.device | str = "cpu") -> Non
     channels = pooling.channels
     _require(isinstance(channels, int) and channels > 0, f"channels must be how many it needs, got {channels!r}")
     generator = torch.Generator().manual_seed(0)
-    for (b, rows, columns), dtype in (
-        ((3, 5, 8), torch.float32),
-        ((1, 1, 1), torch.float32),
-        ((3, 5, 8), torch.float64),
-    ):
+    shapes = ((3, 5, 8), torch.float32), ((1, 1, 1), torch.float32), ((3, 5, 8), torch.float64)
+    for (b, rows, columns), dtype in shapes:
         module = copy.deepcopy(pooling).to(device, dtype).eval()
         image = torch.randn(b, channels, rows, columns, generator=generator).to(device, dtype).requires_grad_()
         label = module(image)

@@ -116,7 +116,9 @@ class Skewed(Mercator):
 
 class Unclamped(Equirectangular):
     def jacobian(self, points):
-        return super().jacobian(points) / points[..., :2].norm(dim=-1)[..., None, None]
+        azimuth, elevation = super().jacobian(points).unbind(-2)
+        azimuth = nn.functional.normalize(azimuth, dim=-1) / points[..., :2].norm(dim=-1, keepdim=True)
+        return torch.stack((azimuth, elevation), -2)
 
 
 class Shifted(Equirectangular):
@@ -135,7 +137,7 @@ class Hiding(Mercator):
     ("projection", "message"),
     [
         (Skewed, "jacobian must be the derivative of coordinates"),
-        (Unclamped, "must be finite"),
+        (Unclamped, "covariances2d at hard places must be finite"),
         (Shifted, "plane.v must be coordinates' v"),
         (Hiding, "only what sits on the receiver is hidden"),
     ],

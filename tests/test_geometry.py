@@ -64,7 +64,7 @@ def test_a_pose_takes_dtype_and_device_of_a_tensor():
     [
         ((0, 0, 0), (0, 0, 0, 1.01), r"length 1, got 1.01 for \[0.0, 0.0, 0.0, 1.01\]; normalise it"),
         ((0, 0, 0), (0, 0, 0, 0), "length 1, got 0 "),
-        ((0, math.nan, 0), (0, 0, 0, 1), r"must be finite, got \[0.0, nan, 0.0\]"),
+        ((0, math.nan, 0), (0, 0, 0, 1), r"must be finite, got position \[0.0, nan, 0.0\]"),
         ((0, 0, 0), (0, 0, math.inf, 1), "must be finite"),
         ((0, 0), (0, 0, 0, 1), r"3 and a quaternion of 4 numbers, got \(2,\) and \(4,\)"),
         ((0, 0, 0), torch.eye(3), r"got \(3,\) and \(3, 3\)"),

@@ -16,10 +16,14 @@ from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN
 from gaigs.registry import register
 
 ROWS, COLUMNS = 16, 8
-"""A tile's; the kernels say the same."""
+"""Edges of a tile in pixels; the kernels say the same."""
+
+WORD, GEOMETRY, MOMENTS = 32, 8, 5
+"""Splats a word of bits, and lengths of rows in buffers; the kernels say the same."""
 
 GROUP = 8
-"""Transmitters that one work-item composites at most, where they share footprints; more would leave the nearest cache."""
+"""Transmitters that one work-item composites at most, where they share footprints; more would leave the nearest
+cache."""
 
 
 @register("rasterizer", "opencl")
@@ -27,8 +31,8 @@ class OpenCLRasterizer:
     """Tiles of 16 rows of 8 pixels, a work-item each, their rows in vector registers; the gradient is written by hand.
 
     Splats are sorted by depth once, and listed by the tiles that their ellipses reach: once for all transmitters where
-    these share covariances, which then share footprints too. On a CPU device tensors are handed over without a copy. Two
-    runs give the same bits. Contract and formulas: ``gaigs.rasterizer.Rasterizer``.
+    these share covariances, which then share footprints too. On a CPU device tensors are handed over without a copy.
+    Two runs give the same bits. Contract and formulas: ``gaigs.rasterizer.Rasterizer``.
 
     Args:
         device: Part of a name that ``devices`` lists, e.g. "cpu" or "pocl"; None takes the environment variable
@@ -54,7 +58,7 @@ class OpenCLRasterizer:
         """The map, and the transmittance left behind the last splat; see ``gaigs.rasterizer.Rasterizer``.
 
         Raises:
-            TypeError: A tensor is not float32, or not on the CPU.
+            TypeError: A tensor is not float32 (``visible``: bool), or not on the CPU.
             ValueError: Shapes do not fit together, or there are more than 8 channels.
             RuntimeError: The device cannot build the kernels.
         """
@@ -109,7 +113,7 @@ def _open(name: str | None) -> cl.CommandQueue:
 def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel]:
     """The kernels of one shape family; PoCL keeps what it compiled on disk."""
     folder = Path(__file__).parent / "kernels"
-    source = "\n".join((folder / f"{name}.cl").read_text() for name in ("footprint", "bin", "composite"))
+    source = "\n".join((folder / f"{name}.cl").read_text() for name in ("footprint", "bin", "composite", "gradient"))
     # -w: a CPU without registers of the vectors' width is worth a warning to the compiler.
     options = ["-w", *(f"-D{macro}={value}" for macro, value in macros.items())]
     try:
@@ -123,22 +127,27 @@ def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel
 def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane) -> None:
     """Kernels trust what they are given."""
     b, n, c = signal.shape
-    rows, columns = plane.shape
+    height, width = plane.shape
     tensors = {
         "means2d": (splats.means2d, [(n, 2)]),
         "covariances2d": (splats.covariances2d, [(1, n, 2, 2), (b, n, 2, 2)]),
         "depths": (splats.depths, [(n,)]),
+        "visible": (splats.visible, [(n,)]),
         "signal": (signal, [(b, n, c)]),
         "opacities": (opacities, [(b, n)]),
-        "plane.u": (plane.u, [(1, columns), (rows, columns)]),
-        "plane.v": (plane.v, [(rows, 1), (rows, columns)]),
+        "attenuations": (attenuations, [(b, n)]),
+        "plane.u": (plane.u, [(1, width), (height, width)]),
+        "plane.v": (plane.v, [(height, 1), (height, width)]),
     }
-    if attenuations is not None:
-        tensors["attenuations"] = (attenuations, [(b, n)])
+    if attenuations is None:
+        del tensors["attenuations"]
     for name, (tensor, shapes) in tensors.items():
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            kind = f"{tensor.dtype} on {tensor.device}"
-            raise TypeError(f"rasterizer 'opencl' takes float32 on the CPU, got {name} as {kind}; use rasterizer=torch")
+        dtype = torch.bool if name == "visible" else torch.float32
+        if tensor.dtype != dtype or tensor.device.type != "cpu":
+            raise TypeError(
+                f"rasterizer 'opencl' takes {name} as {dtype} on the CPU, got {tensor.dtype} on {tensor.device}; "
+                "use rasterizer=torch"
+            )
         if tuple(tensor.shape) not in shapes:
             allowed = " or ".join(map(str, shapes))
             raise ValueError(f"{name} must be {allowed} where signal is {(b, n, c)}, got {tuple(tensor.shape)}")
@@ -167,7 +176,7 @@ class _Sizes(ctypes.Structure):
 
     _fields_ = [
         (name, ctypes.c_int32)
-        for name in ("transmitters", "sets", "groups", "group", "splats", "words", "height", "width", "down", "across", "entries")
+        for name in "transmitters sets groups group splats words height width down across entries".split()
     ]
 
 
@@ -185,29 +194,24 @@ class _Render:
         sets = len(splats.covariances2d)
         groups = b if sets > 1 else max(1, -(-b // GROUP))
         group = -(-b // groups)
-        down, across, words = -(-height // ROWS), -(-width // COLUMNS), -(-n // 32)
+        down, across, words = -(-height // ROWS), -(-width // COLUMNS), -(-n // WORD)
         self.sizes = _Sizes(b, sets, groups, group, n, words, height, width, down, across)
         self.tiles, lists = down * across, sets * down * across
         self.attenuates = attenuations is not None
-        together = 1 if group == 1 else GROUP
         looks = 1 + self.attenuates + self.channels  # opacity, attenuation, signal
-        self.partials = 5 + together * looks
+        together = 1 if group == 1 else GROUP
+        self.partials = MOMENTS + together * looks
         separable = plane.u.shape[0] == plane.v.shape[1] == 1
-        period = {} if plane.period is None else {"PERIOD": _literal(plane.period), "PERIOD_REST": _rest(plane.period)}
-        self.kernels = _kernels(
-            queue,
-            CHANNELS=self.channels,
-            ATTENUATION=int(self.attenuates),
-            TRANSMITTERS=together,
-            SEPARABLE=int(separable),
-            ALPHA_MIN=_literal(ALPHA_MIN),
-            ALPHA_MAX=_literal(ALPHA_MAX),
-            **period,
-        )
+        macros = {"CHANNELS": self.channels, "ATTENUATION": int(self.attenuates), "TRANSMITTERS": together}
+        macros |= {"SEPARABLE": int(separable), "ALPHA_MIN": _literal(ALPHA_MIN), "ALPHA_MAX": _literal(ALPHA_MAX)}
+        if plane.period is not None:
+            rest = plane.period - float(np.float32(plane.period))
+            macros |= {"PERIOD": _literal(plane.period), "PERIOD_REST": _literal(rest)}
+        self.kernels = _kernels(queue, **macros)
 
         order = self._share(_front_to_back(splats.depths))
-        geometry, boxes = self._empty(sets * words * 32 * 8), self._empty(sets * words * 32 * 4)
-        appearance = self._empty(words * 32 * b * looks)
+        geometry, boxes = self._empty(sets * words * WORD * GEOMETRY), self._empty(sets * words * WORD * 4)
+        appearance = self._empty(words * WORD * b * looks)
         inputs = splats.means2d, splats.covariances2d, splats.visible, signal, opacities, attenuations
         inputs = [self._share(tensor) for tensor in inputs]  # named, so that they live until the kernels are through
         self._run("prepare", sets * words, order, *inputs, geometry, boxes, appearance)
@@ -255,10 +259,10 @@ class _Render:
 
     def _share(self, values):
         """The host's memory as the device sees it, on a CPU the same; nothing is the null pointer."""
-        if values is None or not len(values):
-            return None
         if isinstance(values, Tensor):
             values = values.detach().numpy()
+        if values is None or not values.size:
+            return None
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
         return cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(values))
 
@@ -276,11 +280,6 @@ def _literal(value: float) -> str:
     return float(np.float32(value)).hex() + "f"
 
 
-def _rest(value: float) -> str:
-    """What rounding to float32 took away."""
-    return _literal(value - float(np.float32(value)))
-
-
 def _front_to_back(depths: Tensor) -> np.ndarray:
     """Indices by depth, ties by index: sorted as integers, whose low half is the index."""
     bits = np.ascontiguousarray(depths.detach().numpy()).view(np.int32)
@@ -291,8 +290,10 @@ def _front_to_back(depths: Tensor) -> np.ndarray:
 
 
 def _whole_tiles(plane: Plane, down: int, across: int, separable: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The plane's coordinates, filled up to whole tiles by repetition: one u a column and one v a row where the plane is
-    separable, else two full grids."""
+    """The plane's coordinates, filled up to whole tiles by repetition.
+
+    They are one u a column and one v a row where the plane is separable, else two full grids.
+    """
     height, width = plane.shape
     y, x = np.minimum(np.arange(down * ROWS), height - 1), np.minimum(np.arange(across * COLUMNS), width - 1)
     u, v = plane.u.detach().numpy(), plane.v.detach().numpy()

@@ -11,8 +11,8 @@ from gaigs.registry import register
 from gaigs.tokenizer import Tokens
 
 PERIOD = 16
-"""The shortest period of the transmitter's features over the distance between neighbouring training transmitters; chosen on
-validation parts of rfid-s23-200 and the built-in room."""
+"""The shortest period of the transmitter's features over the distance between neighbouring training transmitters;
+chosen on validation parts of rfid-s23-200 and the built-in room."""
 
 
 @register("tokenizer", "euclidean")
@@ -24,8 +24,8 @@ class EuclideanTokenizer(nn.Module):
     Args:
         scene: Positions are taken relative to the middle of the transmitters' box, and of the receivers.
         gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a metre.
-        transmitter_octaves: The same for the transmitter; None takes those that the training transmitters can teach, see
-            ``learnable_octaves``.
+        transmitter_octaves: The same for the transmitter; None takes those that the training transmitters can teach,
+            see ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
         width: Width of E(P_TX).
 
@@ -66,8 +66,8 @@ class EuclideanTokenizer(nn.Module):
 def learnable_octaves(scene: Scene) -> tuple[int, int]:
     """Lowest and highest octave of features of the transmitter, as far as the training transmitters bear them out.
 
-    Periods go from twice the box's longest edge down to ``PERIOD`` distances between neighbouring transmitters: the network
-    multiplies frequencies, so what it is given must be well below what these sample.
+    Periods go from twice the box's longest edge down to ``PERIOD`` distances between neighbouring transmitters: the
+    network multiplies frequencies, so what it is given must be well below what these sample.
     """
     edge = (scene.upper - scene.lower).max().item()
     highest = round(-math.log2(PERIOD * scene.spacing))

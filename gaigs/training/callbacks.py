@@ -115,6 +115,8 @@ class KeepBest(Checkpoint):
         self._stop_in_time(trainer)  # a run that was killed once it had stopped
 
     def on_validation_end(self, trainer, module) -> None:
+        if trainer.sanity_checking:
+            return
         ssim = trainer.callback_metrics["validation/ssim"].item()
         if ssim > self.best:
             self.best, self.waited = ssim, 0
@@ -162,7 +164,8 @@ class KeepLast(Checkpoint):
             self._rest(trainer)
 
     def on_validation_end(self, trainer, module) -> None:
-        self._rest(trainer)
+        if not trainer.sanity_checking:
+            self._rest(trainer)
 
     def on_fit_end(self, trainer, module) -> None:
         save(trainer, self.path)

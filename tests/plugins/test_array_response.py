@@ -15,18 +15,19 @@ from gaigs.registry import registry
 from gaigs.testing import check_model, example_links
 
 ROOT = Path(__file__).parents[2]
+SCENE = example_links().scene
+SOMEWHERE = torch.tensor([[1.0, 2.0, 0.5], [3.0, 1.0, 1.5]])
 OPTIONS = {"rows": 4, "columns": 4, "pitch": 0.5, "octaves": [-1, 1], "width": 16, "layers": 1}
 
 
 @pytest.fixture
 def build(monkeypatch):
-    """Builds the model with other options, or for other links."""
+    """Builds the model with other options, or for another scene."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "path", sys.path[:])  # the registry appends to it
 
-    def build(links=None, **options):
+    def build(scene=SCENE, **options):
         torch.manual_seed(0)
-        scene = (links or example_links()).scene
         return registry("model").build({"name": "array_response"} | OPTIONS | options, scene=scene)
 
     return build
@@ -42,24 +43,23 @@ def answering(model, fields):
 
 
 def test_it_keeps_the_contract_of_models(build):
-    check_model(build(), example_links())
+    check_model(build, example_links())
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_label_is_the_simulators_for_the_same_fields(build, seed):
-    links = replace(example_links(), grid=Grid.degrees())
+    scene = replace(SCENE, grid=Grid.degrees())
     fields = torch.randn(16, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed))
-    predicted = answering(build(links), fields).predict(links.transmitters[:1])
-    expected = min_max(bartlett(fields[None, :, None], links.grid)).float()
+    predicted = answering(build(scene), fields).predict(SOMEWHERE[:1])
+    expected = min_max(bartlett(fields[None, :, None], scene.grid)).float()
     torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-5)
 
 
 def test_columns_lie_along_x_and_rows_along_y(build):
-    grid = Grid.degrees(range(1, 90, 8), range(0, 360, 15))
-    links = replace(example_links(), grid=grid)
+    scene = replace(SCENE, grid=Grid.degrees(range(1, 90, 8), range(0, 360, 15)))
     fields = torch.randn(5, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
     along_x, along_y = (
-        answering(build(links, rows=rows, columns=columns), fields).predict(links.transmitters[:1])[0]
+        answering(build(scene, rows=rows, columns=columns), fields).predict(SOMEWHERE[:1])[0]
         for rows, columns in ((1, 5), (5, 1))
     )
     # A line of elements cannot tell a direction from its mirror image across the line: az -> -az, az -> 180 deg - az.
@@ -70,19 +70,18 @@ def test_columns_lie_along_x_and_rows_along_y(build):
 
 def test_at_a_pitch_of_one_wavelength_lobes_repeat(build):
     # cos az cos el is 1/2 and -1/2 there: one period of the pattern, 1 / pitch, apart.
-    links = replace(example_links(), grid=Grid.degrees([60, 1, 90], [0, 90, 180]))
+    scene = replace(SCENE, grid=Grid.degrees([60, 1, 90], [0, 90, 180]))
     fields = torch.randn(16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
-    spectra = [answering(build(links, pitch=p), fields).predict(links.transmitters[:1])[0] for p in (1.0, 0.5)]
+    spectra = [answering(build(scene, pitch=p), fields).predict(SOMEWHERE[:1])[0] for p in (1.0, 0.5)]
     apart = [abs(float(spectrum[0, 0] - spectrum[0, 2])) for spectrum in spectra]
     assert apart[0] < 1e-5 < 0.1 < apart[1]
 
 
 def test_the_gradient_is_that_of_the_plain_formula(build):
-    links = example_links()
-    model = build(links).double()
-    grid = Grid(links.grid.elevations.double(), links.grid.azimuths.double())
-    batch = Batch(links.transmitters[:3].double(), 1, grid)
-    weights = torch.randn(3, *links.grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    model = build().double()
+    grid = Grid(SCENE.grid.elevations.double(), SCENE.grid.azimuths.double())
+    batch = Batch(SOMEWHERE.double(), 1, grid)
+    weights = torch.randn(2, *grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
     outputs = []
     hook = model.network.register_forward_hook(lambda module, inputs, output: outputs.append(output))
@@ -117,4 +116,4 @@ def test_options_out_of_range(build, options, message):
 
 def test_labels_that_are_no_spectra(build):
     with pytest.raises(ValueError, match="predicts spectra"):
-        build(replace(example_links(), grid=None))
+        build(replace(SCENE, grid=None))

@@ -1,4 +1,4 @@
-"""The contract of kind ``rasterizer`` written down once more, densely and in float64: the truth of the rasterizers' tests."""
+"""The contract of kind ``rasterizer`` written down densely and in float64: the truth of the rasterizers' tests."""
 
 import torch
 from jaxtyping import Float

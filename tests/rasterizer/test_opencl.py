@@ -47,7 +47,9 @@ def grid(projection, rows=37, columns=60) -> Plane:
     return projection.plane(torch.linspace(0.02, 1.45, rows), torch.arange(columns) * (2 * math.pi / columns))
 
 
-def random_scene(n=60, b=3, c=2, own=False, attenuations=None, plane=None, spread=(0.05, 0.6), opacities=(0.0, 0.95), seed=0):
+def random_scene(
+    n=60, b=3, c=2, own=False, attenuations=None, plane=None, spread=(0.05, 0.6), opacities=(0.0, 0.95), seed=0
+):
     """Splats all over the plane; ``spread`` bounds the standard deviations, log-uniform, along two random axes."""
     generator = torch.Generator().manual_seed(seed)
     uniform = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
@@ -117,6 +119,12 @@ def unsorted_plane() -> Scene:
     return random_scene(plane=Plane(u, v, plane.period))
 
 
+def twisted_plane() -> Scene:
+    """A period, and rows that mix with columns."""
+    u, v, period = vars(grid(Mercator(0.1))).values()
+    return random_scene(plane=Plane(u + 0.3 * v.sin(), v + 0.2 * u.cos(), period))
+
+
 SCENES = {
     "random": random_scene,
     "another": lambda: random_scene(n=150, spread=(0.02, 0.1), seed=1),
@@ -148,6 +156,7 @@ SCENES = {
     "at the seam": at_the_seam,
     "at the pole": at_the_pole,
     "unsorted plane": unsorted_plane,
+    "twisted plane": twisted_plane,
     "one pixel": lambda: random_scene(plane=grid(Mercator(0.1), 1, 1)),
     "one row": lambda: random_scene(plane=grid(Mercator(0.1), 1, 50)),
     "one column": lambda: random_scene(plane=grid(DirectionCosine(0.1), 50, 1)),
@@ -179,11 +188,15 @@ def test_agrees_with_the_dense_float64_rasterizer(name):
     image, left, gradients = render(opencl.OpenCLRasterizer(), scene, pixels)
     true_image, true_left, true_gradients = render(rasterize, scene, pixels)
     assert image.dtype == left.dtype == torch.float32
-    torch.testing.assert_close(image * pixels[:, None], (true_image * pixels[:, None]).float(), rtol=0, atol=VALUES * largest(true_image))
+    torch.testing.assert_close(
+        image * pixels[:, None], (true_image * pixels[:, None]).float(), rtol=0, atol=VALUES * largest(true_image)
+    )
     torch.testing.assert_close(left * pixels, (true_left * pixels).float(), rtol=0, atol=VALUES)
     for parameter, true_gradient in true_gradients.items():
         tolerance = GRADIENTS * largest(true_gradient)
-        torch.testing.assert_close(gradients[parameter], true_gradient, rtol=0, atol=tolerance, msg=lambda m, p=parameter: f"{p}: {m}")
+        torch.testing.assert_close(
+            gradients[parameter], true_gradient, rtol=0, atol=tolerance, msg=lambda m, p=parameter: f"{p}: {m}"
+        )
 
 
 def largest(tensor: torch.Tensor) -> float:
@@ -226,7 +239,9 @@ def test_reads_tensors_of_any_layout():
     image, left, gradients = render(opencl.OpenCLRasterizer(), scene, pixels)
     strided = lambda tensor: tensor.mT.contiguous().mT
     scene.signal, scene.opacities = strided(scene.signal), strided(scene.opacities)
-    scene.splats = replace(scene.splats, means2d=strided(scene.splats.means2d), depths=scene.splats.depths.repeat_interleave(2)[::2])
+    scene.splats = replace(
+        scene.splats, means2d=strided(scene.splats.means2d), depths=scene.splats.depths.repeat_interleave(2)[::2]
+    )
     scene.plane = replace(scene.plane, u=strided(scene.plane.u), v=strided(scene.plane.v))
     same_image, same_left, same_gradients = render(opencl.OpenCLRasterizer(), scene, pixels)
     assert torch.equal(image, same_image)
@@ -242,7 +257,7 @@ def test_lists_a_device_and_takes_it_by_any_part_of_its_name(monkeypatch):
 
 
 def test_an_unknown_device_is_an_error_that_lists_those_there_are(monkeypatch):
-    with pytest.raises(ValueError, match="no OpenCL device is called 'abacus'; there are: .*PU"):
+    with pytest.raises(ValueError, match=r"no OpenCL device is called 'abacus'; there are: .*PU"):
         opencl.OpenCLRasterizer(device="abacus")
     monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "slide rule")
     with pytest.raises(ValueError, match="'slide rule'"):
@@ -250,7 +265,10 @@ def test_an_unknown_device_is_an_error_that_lists_those_there_are(monkeypatch):
 
 
 def test_no_driver_is_an_error_that_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(opencl.cl, "get_platforms", lambda: [])
+    def find_no_platform():
+        raise opencl.cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(opencl.cl, "get_platforms", find_no_platform)
     with pytest.raises(RuntimeError, match=r"needs an OpenCL driver: pip install 'pyopencl\[pocl\]'"):
         opencl.devices()
 
@@ -265,11 +283,15 @@ def test_kernels_that_do_not_build_are_an_error_that_names_the_device(monkeypatc
 def test_tensors_it_cannot_read_are_errors_that_say_what_to_do():
     rasterizer, scene = opencl.OpenCLRasterizer(), random_scene()
     call = lambda **changes: rasterizer(*vars(replace(scene, **changes)).values())
-    with pytest.raises(TypeError, match=r"float32 on the CPU, got signal as torch.float64 on cpu; use rasterizer=torch"):
+    with pytest.raises(
+        TypeError, match=r"takes signal as torch.float32 on the CPU, got torch.float64 on cpu; use rasterizer=torch"
+    ):
         call(signal=scene.signal.double())
-    with pytest.raises(TypeError, match="got opacities as torch.float32 on meta"):
+    with pytest.raises(TypeError, match=r"takes opacities as torch\.float32 on the CPU, got torch\.float32 on meta"):
         call(opacities=scene.opacities.to("meta"))
     with pytest.raises(ValueError, match=r"opacities must be \(3, 60\) where signal is \(3, 60, 2\), got \(3, 59\)"):
         call(opacities=scene.opacities[:, 1:])
+    with pytest.raises(TypeError, match=r"takes visible as torch\.bool"):
+        call(splats=replace(scene.splats, visible=torch.ones(60)))
     with pytest.raises(ValueError, match="1 to 8 channels, got 9"):
         call(signal=torch.zeros(3, 60, 9))

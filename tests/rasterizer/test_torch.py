@@ -1,6 +1,6 @@
 """The torch rasterizer against its formula where Gaussians are hard, its memory, and what must not vanish.
 
-``gaigs.testing.check_rasterizer``, which tests/test_contracts.py runs, holds it against the formula over many more scenes.
+``gaigs.testing.check_rasterizer``, which tests/test_contracts.py runs, does so over many more scenes.
 """
 
 import math

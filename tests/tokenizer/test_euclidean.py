@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gaigs.testing import example_links
-from gaigs.tokenizer.euclidean import EuclideanTokenizer, fourier_features, octaves
+from gaigs.tokenizer.euclidean import PERIOD, EuclideanTokenizer, fourier_features, learnable_octaves, octaves
 
 OPTIONS = {"gaussian_octaves": (-3, 2), "transmitter_octaves": (-2, 4), "hidden": 16, "width": 8}
 
@@ -67,3 +67,20 @@ def test_a_checkpoint_brings_the_middles_along(scene):
 def test_an_empty_range_of_octaves_is_refused(scene):
     with pytest.raises(ValueError, match=r"transmitter_octaves must be \[lowest, highest\], got \[3, 2\]"):
         EuclideanTokenizer(scene, **(OPTIONS | {"transmitter_octaves": (3, 2)}))
+
+
+@pytest.mark.parametrize("spacing", [0.001, 0.03, 0.2, 5.0])
+@pytest.mark.parametrize("edge", [0.5, 3.0, 40.0])
+def test_octaves_span_the_box_and_stop_well_above_the_spacing(scene, spacing, edge):
+    upper = scene.lower + torch.tensor([0.3, 1.0, 0.2]) * edge
+    lowest, highest = learnable_octaves(replace(scene, upper=upper, spacing=spacing))
+    shortest, longest = 2.0**-highest, 2.0**-lowest
+    assert 0.7 < shortest / (PERIOD * spacing) < 1.42
+    assert longest == shortest or 2 * edge <= longest < 4 * edge + 1e-3
+    assert longest >= 2 * edge * (1 - 1e-6)
+
+
+def test_octaves_not_given_are_those_that_can_be_learnt(scene):
+    free = EuclideanTokenizer(scene, **(OPTIONS | {"transmitter_octaves": None}))
+    given = octaves("transmitter_octaves", *learnable_octaves(scene))
+    assert torch.equal(free.transmitter_frequencies, given)

@@ -109,8 +109,8 @@ class Trainer(SimpleNamespace):
     """What the checkpoint callbacks see of Lightning's trainer; a checkpoint is the number of its step."""
 
     def __init__(self, **state):
-        state = {"loggers": [], "should_stop": False, "enable_validation": True, "val_check_batch": 5} | state
-        super().__init__(global_step=0, **state)
+        state = {"enable_validation": True, "val_check_batch": 5, "loggers": []} | state
+        super().__init__(global_step=0, should_stop=False, sanity_checking=False, **state)
 
     def save_checkpoint(self, path, weights_only):
         assert not weights_only, "the optimizer's state belongs to it"
@@ -140,6 +140,15 @@ def test_without_validation_the_last_step_is_the_best(tmp_path):
     trainer.global_step = 7
     KeepBest(path, patience=None).on_fit_end(trainer, None)
     assert path.read_text() == "7"
+
+
+def test_lightnings_trial_validation_counts_for_nothing(tmp_path):
+    trainer = Trainer()
+    trainer.sanity_checking = True
+    for callback in (KeepBest(tmp_path / "best.ckpt", patience=1), KeepLast(tmp_path / "last.ckpt", every=0)):
+        trainer.validate(callback, 0.9)
+    assert not trainer.should_stop
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kill", range(6))

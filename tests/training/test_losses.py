@@ -14,10 +14,14 @@ def pair():
     return labels + 0.3 * torch.randn(4, 20, 33, generator=generator, dtype=torch.float64), labels
 
 
+def as_arrays(pair):
+    return [values.numpy() for values in pair]
+
+
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 @pytest.mark.parametrize("window", [3, 7, 11])
 def test_ssim_is_scikit_images(pair, window, dtype, tolerance):
-    expected = [skimage_ssim(l.numpy(), p.numpy(), data_range=1.0, win_size=window) for p, l in zip(*pair, strict=True)]
+    expected = [skimage_ssim(*both, data_range=1.0, win_size=window) for both in zip(*as_arrays(pair), strict=True)]
     predictions, labels = (values.to(dtype) for values in pair)
     similarity = structural_similarity(predictions, labels, window)
     assert similarity.item() == pytest.approx(sum(expected) / 4, abs=tolerance)
@@ -26,7 +30,7 @@ def test_ssim_is_scikit_images(pair, window, dtype, tolerance):
 def test_on_the_full_grid_the_loss_is_that_of_the_reported_scores(pair):
     predictions, labels = pair
     terms = spectrum_loss(predictions, labels)
-    reported = [skimage_ssim(l.numpy(), p.numpy(), data_range=1.0) for p, l in zip(*pair, strict=True)]
+    reported = [skimage_ssim(*both, data_range=1.0) for both in zip(*as_arrays(pair), strict=True)]
     assert 1 - terms["ssim"].item() == pytest.approx(sum(reported) / 4, abs=1e-12)
     assert terms["l1"].item() == pytest.approx((predictions - labels).abs().mean().item())
 

@@ -1,8 +1,8 @@
 /* Which splats reach which tile.
  *
- * Lists come in sets: one a transmitter, or one for all where covariances are shared. In each, a tile owns a row of bits,
- * one a splat, and a run of entries: the splats that reach the tile, front to back, each with the rows it reaches. The
- * rank of a bit leads from the splat to the entry, and so the gradient finds its way back without atomics.
+ * Lists come in sets: one a transmitter, or one for all where covariances are shared. In each, a tile owns a row of
+ * bits, one a splat, and a run of entries: the splats that reach the tile, front to back, with the rows each reaches.
+ * The rank of a bit leads from the splat to the entry, and so the gradient finds its way back without atomics.
  */
 
 /* Packs 32 splats of one set at their places in depth order:
@@ -55,7 +55,7 @@ kernel void prepare(sizes_t sizes, global const int *order, global const float *
     }
 }
 
-/* What a tile spans: centre and half size in u and v, and the least and largest v of each row; with slack for rounding. */
+/* What a tile spans, with slack for rounding: centre and half size in u and v, least and largest v of each row. */
 typedef struct {
     float u, half_u, v, half_v;
     float16 low, high;
@@ -87,8 +87,8 @@ static inline span_t span_tile(global const float *u, global const float *v, siz
         ((float *)&lows)[r] = low[r] - slack;
         ((float *)&highs)[r] = high[r] + slack;
     }
-    return (span_t){.5f * (left + right), .5f * (right - left) + slack, .5f * (bottom + top), .5f * (top - bottom) + slack,
-                    lows, highs};
+    return (span_t){.5f * (left + right), .5f * (right - left) + slack,
+                    .5f * (bottom + top), .5f * (top - bottom) + slack, lows, highs};
 }
 
 /* Marks the splats whose box meets one tile of one set. */
@@ -101,9 +101,10 @@ kernel void mark(sizes_t sizes, global const float *u, global const float *v, gl
         uint hits = 0;
         for (int j = 0; j < 32; j++) {
             float du = offset_float(box[j], span.u), dv = box[j + padded] - span.v;
-            uint miss = MOST(du, -du) > box[j + 2 * padded] + span.half_u | MOST(dv, -dv) > box[j + 3 * padded] + span.half_v;
-            hits |= (1 - miss) << j;
-            count += 1 - miss;
+            float half_u = box[j + 2 * padded] + span.half_u, half_v = box[j + 3 * padded] + span.half_v;
+            uint hit = !(MOST(du, -du) > half_u | MOST(dv, -dv) > half_v);
+            hits |= hit << j;
+            count += hit;
         }
         bits[get_global_id(0) * sizes.words + word] = hits;
     }
@@ -115,15 +116,18 @@ static inline uint rows_touched(splat_t splat, span_t span) {
     float reach = splat.reach * 1.0001f; /* slack, as for the boxes */
     float du = offset_float(span.u, splat.u), left = du - span.half_u, right = du + span.half_u;
 #ifdef PERIOD
-    if (left < -.5f * PERIOD || right > .5f * PERIOD) left = -INFINITY, right = INFINITY; /* reached from both sides */
+    if (left < -.5f * PERIOD || right > .5f * PERIOD) { /* reached from both sides */
+        left = -INFINITY;
+        right = INFINITY;
+    }
 #endif
     if (MOST(left, -right) * splat.across > reach) return 0;
     /* The ellipse is highest, and lowest, where du is nearest to its crest, and opposite of it. */
     float2 at = (float2)(splat.crest, -splat.crest);
     at = LEAST(MOST(at, left), right);
     float2 s = at * splat.across, rest = reach * reach - s * s;
-    float2 y = sqrt(MOST(rest, 0.f)) * (float2)(1, -1), dv = (at * splat.shear + y) / splat.along;
-    int16 hits = ~((span.low > splat.v + dv.x) | (span.high < splat.v + dv.y));
+    float2 y = sqrt(MOST(rest, 0.f)) * (float2)(1, -1), v = splat.v + (at * splat.shear + y) / splat.along;
+    int16 hits = ~((span.low > v.x) | (span.high < v.y));
     hits &= (int16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768);
     int8 a = hits.lo | hits.hi;
     int4 b = a.lo | a.hi;

@@ -25,17 +25,17 @@ typedef int8 masks;
 typedef float8 __attribute__((aligned(4))) loose_lanes; /* in buffers, where nothing aligns them */
 
 #define MASKED(mask, value) as_float8((mask) & as_int8(value))
-/* Here as in all comparisons NaN in `a` stays: what is broken must show. */
+/* NaN in `a` stays. So it does in all comparisons of these kernels: what is broken must show. */
 #define LEAST(a, b) ((b) < (a) ? (b) : (a))
 #define MOST(a, b) ((b) > (a) ? (b) : (a))
-/* Places of the highest bit of up to 24, and of the lowest: a float's exponent. */
+/* Places of the highest of up to 24 bits, and of the lowest of 32: a float's exponent. */
 #define HIGHEST(bits) ((as_uint((float)(bits)) >> 23) - 127)
 #define LOWEST(bits) HIGHEST((bits) & -(bits))
 
 typedef struct {
     int transmitters, sets, groups, group; /* sets of lists; groups of `group` transmitters, which share a work-item */
-    int splats, words;                     /* the latter of 32 splats */
-    int height, width, down, across;       /* of the image in pixels; in tiles */
+    int splats, words;                     /* words of 32 splats, the last one filled up */
+    int height, width, down, across;       /* of the image, in pixels and in tiles */
     int entries;                           /* of all lists */
 } sizes_t;
 

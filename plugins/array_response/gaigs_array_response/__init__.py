@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from gaigs.data import Grid, Scene
 from gaigs.model import Batch, Model, Prediction
-from gaigs.tokenizer.euclidean import fourier_features
+from gaigs.tokenizer.euclidean import fourier_features, learnable_octaves
 
 
 class ArrayResponse(Model):
@@ -27,7 +27,8 @@ class ArrayResponse(Model):
         scene: Receivers and grid; positions are taken relative to the middle of the transmitters' box.
         rows, columns: Elements along the array's y and x axis.
         pitch: Distance between neighbouring elements [wavelengths].
-        octaves: Lowest and highest octave k of the Fourier features, 2^k cycles a metre.
+        octaves: Lowest and highest octave k of the Fourier features, 2^k cycles a metre; None takes those that the
+            training transmitters can teach, as the ``euclidean`` tokenizer does.
         width, layers: Of the network's hidden layers.
 
     Raises:
@@ -37,14 +38,21 @@ class ArrayResponse(Model):
     """
 
     def __init__(
-        self, scene: Scene, rows: int, columns: int, pitch: float, octaves: tuple[int, int], width: int, layers: int
+        self,
+        scene: Scene,
+        rows: int,
+        columns: int,
+        pitch: float,
+        octaves: tuple[int, int] | None,
+        width: int,
+        layers: int,
     ):
         super().__init__(scene)
         if scene.grid is None:
             raise ValueError("model 'array_response' predicts spectra, and these labels are none; use another model")
         if rows < 1 or columns < 1 or rows * columns < 2:
             raise ValueError(f"an array must have at least 2 elements, got model.rows={rows}, model.columns={columns}")
-        lowest, highest = octaves
+        lowest, highest = octaves or learnable_octaves(scene)
         if lowest > highest:
             raise ValueError(f"model.octaves must be [lowest, highest], got {[lowest, highest]}")
         x = pitch * (torch.arange(columns) - (columns - 1) / 2)

@@ -1,0 +1,222 @@
+"""The command line as a user meets it; what a run computes is in test_experiment.py."""
+
+import csv
+import json
+import logging
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+import gaigs
+from gaigs import __main__ as command_line
+from gaigs import experiment
+from gaigs.report.multirun import report
+
+SMALL = (
+    "tokenizer=euclidean",
+    "data.transmitters=30",
+    "rasterizer=torch",
+    "gaussians.count=30",
+    "training.batch_size=7",
+    "training.stride=8",
+    "trainer.accelerator=cpu",
+    "trainer.max_steps=40",
+    "trainer.val_check_interval=15",
+    "trainer.log_every_n_steps=2",
+    "save_every=0",
+)
+
+
+def start(folder, *overrides, cwd):
+    """``python -m gaigs``, as from any folder."""
+    environment = os.environ | {"PYTHONPATH": str(Path(gaigs.__path__[0]).parent), "COLUMNS": "80"}
+    command = [sys.executable, "-m", "gaigs", *SMALL, *([f"hydra.run.dir={folder}"] if folder else []), *overrides]
+    return subprocess.Popen(
+        command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )  # fmt: skip
+
+
+def signal_at(process, folder, step, number):
+    """Sends a signal once a step is done."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and process.poll() is None:
+        try:
+            if torch.load(folder / "last.ckpt", weights_only=True)["global_step"] >= step:
+                break
+        except FileNotFoundError:
+            time.sleep(0.01)
+    process.send_signal(number)
+    return process.communicate()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run that nothing interrupts, in the folder that it chooses, and what it says."""
+    cwd = tmp_path_factory.mktemp("anywhere")
+    process = start(None, "+experiment=spectrum", cwd=cwd)
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    (folder,) = (cwd / "runs").iterdir()
+    return folder, out, err
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory):
+    """The same, killed, started again, stopped by Ctrl-C, and started a third time."""
+    folder, says = tmp_path_factory.mktemp("interrupted"), []
+    for step, number in ((6, signal.SIGKILL), (16, signal.SIGINT), (None, None)):
+        process = start(folder, cwd=folder)
+        out, err = signal_at(process, folder, step, number) if number else process.communicate()
+        says.append((process.returncode, out, err))
+    return folder, says
+
+
+def test_a_run_says_what_it_does_and_nothing_else(whole):
+    folder, out, err = whole
+    assert err == ""
+    lines = out.splitlines()
+    assert (folder / "gaigs.log").read_text().splitlines() == [lines[0], lines[1], lines[3]]
+    assert lines[0] == "data: synthetic; split official, validation 0.1, seed 0: 22 train, 2 validation, 6 test"
+    assert lines[1].startswith("model: gaigs, tokenizer euclidean, projection mercator, rasterizer torch, pooling")
+    assert re.match(r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} SSIM \d\.\d{3}$", lines[2])
+    assert re.match(r"trained 40 steps of 7 transmitters in \d+ s: [\d.]+ steps/s$", lines[3])
+    assert "Test scores" in lines[4]
+    assert lines[-1].endswith(str(folder))
+    assert all(len(line) <= 80 for line in lines[2:-1])
+
+
+def test_a_run_folder(whole):
+    folder, _, _ = whole
+    figures = {path.name for path in (folder / "figures").iterdir()}
+    assert figures == {"room.png", "loss.png", "spectra.png", "spectra_polar.png", "ssim_cdf.png"}
+    assert json.loads((folder / "metrics.json").read_text())["train_seconds"] > 0
+    assert yaml.safe_load((folder / "config.yaml").read_text())["gaussians"]["count"] == 30
+
+
+def test_a_killed_run_goes_on(interrupted):
+    (killed, _, _), (stopped, _, err), (ended, out, _) = interrupted[1]
+    assert (killed, stopped, ended) == (-signal.SIGKILL, 130, 0)
+    first, second = (int(re.search(r"going on after step (\d+)", text)[1]) for text in (interrupted[1][1][1], out))
+    assert 6 <= first < second
+    folder = interrupted[0]
+    assert err == f"gaigs: stopped after step {second}; the same command with hydra.run.dir={folder} goes on\n"
+
+
+def test_a_killed_run_ends_as_if_it_had_not_been(whole, interrupted):
+    folder, other = whole[0], interrupted[0]
+    metrics, others = (json.loads((path / "metrics.json").read_text()) for path in (folder, other))
+    assert metrics["models"] == others["models"]
+    for name in ("best.ckpt", "last.ckpt"):
+        a, b = (torch.load(path / name, weights_only=True) for path in (folder, other))
+        assert a["global_step"] == b["global_step"]
+        assert list(a["state_dict"]) == list(b["state_dict"])
+        assert all(torch.equal(a["state_dict"][key], b["state_dict"][key]) for key in a["state_dict"])
+
+
+# --- within this process, as a start takes seconds ---
+
+
+@pytest.fixture
+def run(capsys, monkeypatch, tmp_path):
+    """Runs the command line; gives its exit code and what it says on stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(experiment, "write_figures", lambda *_: None)
+    root = logging.getLogger()
+    handlers = list(root.handlers)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["gaigs", *arguments])
+        code = 0
+        try:
+            command_line.main()
+        except SystemExit as end:
+            code = end.code
+        return code, capsys.readouterr().err
+
+    yield run
+    for handler in set(root.handlers) - set(handlers):
+        handler.close()
+    root.handlers[:] = handlers
+
+
+HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["tokenizer.anchor=3"], "Key 'anchor' is not in struct"),  # Hydra's own
+        (["tokenizer=foo"], "Could not find 'tokenizer/foo'"),
+        (["+experiment=foo"], "Could not find 'experiment/foo'\n\nAvailable options in 'experiment':\n\tspectrum"),
+        (["+tokenizer.widht=3"], "gaigs: tokenizer 'euclidean' has no option 'widht' (did you mean 'width'?)"),
+        (["+trainer.max_step=3"], "gaigs: trainer has no option 'max_step' (did you mean 'max_steps'?)"),
+        (["trainer.accelerator=abacus"], "invalid accelerator name: `accelerator='abacus'`"),
+        (["trainer.val_check_interval=1.5"], "gaigs: `val_check_interval` should be an integer"),
+        (["seed=${sed}"], "gaigs: the configuration is not complete\nInterpolation key 'sed' not found"),
+    ],
+)
+def test_what_a_user_can_mend_is_told_without_a_traceback(overrides, message, run):
+    code, err = run(*SMALL, *HERE, *overrides)
+    assert code == 1
+    assert message in err
+    assert "Traceback" not in err
+
+
+def test_a_value_that_must_be_set_is_named(run):
+    code, err = run("data=nerf2_spectrum", *HERE)
+    assert code == 1
+    assert re.search("gaigs: the configuration is not complete\nMissing mandatory value.*\n +full_key: data.root", err)
+    assert "Traceback" not in err
+
+
+def test_data_that_are_not_there(run, tmp_path):
+    code, err = run("data=nerf2_spectrum", "data.root=nowhere", *HERE)
+    assert code == 1
+    assert "gaigs: nowhere must be the folder of a data set" in err
+    assert "Traceback" not in err
+
+
+def test_what_only_a_developer_can_mend_has_a_traceback(run, monkeypatch):
+    monkeypatch.setattr(experiment, "train_and_test", lambda *_: {}["lost"])
+    code, err = run(*SMALL, *HERE)
+    assert code == 1
+    assert "KeyError: 'lost'" in err
+    assert "Traceback" in err
+
+
+def test_another_configuration_in_the_same_folder(run):
+    assert run(*SMALL, *HERE, "model=mean") == (0, "")
+    code, err = run(*SMALL, *HERE, "model=mean", "data.transmitters=31")
+    assert code == 1
+    assert "of the same configuration, but data.transmitters was 30, is 31; choose another folder" in err
+
+
+def test_ctrl_c_outside_of_the_training(run, monkeypatch):
+    def press(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(experiment, "train_and_test", press)
+    stopped = "gaigs: stopped; the same command with hydra.{} goes on\n"
+    assert run(*SMALL, "hydra.run.dir=run") == (130, stopped.format("run.dir=run"))
+    assert run("-m", *SMALL, "hydra.sweep.dir=sweep", "seed=0,1") == (130, stopped.format("sweep.dir=sweep"))
+
+
+def test_a_multirun_goes_past_a_failure_and_reports(run, tmp_path):
+    varied = ("tokenizer=euclidean,ga", "gaussians.count=0,30", "trainer.max_steps=2", HERE[1])
+    code, err = run("-m", *SMALL[1:], "hydra.sweep.dir=sweep", *varied)
+    assert code == 1
+    assert "gaigs: gaussians.count must be at least one a receiver (1), got 0" in err
+    assert "Traceback" not in err
+    assert report(tmp_path / "sweep").row_count == 4 + 2
+    with open(tmp_path / "sweep" / "ablation.csv", newline="") as file:
+        ended = {(row["tokenizer"], row["gaussians.count"]): row["status"] for row in csv.DictReader(file)}
+    for tokenizer in ("euclidean", "ga"):
+        assert (ended[tokenizer, "0"], ended[tokenizer, "30"]) == ("failed", "done")
