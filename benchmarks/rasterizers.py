@@ -31,45 +31,53 @@ from gaigs.rasterizer.torch import TorchRasterizer
 from gaigs.registry import registry
 
 CEILING = """
-/* One splat that covers a whole tile, passed over and over; memory holds its opacity and signal, all small. */
-static inline view_t still(global const float *memory) {
+/* One splat that covers a whole tile, passed over and over; memory holds its appearance and its offsets, all small. */
+static inline view_t view_still(global const float *memory) {
     view_t view;
     view.s = view.square = view.skew = memory[0];
     for (int r = 0; r < ROWS; r++) view.height[r] = memory[r];
     return view;
 }
 
-kernel void ceiling_forward(global float *memory, int passes) {
-    view_t view = still(memory);
+kernel void ceiling_forward(global float *memory, int chunks) {
+    view_t view = view_still(memory);
     map_t map;
     lanes footprints[ROWS], all = 0;
     for (int r = 0; r < ROWS; r++)
         for (int c = 0; c < CHANNELS; c++) map.colour[c][r] = 0;
-    for (int k = 0; k < passes; k++, view.square += 1e-6f) {
-        if (k % 64 == 0)
-            for (int r = 0; r < ROWS; r++) map.transmittance[r] = 1;
-        for (int r = 0; r < ROWS; r++) footprints[r] = footprint(offsets_of(&view, r));
-        for (int r = 0; r < ROWS; r++) blend(&map, r, footprints[r], memory);
+    for (int chunk = 0; chunk < chunks; chunk++) {
+        for (int r = 0; r < ROWS; r++) map.transmittance[r] = 1;
+        for (int k = 0; k < CHUNK; k++, view.square += 1e-6f) {
+            for (int r = 0; r < ROWS; r++) footprints[r] = footprint(offsets_of(&view, r));
+            for (int r = 0; r < ROWS; r++) blend(&map, r, footprints[r], memory);
+        }
     }
     for (int r = 0; r < ROWS; r++)
         for (int c = 0; c < CHANNELS; c++) all += map.colour[c][r];
     memory[64 + get_global_id(0)] = sum(all);
 }
 
-kernel void ceiling_backward(global float *memory, int passes) {
-    view_t view = still(memory);
-    state_t state;
+kernel void ceiling_backward(global float *memory, int chunks) {
+    view_t view = view_still(memory);
+    chunk_t chunk;
     found_t found = {0};
     moments_t moments = {0};
-    lanes footprints[ROWS], flows[ROWS];
+    lanes transmittance[ROWS], behind[ROWS], gradient[CHANNELS][ROWS];
     for (int r = 0; r < ROWS; r++)
-        for (int c = 0; c < CHANNELS; c++) state.gradient[c][r] = memory[c];
-    for (int k = 0; k < passes; k++, view.square += 1e-6f) {
-        if (k % 64 == 0)
-            for (int r = 0; r < ROWS; r++) state.transmittance[r] = state.behind[r] = 1;
-        for (int r = 0; r < ROWS; r++) footprints[r] = footprint(offsets_of(&view, r));
-        for (int r = 0; r < ROWS; r++) flows[r] = pass(&state, r, footprints[r], memory, &found);
-        for (int r = 0; r < ROWS; r++) add_moments(&moments, flows[r], offsets_of(&view, r));
+        for (int c = 0; c < CHANNELS; c++) gradient[c][r] = memory[c];
+    for (int number = 0; number < chunks; number++) {
+        for (int r = 0; r < ROWS; r++) transmittance[r] = behind[r] = 1;
+        for (int k = 0; k < CHUNK; k++, view.square += 1e-6f)
+            for (int r = 0; r < ROWS; r++) {
+                chunk.footprint[k][r] = footprint(offsets_of(&view, r));
+                chunk.flow[k][r] = 0;
+            }
+        for (int k = 0; k < CHUNK; k++)
+            for (int r = 0; r < ROWS; r++) pass_forward(&chunk, k, r, transmittance + r, memory);
+        for (int k = CHUNK - 1; k >= 0; k--)
+            for (int r = 0; r < ROWS; r++) pass_back(&chunk, k, r, behind + r, gradient[0] + r, memory, &found);
+        for (int k = 0; k < CHUNK; k++)
+            for (int r = 0; r < ROWS; r++) add_moments(&moments, chunk.flow[k][r], offsets_of(&view, r));
     }
     lanes all = found.opacity + found.attenuation + moments.s + moments.y + moments.yy;
     for (int c = 0; c < CHANNELS; c++) all += found.signal[c];
@@ -161,7 +169,7 @@ def time_compositing(rasterizer: Rasterizer, scene: Scene) -> float | None:
     splats, signal, opacities, attenuations, plane = scene
     render = opencl._Render(opencl._queue(rasterizer.device), splats, signal, opacities, attenuations, plane)
     start = time.perf_counter()
-    render.forward()
+    render.forward(differentiate=True)
     return time.perf_counter() - start
 
 
@@ -172,10 +180,8 @@ class Ceiling:
         self.queue = opencl._queue(None)
         macros = {"CHANNELS": channels, "ATTENUATION": int(attenuation), "TRANSMITTERS": 1, "SEPARABLE": 1}
         macros |= {"ALPHA_MIN": opencl._literal(ALPHA_MIN), "ALPHA_MAX": opencl._literal(ALPHA_MAX)}
-        kernels = Path(opencl.__file__).parent / "kernels"
-        source = "".join((kernels / f"{name}.cl").read_text() for name in ("footprint", "composite", "gradient")) + CEILING
         options = ["-w", *(f"-D{macro}={value}" for macro, value in macros.items())]
-        program = cl.Program(self.queue.context, source).build(options)
+        program = cl.Program(self.queue.context, opencl._source() + CEILING).build(options)
         self.kernels = {way: cl.Kernel(program, f"ceiling_{way}") for way in ("forward", "backward")}
         self.items = 4 * self.queue.device.max_compute_units
         values = np.full(64 + self.items, 0.01, np.float32)
@@ -183,10 +189,11 @@ class Ceiling:
 
     def time_pair(self, way: str) -> float:
         """Time a pair, "forward" or "backward" [s]."""
-        passes = 2000
+        chunks = 100
         start = time.perf_counter()
-        self.kernels[way](self.queue, (self.items,), (1,), self.memory, np.int32(passes)).wait()
-        return (time.perf_counter() - start) / (self.items * passes * opencl.ROWS * opencl.COLUMNS)
+        self.kernels[way](self.queue, (self.items,), (1,), self.memory, np.int32(chunks)).wait()
+        seconds = time.perf_counter() - start
+        return seconds / (self.items * chunks * opencl.CHUNK * opencl.ROWS * opencl.COLUMNS)
 
 
 def peak_memory(name: str, scene: str, n: int, device: str) -> float:

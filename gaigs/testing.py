@@ -350,8 +350,7 @@ def _render(rasterizer: Rasterizer, arguments: tuple, pixels: Bool[Tensor, "b ro
     means2d, covariances2d, *others = leaves.values()
     image, left = rasterizer(replace(splats, means2d=means2d, covariances2d=covariances2d), *others, plane)
     image, left = image * pixels[:, None], left * pixels
-    weights = lambda values: torch.arange(values.numel(), device=values.device).cos().to(values).view(values.shape)
-    (image * weights(image)).sum().add((left * weights(left)).sum()).backward()
+    (_fixed_sum(image) + _fixed_sum(left)).backward()
     results = {"map": image.detach(), "transmittance": left.detach()}
     for name, leaf in leaves.items():
         if leaf is not None:
@@ -433,11 +432,16 @@ def _check_gradients(outputs: Sequence[Tensor], leaves: dict[str, Tensor]) -> No
     outputs = [output for output in outputs if output.requires_grad and output.numel()]
     if not outputs:
         return
-    weights = lambda values: torch.arange(values.numel(), device=values.device).cos().to(values).view(values.shape)
-    total = sum((output * weights(output)).sum() for output in outputs)
+    total = sum(map(_fixed_sum, outputs))
     gradients = torch.autograd.grad(total, [*leaves.values()], allow_unused=True, retain_graph=True)
     for name, gradient in zip(leaves, gradients, strict=True):
         _require(gradient is None or bool(gradient.isfinite().all()), f"the gradient of {name} must be finite")
+
+
+def _fixed_sum(values: Tensor) -> Tensor:
+    """A sum with weights that differ but are always the same, so that no two gradients cancel."""
+    weights = torch.arange(values.numel(), device=values.device).cos().to(values)
+    return (values.flatten() * weights).sum()
 
 
 def _check_tensor(

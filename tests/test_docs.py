@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("plugins/*/*.md")])
 OURS = tuple(f"{folder}/" for folder in ("gaigs", "conf", "plugins", "tests", "docs", "benchmarks"))
 FILES = {".ply", ".log"}
-"""What files that begin like a name or a key end in."""
+"""What a file's name ends in that would pass for a key or a name."""
 
 BRIEF = [
     "trainer.max_steps=2", "trainer.val_check_interval=2", "trainer.accelerator=cpu", "gaussians.count=20",
@@ -153,13 +153,17 @@ def test_commands_compose(page, composed):
 
 
 @page_by_page
-def test_configuration_keys_exist(page, composed):
+def test_configuration_keys_exist(page, composed, place):
+    with contextlib.chdir(place):
+        folders = [configuration.conf_dir(), *configuration.plugin_conf_dirs()]
     for word in spoken(page):
         match = re.fullmatch(r"\+?(?P<top>[a-z_]+)(\.[a-z_]+)*(=\S+)?", word)
-        if match is None or match["top"] not in composed() or not set(".=") & set(word) or Path(word).suffix in FILES:
+        if match is None or not set(".=") & set(word) or Path(word).suffix in FILES:
+            continue
+        if match["top"] not in {*composed(), "experiment"}:
             continue
         # A key that only some option of its group has, such as data.root, exists too.
-        options = [file.stem for file in configuration.conf_dir().glob(f"{match['top']}/*.yaml")]
+        options = [file.stem for folder in folders for file in folder.glob(f"{match['top']}/*.yaml")]
         bases = [[], *([f"{match['top']}={option}"] for option in options)]
         assert any(_has(composed, base, word) for base in bases), word
 
@@ -191,8 +195,10 @@ def test_the_tokenizer_trains_by_its_command_and_predicts_as_the_readme_says(pla
     checkpoint = torch.load(place / "runs/room/best.ckpt", weights_only=True)
     assert checkpoint["global_step"] == 2
     assert "model.tokenizer.waves.weight" in checkpoint["state_dict"]
-    (block,) = blocks(ROOT / "README.md", "python")
-    assert _python(place, "-c", f"{block}\nprint([*spectra.shape])").strip() == "[2, 90, 360]"
+    (predict,) = blocks(ROOT / "README.md", "python")
+    check = blocks(ROOT / "docs/plugins.md", "python")[-1]
+    script = f"{predict}\nprint([*spectra.shape])\n{check}\ntest_plane_waves()"
+    assert _python(place, "-c", script).strip() == "[2, 90, 360]"
 
 
 def test_the_packages_are_found_once_installed(place, tmp_path):

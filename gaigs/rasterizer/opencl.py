@@ -18,8 +18,8 @@ from gaigs.registry import register
 ROWS, COLUMNS = 16, 8
 """Edges of a tile in pixels; the kernels say the same."""
 
-WORD, GEOMETRY, MOMENTS = 32, 8, 5
-"""Splats a word of bits, and lengths of rows in buffers; the kernels say the same."""
+WORD, CHUNK, GEOMETRY, MOMENTS = 32, 32, 8, 5
+"""Splats a word of bits, entries a checkpoint, and lengths of rows in buffers; the kernels say the same."""
 
 GROUP = 8
 """Transmitters that one work-item composites at most, where they share footprints; more would leave the nearest
@@ -65,7 +65,7 @@ class OpenCLRasterizer:
         _check(splats, signal, opacities, attenuations, plane)
         # What autograd differentiates has to be an argument of its own; `_Render` finds it in the splats.
         inputs = splats.means2d, splats.covariances2d, signal, opacities, attenuations
-        return _Composite.apply(_queue(self.device), splats, plane, *inputs)
+        return _Composite.apply(_queue(self.device), splats, plane, torch.is_grad_enabled(), *inputs)
 
 
 def devices() -> list[str]:
@@ -109,15 +109,19 @@ def _open(name: str | None) -> cl.CommandQueue:
     return cl.CommandQueue(cl.Context(chosen[:1]))
 
 
+def _source() -> str:
+    """All kernels, in the order in which they use each other's functions."""
+    folder = Path(__file__).parent / "kernels"
+    return "\n".join((folder / f"{name}.cl").read_text() for name in ("footprint", "bin", "composite", "gradient"))
+
+
 @functools.cache
 def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel]:
     """The kernels of one shape family; PoCL keeps what it compiled on disk."""
-    folder = Path(__file__).parent / "kernels"
-    source = "\n".join((folder / f"{name}.cl").read_text() for name in ("footprint", "bin", "composite", "gradient"))
     # -w: a CPU without registers of the vectors' width is worth a warning to the compiler.
     options = ["-w", *(f"-D{macro}={value}" for macro, value in macros.items())]
     try:
-        program = cl.Program(queue.context, source).build(options)
+        program = cl.Program(queue.context, _source()).build(options)
     except cl.RuntimeError as error:
         device = _name(queue.device)
         raise RuntimeError(f"rasterizer 'opencl': {device} cannot build the kernels; use rasterizer=torch") from error
@@ -159,16 +163,14 @@ def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tens
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, queue, splats, plane, means, covariances, signal, opacities, attenuations):
+    def forward(ctx, queue, splats, plane, grad_enabled, means, covariances, signal, opacities, attenuations):
         ctx.render = _Render(queue, splats, signal, opacities, attenuations, plane)
-        image, left = ctx.render.forward()
-        ctx.save_for_backward(image, left)
-        return image, left
+        return ctx.render.forward(grad_enabled and any(ctx.needs_input_grad))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, image_gradient, left_gradient):
-        return None, None, None, *ctx.render.backward(*ctx.saved_tensors, image_gradient, left_gradient)
+        return None, None, None, None, *ctx.render.backward(image_gradient, left_gradient)
 
 
 class _Sizes(ctypes.Structure):
@@ -196,11 +198,12 @@ class _Render:
         group = -(-b // groups)
         down, across, words = -(-height // ROWS), -(-width // COLUMNS), -(-n // WORD)
         self.sizes = _Sizes(b, sets, groups, group, n, words, height, width, down, across)
-        self.tiles, lists = down * across, sets * down * across
+        self.tiles, self.lists = down * across, sets * down * across
+        self.walks = groups if sets == 1 else 1  # through each list
         self.attenuates = attenuations is not None
         looks = 1 + self.attenuates + self.channels  # opacity, attenuation, signal
         together = 1 if group == 1 else GROUP
-        self.partials = MOMENTS + together * looks
+        self.together, self.partials = together, MOMENTS + together * looks
         separable = plane.u.shape[0] == plane.v.shape[1] == 1
         macros = {"CHANNELS": self.channels, "ATTENUATION": int(self.attenuates), "TRANSMITTERS": together}
         macros |= {"SEPARABLE": int(separable), "ALPHA_MIN": _literal(ALPHA_MIN), "ALPHA_MAX": _literal(ALPHA_MAX)}
@@ -217,35 +220,39 @@ class _Render:
         self._run("prepare", sets * words, order, *inputs, geometry, boxes, appearance)
 
         u, v = (self._share(coordinate) for coordinate in _whole_tiles(plane, down, across, separable))
-        bits, ranks = self._empty(lists * words), self._empty(lists * words)
-        counts = np.empty(lists, np.int32)
+        bits, ranks = self._empty(self.lists * words), self._empty(self.lists * words)
+        counts = np.empty(self.lists, np.int32)
         shared_counts = self._share(counts)
-        self._run("mark", lists, u, v, boxes, bits, shared_counts)
+        self._run("mark", self.lists, u, v, boxes, bits, shared_counts)
         self._finish(shared_counts)
         offsets = self._share(np.cumsum(counts, dtype=np.int32) - counts)
         self.sizes.entries = counts.sum()
         entries = self._empty(self.sizes.entries)
-        self._run("list", lists, u, v, geometry, offsets, bits, ranks, entries, shared_counts)
-        self.lists = u, v, offsets, shared_counts, entries, geometry, appearance
+        self._run("list", self.lists, u, v, geometry, offsets, bits, ranks, entries, shared_counts)
+        self.scene = u, v, offsets, shared_counts, entries, geometry, appearance
         self.inverse = order, bits, ranks, geometry, appearance
         self.loudest = self._share(np.abs(signal.detach().numpy()).max((1, 2), initial=0))
 
-    def forward(self):
+    def forward(self, differentiate=False):
         sizes = self.sizes
         image = torch.empty(sizes.transmitters, self.channels, sizes.height, sizes.width)
         left = torch.empty(sizes.transmitters, sizes.height, sizes.width)
-        self.stops = self._empty(sizes.groups * self.tiles)
         outputs = self._share(image), self._share(left)
-        self._run("forward", sizes.groups * self.tiles, *self.lists, self.loudest, *outputs, self.stops)
+        ends, checkpoints = self._empty(sizes.groups * self.tiles), None
+        if differentiate:
+            size = self.walks * (sizes.entries // CHUNK + self.lists)
+            checkpoints = self._empty(size * self.together * ROWS * COLUMNS)
+        self._run("forward", sizes.groups * self.tiles, *self.scene, self.loudest, *outputs, ends, checkpoints)
+        self.path = ends, checkpoints
         self._finish(*outputs)
         return image, left
 
-    def backward(self, image, left, image_gradient, left_gradient):
+    def backward(self, image_gradient, left_gradient):
         sizes = self.sizes
         b, n = sizes.transmitters, sizes.splats
-        images = [self._share(tensor) for tensor in (image, left, image_gradient, left_gradient)]
-        partials = self._empty((sizes.groups if sizes.sets == 1 else 1) * sizes.entries * self.partials)
-        self._run("backward", sizes.groups * self.tiles, *self.lists, *images, self.stops, partials)
+        images = self._share(image_gradient), self._share(left_gradient)
+        partials = self._empty(self.walks * sizes.entries * self.partials)
+        self._run("backward", sizes.groups * self.tiles, *self.scene, *self.path, *images, partials)
         shapes = (n, 2), (sizes.sets, n, 2, 2), (b, n, self.channels), (b, n), (b, n) if self.attenuates else None
         gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
         outputs = [self._share(gradient) for gradient in gradients]

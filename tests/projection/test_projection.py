@@ -60,7 +60,10 @@ def test_footprints_are_the_covariances_of_projected_samples(kind, place):
     half = axes * torch.tensor([0.01, 0.03, 0.005], dtype=torch.float64)
     samples = mean + torch.randn(100_000, 3, generator=generator, dtype=torch.float64) @ half.mT
     projection = kind(1e-9)
-    splats = projection.project(mean[None], (half @ half.mT)[None, None], HERE)
+    turn = Rotation.from_euler("zyx", [110, -35, 70], degrees=True)
+    pose = Pose(torch.tensor([3.0, -1, 2], dtype=torch.float64), torch.from_numpy(turn.as_matrix()))
+    covariance = pose.rotation @ half @ half.mT @ pose.rotation.mT
+    splats = projection.project(pose.world(mean[None]), covariance[None, None], pose)
     off = projection.coordinates(samples) - splats.means2d
     if kind is not DirectionCosine:
         off[:, 0] = (off[:, 0] + math.pi).remainder(math.tau) - math.pi

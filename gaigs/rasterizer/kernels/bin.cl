@@ -135,7 +135,14 @@ static inline uint rows_touched(splat_t splat, span_t span) {
     return c.x | c.y;
 }
 
-/* Lists one tile of one set: splat | first row << 24 | last row << 28. Bits of ellipses that miss are cleared. */
+/* A splat in a tile's list, with the rows it reaches; packed as splat | first << 24 | last << 28. */
+typedef struct {
+    uint splat, first, last;
+} entry_t;
+
+static inline entry_t unpack(uint entry) { return (entry_t){entry & 0xffffff, entry >> 24 & 15, entry >> 28}; }
+
+/* Lists one tile of one set. Bits of ellipses that miss are cleared. */
 kernel void list(sizes_t sizes, global const float *u, global const float *v, global const float *geometry,
                  global const int *offsets, global uint *bits, global int *ranks, global uint *entries,
                  global int *counts) {

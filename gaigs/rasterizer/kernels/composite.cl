@@ -4,31 +4,33 @@
  * Images are (transmitters, CHANNELS, height, width); `left` is the transmittance behind the last splat.
  */
 
-/* A tile is done where what remains behind, at most its largest transmittance times the loudest signal, can change none
- * of its pixels by more than this part of its largest value. In doubt (NaN) it goes on. */
+/* Entries from one checkpoint to the next. There the transmittance is kept for the way back, and a tile ends where what
+ * remains behind, at most its largest transmittance times the loudest signal, can change none of its pixels by more
+ * than NEGLIGIBLE of its largest value. In doubt (NaN) it goes on. */
+#define CHUNK 32
 #define NEGLIGIBLE 1e-7f
 
 typedef struct {
     int tile, x, y;   /* the tile and its first pixel */
     int first, count; /* transmitters */
     int begin, end;   /* entries */
+    int checkpoint;   /* the first of the tile's; each holds TRANSMITTERS rows of ROWS COLUMNS values */
 } job_t;
 
 static inline job_t find_job(sizes_t sizes, int item, global const int *offsets, global const int *counts) {
-    int tiles = sizes.down * sizes.across, tile = item % tiles, list = sizes.sets == 1 ? tile : item;
-    int first = item / tiles * sizes.group, rest = sizes.transmitters - first, begin = offsets[list];
-    int x = tile % sizes.across * COLUMNS, y = tile / sizes.across * ROWS;
-    return (job_t){tile, x, y, first, LEAST(rest, sizes.group), begin, begin + counts[list]};
+    int tiles = sizes.down * sizes.across, tile = item % tiles, group = item / tiles;
+    int list = sizes.sets == 1 ? tile : item, first = group * sizes.group, rest = sizes.transmitters - first;
+    job_t job = {tile, tile % sizes.across * COLUMNS, tile / sizes.across * ROWS, first, LEAST(rest, sizes.group)};
+    job.begin = offsets[list];
+    job.end = job.begin + counts[list];
+    job.checkpoint = job.begin / CHUNK + list; /* a list ends within its last checkpoint: one more for each */
+    if (sizes.sets == 1) job.checkpoint += group * (sizes.entries / CHUNK + tiles);
+    return job;
 }
 
-/* One row of a tile from or to an image; pixels beyond its edges read 0. */
-static inline lanes load_row(global const float *image, sizes_t sizes, job_t job, int row) {
-    global const float *pixels = image + (job.y + row) * sizes.width + job.x;
-    int inside = job.y + row < sizes.height ? sizes.width - job.x : 0;
-    if (inside >= COLUMNS) return *(global const loose_lanes *)pixels;
-    float value[COLUMNS];
-    for (int x = 0; x < COLUMNS; x++) value[x] = x < inside ? pixels[x] : 0;
-    return *(loose_lanes *)value;
+/* Where a transmitter's transmittance in one row is kept. */
+static inline size_t find_row(int checkpoint, int transmitter, int row) {
+    return (((size_t)checkpoint * TRANSMITTERS + transmitter) * ROWS + row) * COLUMNS;
 }
 
 static inline void store_row(lanes value, global float *image, sizes_t sizes, job_t job, int row) {
@@ -38,12 +40,6 @@ static inline void store_row(lanes value, global float *image, sizes_t sizes, jo
         *(global loose_lanes *)pixels = value;
     else
         for (int x = 0; x < inside; x++) pixels[x] = ((float *)&value)[x];
-}
-
-static inline float sum(lanes v) {
-    float4 a = v.lo + v.hi;
-    float2 b = a.lo + a.hi;
-    return b.lo + b.hi;
 }
 
 /* The largest absolute value; as integers, which order like the floats. */
@@ -58,6 +54,19 @@ static inline float largest(const lanes *rows, int count) {
     return as_float(MOST(b.lo, b.hi));
 }
 
+/* A of a splat in one row, 0 where it does nothing. */
+static inline lanes alpha_of(lanes g, global const float *look) {
+    lanes alpha = g * look[0];
+    return MASKED(~(alpha < ALPHA_MIN), LEAST(alpha, ALPHA_MAX));
+}
+
+#if ATTENUATION
+/* d^G of a splat in one row, 1 where it does nothing. */
+static inline lanes attenuation_of(lanes g, lanes alpha, global const float *look) {
+    return power_of_two(MASKED(alpha != 0, g * look[1]));
+}
+#endif
+
 /* One transmitter's map over a tile, as far as it is composited. */
 typedef struct {
     lanes transmittance[ROWS], colour[CHANNELS][ROWS];
@@ -65,21 +74,20 @@ typedef struct {
 
 /* Lays an entry under one row: the map gains signal A T, and T becomes T (1 - A) d^G. */
 static inline void blend(map_t *map, int r, lanes g, global const float *look) {
-    lanes raw = g * look[0], before = map->transmittance[r];
-    masks acts = ~(raw < ALPHA_MIN);
-    lanes weight = MASKED(acts, LEAST(raw, ALPHA_MAX)) * before, after = before - weight;
+    lanes alpha = alpha_of(g, look), before = map->transmittance[r], weight = alpha * before, after = before - weight;
 #if ATTENUATION
-    after *= power_of_two(MASKED(acts, g * look[1]));
+    after *= attenuation_of(g, alpha, look);
 #endif
     map->transmittance[r] = after;
 #pragma unroll
     for (int c = 0; c < CHANNELS; c++) map->colour[c][r] += weight * look[1 + ATTENUATION + c];
 }
 
+/* `checkpoints` may be null: no gradient is wanted. */
 kernel void forward(sizes_t sizes, global const float *u, global const float *v, global const int *offsets,
                     global const int *counts, global const uint *entries, global const float *geometry,
                     global const float *appearance, global const float *loudest, global float *image,
-                    global float *left, global int *stops) {
+                    global float *left, global int *ends, global float *checkpoints) {
     job_t job = find_job(sizes, get_global_id(0), offsets, counts);
     int area = sizes.height * sizes.width;
     if (sizes.sets > 1) geometry += job.first * sizes.words * 32 * GEOMETRY;
@@ -92,14 +100,21 @@ kernel void forward(sizes_t sizes, global const float *u, global const float *v,
         }
     int done = 0, k = job.begin;
     while (k < job.end && done < job.count) {
-        for (int pause = LEAST(k + 16, job.end); k < pause; k++) {
-            uint entry = entries[k], i = entry & 0xffffff, first = entry >> 24 & 15, last = entry >> 28;
-            view_t view = view_splat(load_splat(geometry + i * GEOMETRY), u, v, sizes, job.tile);
-            global const float *looks = appearance + i * sizes.transmitters * APPEARANCE;
-            lanes footprints[ROWS];
-            for (uint r = first; r <= last; r++) footprints[r] = footprint(offsets_of(&view, r));
+        if (checkpoints) {
             for (int t = 0; t < job.count; t++)
-                for (uint r = first; r <= last; r++) blend(maps + t, r, footprints[r], looks + t * APPEARANCE);
+                for (int r = 0; r < ROWS; r++)
+                    *(global loose_lanes *)(checkpoints + find_row(job.checkpoint, t, r)) = maps[t].transmittance[r];
+            job.checkpoint++;
+        }
+        for (int pause = LEAST(k + CHUNK, job.end); k < pause; k++) {
+            entry_t entry = unpack(entries[k]);
+            view_t view = view_splat(load_splat(geometry + entry.splat * GEOMETRY), u, v, sizes, job.tile);
+            global const float *looks = appearance + entry.splat * sizes.transmitters * APPEARANCE;
+            lanes footprints[ROWS];
+            for (uint r = entry.first; r <= entry.last; r++) footprints[r] = footprint(offsets_of(&view, r));
+            for (int t = 0; t < job.count; t++)
+                for (uint r = entry.first; r <= entry.last; r++)
+                    blend(maps + t, r, footprints[r], looks + t * APPEARANCE);
         }
         for (done = 0; done < job.count; done++) {
             float dark = largest(maps[done].transmittance, ROWS);
@@ -108,7 +123,7 @@ kernel void forward(sizes_t sizes, global const float *u, global const float *v,
             if (!(dark * loudest[job.first + done] <= NEGLIGIBLE * bright)) break;
         }
     }
-    stops[get_global_id(0)] = k;
+    ends[get_global_id(0)] = k;
     for (int t = 0; t < job.count; t++)
         for (int r = 0; r < ROWS; r++) {
             store_row(maps[t].transmittance[r], left + (job.first + t) * area, sizes, job, r);

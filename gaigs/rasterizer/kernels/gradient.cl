@@ -1,48 +1,64 @@
-/* The way back: front to back once more through the entries of a tile, and from its pixels to the splats. */
+/* The way back: from the pixels of a tile to its entries, back to front, and from entries to splats.
+ *
+ * With D = signal . gradient at a pixel, and R_i the gradient with respect to the transmittance behind splat i, what
+ * all behind it gives for each unit of light that gets there:
+ *
+ *   P_i = d_i^{G_i} R_i        R_{i-1} = P_i + A_i (D_i - P_i)        R_last = gradient_left
+ *   d/dA_i = T_i (D_i - P_i)   d/d(log d_i) = G_i T_i (1 - A_i) P_i
+ *
+ * No division and no small difference of large sums: a float's digits last. T is found by going front to back once more
+ * from the checkpoint of each chunk.
+ */
 
 /* What a tile hands back to an entry: moments of the gradient, then each transmitter's gradient of the appearance. */
 #define MOMENTS 5
 #define PARTIALS (MOMENTS + TRANSMITTERS * APPEARANCE)
 
-/* One transmitter's state over a tile: T, S and the gradient of the map. */
+/* A chunk of entries: footprints, and the gradients of their logarithm summed over transmitters; for one transmitter at
+ * a time A, the transmittance before, and d^G. */
 typedef struct {
-    lanes transmittance[ROWS], behind[ROWS], gradient[CHANNELS][ROWS];
-} state_t;
+    lanes footprint[CHUNK][ROWS], flow[CHUNK][ROWS];
+    lanes alpha[CHUNK][ROWS], before[CHUNK][ROWS], attenuation[CHUNK][ROWS];
+} chunk_t;
 
 /* Gradients of one splat's appearance, summed over rows. */
 typedef struct {
     lanes opacity, attenuation, signal[CHANNELS];
 } found_t;
 
-/* Passes an entry at one row, and returns the gradient of log G.
- *
- * With D = signal . gradient at a pixel, and S_i = sum_{j>i} D_j A_j T_j + left gradient_left what all behind it adds,
- *
- *   d/dA_i = T_i D_i - S_i / (1 - A_i)        d/d(log d_i) = G_i S_i
- *
- * S starts as the whole, image . gradient + left gradient_left, and loses a splat's own part when the splat is passed,
- * so that the walk is the forward's own. Where A is clamped, d/dA goes nowhere. */
-static inline lanes pass(state_t *state, int r, lanes g, global const float *look, found_t *found) {
-    lanes raw = g * look[0], before = state->transmittance[r], d = 0;
-    masks acts = ~(raw < ALPHA_MIN);
-    lanes alpha = MASKED(acts, LEAST(raw, ALPHA_MAX)), weight = alpha * before;
+/* Front to back through one row of an entry. */
+static inline void pass_forward(chunk_t *chunk, int k, int r, lanes *transmittance, global const float *look) {
+    lanes g = chunk->footprint[k][r], alpha = alpha_of(g, look), before = *transmittance;
+    lanes after = before - alpha * before;
+    chunk->alpha[k][r] = alpha;
+    chunk->before[k][r] = before;
+#if ATTENUATION
+    lanes attenuation = attenuation_of(g, alpha, look);
+    chunk->attenuation[k][r] = attenuation;
+    after *= attenuation;
+#endif
+    *transmittance = after;
+}
+
+/* Back to front through one row of an entry; channels of the gradient lie ROWS apart. */
+static inline void pass_back(chunk_t *chunk, int k, int r, lanes *behind, const lanes *gradient,
+                             global const float *look, found_t *found) {
+    lanes alpha = chunk->alpha[k][r], before = chunk->before[k][r], weight = alpha * before, d = 0, p = *behind;
 #pragma unroll
     for (int c = 0; c < CHANNELS; c++) {
-        d += state->gradient[c][r] * look[1 + ATTENUATION + c];
-        found->signal[c] += state->gradient[c][r] * weight;
+        d += gradient[c * ROWS] * look[1 + ATTENUATION + c];
+        found->signal[c] += gradient[c * ROWS] * weight;
     }
-    lanes behind = state->behind[r] - weight * d, after = before - weight;
-    lanes flow = MASKED(~(raw >= ALPHA_MAX), alpha * (before * d - behind / (1 - alpha)));
-    found->opacity += flow;
 #if ATTENUATION
-    lanes covered = MASKED(acts, g * behind);
+    p *= chunk->attenuation[k][r];
+    lanes covered = MASKED(alpha != 0, chunk->footprint[k][r] * (before - weight) * p);
     found->attenuation += covered;
-    flow += covered * (look[1] * 0.693147181f); /* log d */
-    after *= power_of_two(MASKED(acts, g * look[1]));
+    chunk->flow[k][r] += covered * (look[1] * 0.693147181f); /* log d */
 #endif
-    state->behind[r] = behind;
-    state->transmittance[r] = after;
-    return flow;
+    lanes gain = d - p, flow = MASKED(~(alpha >= ALPHA_MAX), weight * gain); /* a clamped A does not move */
+    found->opacity += flow;
+    chunk->flow[k][r] += flow;
+    *behind = p + alpha * gain;
 }
 
 /* Moments of the gradient of log G over the pixels, in whitened coordinates: centre and covariance follow from them. */
@@ -51,7 +67,7 @@ typedef struct {
 } moments_t;
 
 static inline void add_moments(moments_t *moments, lanes flow, offsets_t at) {
-#if SEPARABLE
+#if SEPARABLE /* s is the same in all rows: it comes in when they are summed up */
     lanes flow_y = flow * at.y;
     moments->s += flow;
     moments->y += flow_y;
@@ -66,65 +82,93 @@ static inline void add_moments(moments_t *moments, lanes flow, offsets_t at) {
 #endif
 }
 
+/* One row of a tile from an image; pixels beyond its edges read 0. */
+static inline lanes load_row(global const float *image, sizes_t sizes, job_t job, int row) {
+    global const float *pixels = image + (job.y + row) * sizes.width + job.x;
+    int inside = job.y + row < sizes.height ? sizes.width - job.x : 0;
+    if (inside >= COLUMNS) return *(global const loose_lanes *)pixels;
+    float value[COLUMNS];
+    for (int x = 0; x < COLUMNS; x++) value[x] = x < inside ? pixels[x] : 0;
+    return *(loose_lanes *)value;
+}
+
+static inline float sum(lanes v) {
+    float4 a = v.lo + v.hi;
+    float2 b = a.lo + a.hi;
+    return b.lo + b.hi;
+}
+
 kernel void backward(sizes_t sizes, global const float *u, global const float *v, global const int *offsets,
                      global const int *counts, global const uint *entries, global const float *geometry,
-                     global const float *appearance, global const float *image, global const float *left,
-                     global const float *image_gradient, global const float *left_gradient, global const int *stops,
-                     global float *partials) {
+                     global const float *appearance, global const int *ends, global const float *checkpoints,
+                     global const float *image_gradient, global const float *left_gradient, global float *partials) {
     job_t job = find_job(sizes, get_global_id(0), offsets, counts);
-    int area = sizes.height * sizes.width, stop = stops[get_global_id(0)];
+    int area = sizes.height * sizes.width, end = ends[get_global_id(0)];
     if (sizes.sets > 1)
         geometry += job.first * sizes.words * 32 * GEOMETRY;
     else
         partials += get_global_id(0) / (sizes.down * sizes.across) * (size_t)sizes.entries * PARTIALS;
     appearance += job.first * APPEARANCE;
-    state_t states[TRANSMITTERS];
-    for (int t = 0; t < job.count; t++) {
-        int plane = (job.first + t) * area;
+    lanes behind[TRANSMITTERS][ROWS], gradient[TRANSMITTERS][CHANNELS][ROWS];
+    for (int t = 0; t < job.count; t++)
         for (int r = 0; r < ROWS; r++) {
-            states[t].transmittance[r] = 1;
-            states[t].behind[r] = load_row(left + plane, sizes, job, r);
-            states[t].behind[r] *= load_row(left_gradient + plane, sizes, job, r);
-            for (int c = 0; c < CHANNELS; c++) {
-                int channel = plane * CHANNELS + c * area;
-                states[t].gradient[c][r] = load_row(image_gradient + channel, sizes, job, r);
-                states[t].behind[r] += states[t].gradient[c][r] * load_row(image + channel, sizes, job, r);
+            behind[t][r] = load_row(left_gradient + (job.first + t) * area, sizes, job, r);
+            for (int c = 0; c < CHANNELS; c++)
+                gradient[t][c][r] = load_row(image_gradient + ((job.first + t) * CHANNELS + c) * area, sizes, job, r);
+        }
+    for (size_t p = (size_t)end * PARTIALS; p < (size_t)job.end * PARTIALS; p++) partials[p] = 0;
+
+    chunk_t chunk;
+    view_t views[CHUNK];
+    for (int number = (end - job.begin + CHUNK - 1) / CHUNK - 1; number >= 0; number--) {
+        int begin = job.begin + number * CHUNK, count = LEAST(end - begin, CHUNK);
+        global float *partial = partials + (size_t)begin * PARTIALS;
+        for (int k = 0; k < count; k++) {
+            entry_t entry = unpack(entries[begin + k]);
+            views[k] = view_splat(load_splat(geometry + entry.splat * GEOMETRY), u, v, sizes, job.tile);
+            for (uint r = entry.first; r <= entry.last; r++) {
+                chunk.footprint[k][r] = footprint(offsets_of(views + k, r));
+                chunk.flow[k][r] = 0;
             }
         }
-    }
-    for (int k = job.begin; k < stop; k++) {
-        uint entry = entries[k], i = entry & 0xffffff, first = entry >> 24 & 15, last = entry >> 28;
-        view_t view = view_splat(load_splat(geometry + i * GEOMETRY), u, v, sizes, job.tile);
-        global const float *looks = appearance + i * sizes.transmitters * APPEARANCE;
-        global float *partial = partials + (size_t)k * PARTIALS;
-        moments_t moments = {0, 0, 0, 0, 0};
-        lanes footprints[ROWS], flows[ROWS];
-        for (uint r = first; r <= last; r++) {
-            footprints[r] = footprint(offsets_of(&view, r));
-            flows[r] = 0;
-        }
         for (int t = 0; t < job.count; t++) {
-            global const float *look = looks + t * APPEARANCE;
-            found_t found = {0};
-            for (uint r = first; r <= last; r++) flows[r] += pass(states + t, r, footprints[r], look, &found);
-            global float *sums = partial + MOMENTS + t * APPEARANCE;
-            sums[0] = sum(found.opacity);
-            if (ATTENUATION) sums[1] = sum(found.attenuation);
-            for (int c = 0; c < CHANNELS; c++) sums[1 + ATTENUATION + c] = sum(found.signal[c]);
+            lanes transmittance[ROWS];
+            for (int r = 0; r < ROWS; r++)
+                transmittance[r] = *(global const loose_lanes *)(checkpoints + find_row(job.checkpoint + number, t, r));
+            for (int k = 0; k < count; k++) {
+                entry_t entry = unpack(entries[begin + k]);
+                global const float *look = appearance + (entry.splat * sizes.transmitters + t) * APPEARANCE;
+                for (uint r = entry.first; r <= entry.last; r++) pass_forward(&chunk, k, r, transmittance + r, look);
+            }
+            for (int k = count - 1; k >= 0; k--) {
+                entry_t entry = unpack(entries[begin + k]);
+                global const float *look = appearance + (entry.splat * sizes.transmitters + t) * APPEARANCE;
+                found_t found = {0};
+                for (uint r = entry.first; r <= entry.last; r++)
+                    pass_back(&chunk, k, r, behind[t] + r, gradient[t][0] + r, look, &found);
+                global float *sums = partial + k * PARTIALS + MOMENTS + t * APPEARANCE;
+                sums[0] = sum(found.opacity);
+                if (ATTENUATION) sums[1] = sum(found.attenuation);
+                for (int c = 0; c < CHANNELS; c++) sums[1 + ATTENUATION + c] = sum(found.signal[c]);
+            }
         }
-        for (uint r = first; r <= last; r++) add_moments(&moments, flows[r], offsets_of(&view, r));
+        for (int k = 0; k < count; k++, partial += PARTIALS) {
+            entry_t entry = unpack(entries[begin + k]);
+            moments_t moments = {0};
+            for (uint r = entry.first; r <= entry.last; r++)
+                add_moments(&moments, chunk.flow[k][r], offsets_of(views + k, r));
 #if SEPARABLE
-        moments.s *= view.s;
-        moments.ss = moments.s * view.s;
-        moments.sy = moments.y * view.s;
+            moments.s *= views[k].s;
+            moments.ss = moments.s * views[k].s;
+            moments.sy = moments.y * views[k].s;
 #endif
-        partial[0] = sum(moments.s);
-        partial[1] = sum(moments.y);
-        partial[2] = sum(moments.ss);
-        partial[3] = sum(moments.sy);
-        partial[4] = sum(moments.yy);
+            partial[0] = sum(moments.s);
+            partial[1] = sum(moments.y);
+            partial[2] = sum(moments.ss);
+            partial[3] = sum(moments.sy);
+            partial[4] = sum(moments.yy);
+        }
     }
-    for (size_t j = (size_t)stop * PARTIALS; j < (size_t)job.end * PARTIALS; j++) partials[j] = 0;
 }
 
 /* Adds up the partial sums of 32 splats over tiles, in the tiles' order, and turns them into gradients of what the host
