@@ -156,7 +156,7 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
     trainer = call("trainer", lightning.Trainer, config["trainer"], **context)
     if trainer.world_size > 1 or trainer.accumulate_grad_batches > 1:
-        raise ValueError("trainer.devices and accumulate_grad_batches must be 1; training.batch_size says what a step is")
+        raise ValueError("trainer.devices and accumulate_grad_batches must be 1; set training.batch_size instead")
     batches = Batches(links, links.split.train, module.batch_size, config["seed"], trainer.max_steps)
     validation = Pass(links, links.split.validation, module.batch_size) if len(links.split.validation) else None
     resume = None

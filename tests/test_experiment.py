@@ -254,8 +254,11 @@ def test_a_run_killed_behind_its_training_only_tests_anew(finished, tmp_path, mo
     assert others["train_seconds"] == trained
 
 
-def test_another_configuration_in_the_same_folder_is_refused(finished):
-    config, folder, _ = finished
+@pytest.mark.parametrize("left", ["last.ckpt", "metrics.json"])
+def test_another_configuration_in_the_same_folder_is_refused(left, finished, tmp_path):
+    config, run, _ = finished
+    folder = shutil.copytree(run, tmp_path / "run")
+    (folder / ({"last.ckpt", "metrics.json"} - {left}).pop()).unlink()
     before = digest(folder)
     other = config | {"seed": 1, "gaussians": config["gaussians"] | {"count": 31}}
     other["model"] = config["model"] | {"gaussians": other["gaussians"]}

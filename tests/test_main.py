@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -18,6 +19,7 @@ import yaml
 import gaigs
 from gaigs import __main__ as command_line
 from gaigs import experiment
+from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
 
 SMALL = (
@@ -119,6 +121,10 @@ def test_a_killed_run_ends_as_if_it_had_not_been(whole, interrupted):
         assert a["global_step"] == b["global_step"]
         assert list(a["state_dict"]) == list(b["state_dict"])
         assert all(torch.equal(a["state_dict"][key], b["state_dict"][key]) for key in a["state_dict"])
+    curves, resumed = (read_curves(sorted(path.glob("log/*/metrics.csv"))) for path in (folder, other))
+    assert curves.keys() == resumed.keys()
+    for name in curves:
+        np.testing.assert_array_equal(curves[name], resumed[name], name)
 
 
 # --- within this process, as a start takes seconds ---

@@ -1,5 +1,6 @@
 """The spatial spectrum: the map's magnitude."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -21,8 +22,5 @@ class Spectrum(nn.Module):
         self.channels = channels
 
     def forward(self, image: Float[Tensor, "b c rows columns"]) -> Float[Tensor, "b rows columns"]:
-        """The predicted spectrum.
-
-        ``vector_norm`` takes the subgradient 0 where the map is 0.
-        """
-        return image.norm(dim=1)
+        """The predicted spectrum; where the map is 0, so is its gradient."""
+        return image[:, 0].abs() if self.channels == 1 else torch.complex(*image.unbind(1)).abs()

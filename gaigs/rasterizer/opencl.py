@@ -220,20 +220,21 @@ class _Render:
         self._run("prepare", sets * words, order, *inputs, geometry, boxes, appearance)
 
         u, v = (self._share(coordinate) for coordinate in _whole_tiles(plane, down, across, separable))
-        bits, ranks = self._empty(self.lists * words), self._empty(self.lists * words)
+        marks = self._empty(self.lists * words * 2)
         counts = np.empty(self.lists, np.int32)
         shared_counts = self._share(counts)
-        self._run("mark", self.lists, u, v, boxes, bits, shared_counts)
+        self._run("mark", self.lists, u, v, boxes, marks, shared_counts)
         self._finish(shared_counts)
         offsets = self._share(np.cumsum(counts, dtype=np.int32) - counts)
         self.sizes.entries = counts.sum()
         entries = self._empty(self.sizes.entries)
-        self._run("list", self.lists, u, v, geometry, offsets, bits, ranks, entries, shared_counts)
+        self._run("list", self.lists, u, v, geometry, offsets, marks, entries, shared_counts)
         self.scene = u, v, offsets, shared_counts, entries, geometry, appearance
-        self.inverse = order, bits, ranks, geometry, appearance
+        self.inverse = order, marks, geometry, appearance
         self.loudest = self._share(np.abs(signal.detach().numpy()).max((1, 2), initial=0))
 
-    def forward(self, differentiate=False):
+    def forward(self, differentiate):
+        """The map and the transmittance; to ``differentiate``, checkpoints for the way back are kept."""
         sizes = self.sizes
         image = torch.empty(sizes.transmitters, self.channels, sizes.height, sizes.width)
         left = torch.empty(sizes.transmitters, sizes.height, sizes.width)

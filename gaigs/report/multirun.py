@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
@@ -22,6 +23,9 @@ COSTS = {
     "inference_ms": "inference [ms]",
 }
 """What a reader calls the costs of ``metrics.json``."""
+
+WRITTEN_ONLY = ("ssim_mean", "ssim_p10", "ssim_p90", "num_gaussians")
+"""Columns for which a terminal has no room."""
 
 
 class Run(NamedTuple):
@@ -109,7 +113,7 @@ def report(folder: Path) -> Table:
         folder: Of a Hydra multirun.
 
     Returns:
-        The table, for the terminal.
+        The table, for a terminal of 80 columns: without ``WRITTEN_ONLY``, and without the status if nothing failed.
 
     Raises:
         FileNotFoundError: The folder holds no run.
@@ -131,11 +135,15 @@ def report(folder: Path) -> Table:
     if any(run.metrics is not None for run in runs):
         _speed(runs, rows, shared).savefig(folder / "speed_against_error.png", dpi=DPI)
 
-    table = Table(title=f"Runs of {escape(str(folder))}", caption=escape(caption))
-    for column, head in zip(columns, heads, strict=True):
-        table.add_column(escape(head), justify="right" if column in METRICS | COSTS else "left")
+    failed = any(row["status"] == "failed" for row in rows)
+    shown = [i for i, column in enumerate(columns) if column not in WRITTEN_ONLY and (column != "status" or failed)]
+    caption += "; all columns in ablation.md"
+    table = Table(title=f"Runs of {escape(str(folder))}", caption=escape(caption), box=SIMPLE_HEAD, pad_edge=False)
+    for i in shown:
+        table.add_column(escape(heads[i]), justify="right" if columns[i] in METRICS | COSTS else "left")
     for row, line in zip(rows, cells, strict=True):
-        table.add_row(*map(escape, line), style={"failed": "red", "look-up": "dim"}.get(row["status"]))
+        style = {"failed": "red", "look-up": "dim"}.get(row["status"])
+        table.add_row(*(escape(line[i]) for i in shown), style=style)
     return table
 
 

@@ -86,7 +86,7 @@ def test_failed_runs_stay_and_lookups_come_once(tmp_path):
     assert [row["num_gaussians"] for row in rows[:4]] == ["2000", "", "", "2000"]
     assert (rows[0]["train_seconds"], rows[0]["inference_ms"], rows[0]["num_parameters"]) == ("60.5", "17.25", "123456")
     assert table.row_count == 6
-    assert table.caption == "experiment=spectrum, data=rfid, split=official, device=cpu"
+    assert table.caption == "experiment=spectrum, data=rfid, split=official, device=cpu; all columns in ablation.md"
     markdown = (tmp_path / "ablation.md").read_text().splitlines()
     assert len({line.count("|") for line in markdown[:8]}) == 1
     assert markdown[3].startswith("| 1 | failed |  | multiview | 1 |")

@@ -1,8 +1,9 @@
 /* Which splats reach which tile.
  *
  * Lists come in sets: one a transmitter, or one for all where covariances are shared. In each, a tile owns a row of
- * bits, one a splat, and a run of entries: the splats that reach the tile, front to back, with the rows each reaches.
- * The rank of a bit leads from the splat to the entry, and so the gradient finds its way back without atomics.
+ * marks, words of one bit a splat, and a run of entries: the splats that reach the tile, front to back, with the rows
+ * each reaches. Beside a word stands the place of its first entry: so the gradient finds from splats to entries without
+ * atomics.
  */
 
 /* Packs 32 splats of one set at their places in depth order:
@@ -93,7 +94,7 @@ static inline span_t span_tile(global const float *u, global const float *v, siz
 
 /* Marks the splats whose box meets one tile of one set. */
 kernel void mark(sizes_t sizes, global const float *u, global const float *v, global const float *boxes,
-                 global uint *bits, global int *counts) {
+                 global uint2 *marks, global int *counts) {
     int tiles = sizes.down * sizes.across, padded = sizes.words * 32, count = 0;
     global const float *box = boxes + get_global_id(0) / tiles * 4 * padded;
     span_t span = span_tile(u, v, sizes, get_global_id(0) % tiles);
@@ -106,7 +107,7 @@ kernel void mark(sizes_t sizes, global const float *u, global const float *v, gl
             hits |= hit << j;
             count += hit;
         }
-        bits[get_global_id(0) * sizes.words + word] = hits;
+        marks[get_global_id(0) * sizes.words + word].x = hits;
     }
     counts[get_global_id(0)] = count;
 }
@@ -144,22 +145,20 @@ static inline entry_t unpack(uint entry) { return (entry_t){entry & 0xffffff, en
 
 /* Lists one tile of one set. Bits of ellipses that miss are cleared. */
 kernel void list(sizes_t sizes, global const float *u, global const float *v, global const float *geometry,
-                 global const int *offsets, global uint *bits, global int *ranks, global uint *entries,
-                 global int *counts) {
+                 global const int *offsets, global uint2 *marks, global uint *entries, global int *counts) {
     int tiles = sizes.down * sizes.across, entry = offsets[get_global_id(0)];
     geometry += get_global_id(0) / tiles * sizes.words * 32 * GEOMETRY;
     span_t span = span_tile(u, v, sizes, get_global_id(0) % tiles);
+    marks += get_global_id(0) * sizes.words;
     for (int word = 0; word < sizes.words; word++) {
-        int at = get_global_id(0) * sizes.words + word;
-        uint kept = 0;
-        ranks[at] = entry;
-        for (uint left = bits[at]; left; left &= left - 1) {
+        uint kept = 0, rank = entry;
+        for (uint left = marks[word].x; left; left &= left - 1) {
             uint i = word * 32 + LOWEST(left), rows = rows_touched(load_splat(geometry + i * GEOMETRY), span);
             if (!rows) continue;
             entries[entry++] = i | LOWEST(rows) << 24 | HIGHEST(rows) << 28;
             kept |= left & -left;
         }
-        bits[at] = kept;
+        marks[word] = (uint2)(kept, rank);
     }
     counts[get_global_id(0)] = entry - offsets[get_global_id(0)];
 }

@@ -179,25 +179,25 @@ kernel void backward(sizes_t sizes, global const float *u, global const float *v
  *   d(log G)/d(mean) = L^-T z / h        d(log G)/dC = L^-T z z' L^-1 / (2 h^2)
  *
  * and L^-T / h = [across, -shear; 0, along] / h^2. */
-kernel void gather(sizes_t sizes, global const int *order, global const uint *bits, global const int *ranks,
-                   global const float *geometry, global const float *appearance, global const float *partials,
-                   global float *means, global float *covariances, global float *signal, global float *opacities,
+kernel void gather(sizes_t sizes, global const int *order, global const uint2 *marks, global const float *geometry,
+                   global const float *appearance, global const float *partials, global float *means,
+                   global float *covariances, global float *signal, global float *opacities,
                    global float *attenuations) {
     int word = get_global_id(0), rest = sizes.splats - word * 32, size = LEAST(rest, 32);
-    int tiles = sizes.down * sizes.across, shared_set = sizes.sets == 1;
+    int tiles = sizes.down * sizes.across, together = sizes.sets == 1; /* one set of lists, walked by every group */
     float sums[32][PARTIALS], centres[32][2];
     for (int j = 0; j < 32; j++) centres[j][0] = centres[j][1] = 0;
     for (int group = 0; group < sizes.groups; group++) {
-        int set = shared_set ? 0 : group, first = group * sizes.group;
+        int set = together ? 0 : group, first = group * sizes.group;
         for (int j = 0; j < size; j++)
-            for (int p = shared_set && group ? MOMENTS : 0; p < PARTIALS; p++) sums[j][p] = 0;
+            for (int p = together && group ? MOMENTS : 0; p < PARTIALS; p++) sums[j][p] = 0;
         for (int tile = 0; tile < tiles; tile++) {
-            int at = (set * tiles + tile) * sizes.words + word;
-            global const float *partial = partials + (size_t)ranks[at] * PARTIALS;
-            for (uint left = bits[at]; left; left &= left - 1, partial += PARTIALS)
+            uint2 mark = marks[(set * tiles + tile) * sizes.words + word];
+            global const float *partial = partials + (size_t)mark.y * PARTIALS;
+            for (uint left = mark.x; left; left &= left - 1, partial += PARTIALS)
                 for (int p = 0; p < PARTIALS; p++) sums[LOWEST(left)][p] += partial[p];
         }
-        if (shared_set) partials += (size_t)sizes.entries * PARTIALS;
+        if (together) partials += (size_t)sizes.entries * PARTIALS;
         for (int j = 0; j < size; j++) {
             int i = word * 32 + j, to = order[i];
             for (int t = first; t < LEAST(first + sizes.group, sizes.transmitters); t++) {
@@ -210,7 +210,7 @@ kernel void gather(sizes_t sizes, global const int *order, global const uint *bi
 #endif
                 for (int c = 0; c < CHANNELS; c++) signal[at * CHANNELS + c] = found[1 + ATTENUATION + c];
             }
-            if (shared_set && group < sizes.groups - 1) continue;
+            if (together && group < sizes.groups - 1) continue;
             splat_t splat = load_splat(geometry + (set * sizes.words * 32 + i) * GEOMETRY);
             const float inverse = 1.38629436f; /* 1 / h^2 */
             float a = splat.across, b = splat.along, k = splat.shear;
