@@ -139,7 +139,7 @@ SCENES = {
     "one channel": lambda: random_scene(c=1),
     "eight channels": lambda: random_scene(c=8),
     "one transmitter": lambda: random_scene(b=1),
-    "many transmitters": lambda: random_scene(n=30, b=19),
+    "many transmitters": lambda: random_scene(b=19, spread=(1.0, 2.0)),
     "one splat": lambda: random_scene(n=1),
     "no transmitter": lambda: random_scene(b=0),
     "nothing visible": lambda: random_scene(opacities=(0.0, 0.0)),
@@ -201,6 +201,14 @@ def test_agrees_with_the_dense_float64_rasterizer(name):
 
 def largest(tensor: torch.Tensor) -> float:
     return tensor.abs().max().item() if tensor.numel() else 0.0
+
+
+def test_the_transmittance_is_right_where_nothing_is_heard():
+    scene = random_scene(n=120, spread=(3.0, 30.0), opacities=(0.1, 0.3))
+    arguments = scene.splats, torch.zeros_like(scene.signal), scene.opacities, None, scene.plane
+    _, left = opencl.OpenCLRasterizer()(*arguments)
+    _, true_left = rasterize(*arguments)
+    torch.testing.assert_close(left, true_left.float(), rtol=0, atol=VALUES)
 
 
 def test_no_splat_leaves_an_empty_map():
