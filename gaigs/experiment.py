@@ -147,7 +147,7 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
     timer, keep_last = Timer(), KeepLast(last, config["save_every"])
     callbacks = [timer, KeepBest(best, module.patience), keep_last]  # Lightning puts the last two behind all others
     if module.density is not None:
-        callbacks.append(call("training.density", DensityControl, module.density, seed=config["seed"]))
+        callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))
     if config["trainer"].get("enable_progress_bar", True):
         callbacks.append(ProgressLine())
     loggers = [CSVLogger(folder, "log")]
@@ -162,7 +162,9 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
     resume = None
     if last.is_file():
         resume = last
-        log.info("going on after step %d", checkpoint.read(last)["global_step"])
+        content = checkpoint.read(last)
+        check_same_links(content[checkpoint.KEY], identity, last)
+        log.info("going on after step %d", content["global_step"])
     handler = signal.signal(signal.SIGINT, keep_last.interrupt)
     try:
         with warnings.catch_warnings():
@@ -178,6 +180,21 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
     log.info("trained %d steps of %d transmitters in %.0f s: %.1f steps/s", steps, size, seconds, steps / seconds)
     module.load_state_dict(checkpoint.read(best)["state_dict"])
     return model.eval().to(trainer.strategy.root_device), seconds
+
+
+def check_same_links(there: dict, here: dict, path: Path) -> None:
+    """Sees to it that a training goes on with the links it began with, so that none of the test has been trained on.
+
+    Raises:
+        ValueError: The split or the transmitters are others.
+    """
+    parts = ("train", "validation", "test")
+    same = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
+    if not same or any(not torch.equal(there["scene"][corner], here["scene"][corner]) for corner in ("lower", "upper")):
+        raise ValueError(
+            f"{path} must be of these very data to go on, but they have another split or other transmitters now; "
+            "choose another folder with hydra.run.dir=DIR"
+        )
 
 
 def test(model: Model, name: str, links: Links, folder: Path) -> dict[str, dict[str, float]]:

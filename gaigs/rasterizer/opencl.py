@@ -63,6 +63,8 @@ class OpenCLRasterizer:
             RuntimeError: The device cannot build the kernels.
         """
         _check(splats, signal, opacities, attenuations, plane)
+        if not len(signal):  # nothing to wait for, so nothing may be enqueued
+            return signal.new_zeros(0, signal.shape[2], *plane.shape), signal.new_ones(0, *plane.shape)
         # What autograd differentiates has to be an argument of its own; `_Render` finds it in the splats.
         inputs = splats.means2d, splats.covariances2d, signal, opacities, attenuations
         return _Composite.apply(_queue(self.device), splats, plane, torch.is_grad_enabled(), *inputs)

@@ -10,6 +10,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from gaigs import density
+from gaigs.training.metrics import spectrum_scores
 
 
 class DensityControl(Callback):
@@ -38,7 +39,7 @@ class DensityControl(Callback):
         self, every: int, start: int, stop: int, gradient: float, wide: float, opacity: float, most: int, seed: int
     ):
         if every < 1:
-            raise ValueError(f"training.density.every must be at least 1 step, got {every}")
+            raise ValueError(f"density.every must be at least 1 step, got {every}")
         self.every, self.start, self.stop = every, start, stop
         self.gradient, self.wide, self.opacity, self.most, self.seed = gradient, wide, opacity, most, seed
         self.pull = torch.zeros(0)
@@ -52,7 +53,7 @@ class DensityControl(Callback):
 
     def on_fit_start(self, trainer, module) -> None:
         if not hasattr(module.model, "gaussians"):
-            raise ValueError("training.density needs a model with Gaussians, and this one has none; set it to null")
+            raise ValueError("density needs a model with Gaussians, and this one has none; set density=null")
 
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
         gaussians = module.model.gaussians
@@ -124,6 +125,20 @@ class KeepBest(Checkpoint):
         else:
             self.waited += 1
         self._stop_in_time(trainer)
+
+    @torch.no_grad()
+    def on_train_end(self, trainer, module) -> None:
+        """The last step counts too, where no validation was due at it."""
+        if not trainer.enable_validation or trainer.global_step % trainer.val_check_batch == 0:
+            return
+        module.eval()
+        batches = (batch.to(module.device) for batch in trainer.val_dataloaders)
+        scores = [spectrum_scores(batch.labels, module.model(batch).label)["ssim"] for batch in batches]
+        module.train()
+        ssim = torch.cat(scores).mean().item()
+        if ssim > self.best:
+            self.best = ssim
+            save(trainer, self.path)
 
     def on_fit_end(self, trainer, module) -> None:
         if self.best == -math.inf:
