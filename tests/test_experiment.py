@@ -378,3 +378,14 @@ def test_data_are_only_read(rfid, tmp_path):
 def test_data_that_are_not_there_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere must be the folder of a data set"):
         experiment.run(measured(tmp_path / "nowhere"), tmp_path)
+
+
+def test_another_split_in_the_same_folder_is_refused():
+    links = {"split": {"train": torch.tensor([0, 1]), "validation": torch.tensor([2]), "test": torch.tensor([3])}}
+    links["scene"] = {"lower": torch.zeros(3), "upper": torch.ones(3)}
+    experiment.check_same_links(links, links, Path("last.ckpt"))
+    exchanged = links | {"split": links["split"] | {"train": torch.tensor([0, 3]), "test": torch.tensor([1])}}
+    moved = links | {"scene": {"lower": torch.zeros(3), "upper": 2 * torch.ones(3)}}
+    for others in (exchanged, moved):
+        with pytest.raises(ValueError, match=r"last\.ckpt must be of these very data"):
+            experiment.check_same_links(links, others, Path("last.ckpt"))

@@ -55,7 +55,7 @@ class Projection(ABC):
 
     A projection is a smooth map from directions to the plane, ``coordinates``; a Gaussian's footprint there is that of
     the map's linearisation at its centre, ``jacobian`` (EWA splatting). To it comes the variance of a square pixel,
-    so that a splat narrower than a pixel is not lost between two pixel centres (docs/methods.md: not on Mercator at height).
+    so that a splat narrower than a pixel is not lost between two pixel centres; docs/methods.md says where that fails.
 
     Args:
         pixel: Edge of that pixel, the pitch of the label's grid [rad].

@@ -11,21 +11,22 @@ ALPHA_MIN = 1 / 255
 """A splat acts on a pixel where its opacity a G is at least this, the field's customary bound (one grey level)."""
 
 ALPHA_MAX = 0.99
-"""Largest opacity a G of one splat at a pixel, the field's customary bound: log(1 - a G) stays finite, and the gradient's
-division by (1 - a G) costs two of float32's seven digits at the most."""
+"""Largest opacity a G of one splat at a pixel, the field's customary bound: log(1 - a G) stays finite, and dividing by
+(1 - a G) in a gradient costs two of float32's seven digits at the most."""
 
 
 class Rasterizer(Protocol):
     """The contract of kind ``rasterizer``.
 
-    Front to back by ``depths`` (ties by index), with a_i the effective opacity in [0, 1], d_i the attenuation in (0, 1],
-    G_i the footprint exp(-x' C^-1 x / 2) at the pixel, A_i = min(a_i G_i, ALPHA_MAX) where that is at least ALPHA_MIN
-    (elsewhere splat i does nothing at this pixel):
+    Front to back by ``depths`` (ties by index), with a_i the effective opacity in [0, 1], d_i the attenuation in
+    (0, 1], G_i the footprint exp(-x' C^-1 x / 2) at the pixel, A_i = min(a_i G_i, ALPHA_MAX) where that is at least
+    ALPHA_MIN (elsewhere splat i does nothing at this pixel):
 
         map = sum_i signal_i A_i T_i        T_i = prod_{j<i} (1 - A_j) d_j^{G_j}
 
-    x is the pixel minus the splat's centre, u taken to the nearest image where the plane is periodic. Splats that are not
-    ``visible`` do nothing. Every input but depths is differentiable: means2d, covariances2d, signal, opacities, attenuations.
+    x is the pixel minus the splat's centre, u taken to the nearest image where the plane is periodic. Splats that are
+    not ``visible`` do nothing. Every input but depths is differentiable: means2d, covariances2d, signal, opacities,
+    attenuations.
 
     Source: GAI-GS, "Mapping, Projection and Render Module"; the area over which d_j acts is ours (docs/methods.md).
     """

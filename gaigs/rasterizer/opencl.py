@@ -63,8 +63,6 @@ class OpenCLRasterizer:
             RuntimeError: The device cannot build the kernels.
         """
         _check(splats, signal, opacities, attenuations, plane)
-        if not len(signal):  # nothing to wait for, so nothing may be enqueued
-            return signal.new_zeros(0, signal.shape[2], *plane.shape), signal.new_ones(0, *plane.shape)
         # What autograd differentiates has to be an argument of its own; `_Render` finds it in the splats.
         inputs = splats.means2d, splats.covariances2d, signal, opacities, attenuations
         return _Composite.apply(_queue(self.device), splats, plane, torch.is_grad_enabled(), *inputs)
@@ -284,6 +282,7 @@ class _Render:
         """Waits until what kernels wrote into the host's memory is there."""
         for buffer in filter(None, buffers):
             cl.enqueue_map_buffer(self.queue, buffer, cl.map_flags.READ, 0, (buffer.size,), np.uint8)
+        self.queue.finish()  # no kernel outlives the host's memory, not even where there was no output to wait for
 
 
 def _literal(value: float) -> str:

@@ -21,8 +21,8 @@ def write_figures(folder: Path, links: Links, gaussians: Gaussians | None) -> li
     """Draws a run: its room, its losses, and for spectra some examples and how SSIM is distributed.
 
     Args:
-        folder: Of the run. ``predictions.npz`` and, where the model was trained, ``log/*/metrics.csv`` are read from it;
-            the figures go to ``figures/``.
+        folder: Of the run. ``predictions.npz`` and, where the model was trained, ``log/*/metrics.csv`` are read from
+            it; the figures go to ``figures/``.
         links: What the run was trained and tested on.
         gaussians: The Gaussians it learnt; None for a model without.
 

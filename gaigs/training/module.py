@@ -32,7 +32,7 @@ class Training(lightning.LightningModule):
         density: Options of ``DensityControl``; None for none.
 
     Raises:
-        ValueError: The model has a group of parameters without a learning rate.
+        ValueError: An option is out of range, or the model has a group of parameters without a learning rate.
 
     Source: GAI-GS, "Results"; optimiser and schedules after the released configuration.
     """
@@ -54,6 +54,15 @@ class Training(lightning.LightningModule):
         density: dict | None,
     ):
         super().__init__()
+        coarsest = min(model.scene.grid.shape) // 3  # which leaves the SSIM's smallest window
+        for option, value, holds, bounds in (
+            ("ssim", ssim, 0 <= ssim <= 1, "in [0, 1]"),
+            ("final_rate", final_rate, 0 < final_rate <= 1, "in (0, 1]"),
+            ("warmup", warmup, warmup >= 0, "at least 0 steps"),
+            ("stride", stride, 1 <= stride <= coarsest, f"in 1..{coarsest} for this grid"),
+        ):
+            if not holds:
+                raise ValueError(f"training.{option} must be {bounds}, got {value}")
         if unset := set(model.parameter_groups()) - set(learning_rates):
             raise ValueError(f"training.learning_rates must give a rate for {', '.join(sorted(unset))}")
         self.model, self.identity, self.seed, self.batch_size = model, identity, seed, batch_size

@@ -141,6 +141,7 @@ def test_impossible_options_are_refused(options, message):
 
 
 def test_a_room_of_one_point_is_refused():
-    scene = Scene((Receiver("gateway", Pose(torch.ones(3), torch.eye(3))),), torch.ones(3), torch.ones(3), 0.1, None, "none")
+    receiver = Receiver("gateway", Pose(torch.ones(3), torch.eye(3)))
+    scene = Scene((receiver,), torch.ones(3), torch.ones(3), 0.1, None, "none")
     with pytest.raises(ValueError, match="one point"):
         GATokenizer(scene)

@@ -181,3 +181,11 @@ def test_a_loss_that_is_not_finite_ends_the_training(module, links, tmp_path):
     module.model.network.bias.data[0] = float("nan")
     with pytest.raises(ValueError, match=r"loss must stay finite, got nan at step 0; lower training\.learning_rates"):
         fit(module, links, tmp_path, 3)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("ssim", 2), ("final_rate", 0), ("warmup", -1), ("stride", 0), ("stride", 40)]
+)
+def test_an_option_out_of_range_is_refused(links, option, value):
+    with pytest.raises(ValueError, match=rf"training\.{option} must be .*, got {value}"):
+        Training(Plane(links.scene), {}, seed=0, **OPTIONS | {option: value})
