@@ -14,7 +14,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="folder that Hydra made for python -m gaigs --multirun ...")
     try:
         table = report(parser.parse_args().folder)
-    except FileNotFoundError as error:
+    except (FileNotFoundError, ValueError) as error:
         parser.error(str(error))
     Console().print(table)
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
@@ -50,6 +51,12 @@ def read_runs(folder: Path) -> list[Run]:
     """
     runs = []
     for path in folder.glob("*/.hydra/overrides.yaml"):
+        run_config, started = path.parents[1] / "config.yaml", path.parent / "config.yaml"
+        if run_config.is_file() and started.is_file() and _resolved(run_config) != _resolved(started):
+            raise ValueError(
+                f"{run_config.parent} holds a run of another configuration than the one last started there, which was "
+                "refused, and Hydra has rewritten its overrides; start the multirun once more as it was at first"
+            )
         overrides = (override.partition("=") for override in yaml.safe_load(path.read_text()))
         metrics = path.parents[1] / "metrics.json"
         runs.append(
@@ -65,6 +72,10 @@ def read_runs(folder: Path) -> list[Run]:
             "pass the folder that Hydra made for 'python -m gaigs --multirun ...'"
         )
     return sorted(runs, key=lambda run: (int(run.name) if run.name.isdigit() else len(runs), run.name))
+
+
+def _resolved(path: Path) -> dict:
+    return OmegaConf.to_container(OmegaConf.load(path), resolve=True)
 
 
 def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
