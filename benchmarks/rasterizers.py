@@ -3,10 +3,13 @@
     python benchmarks/rasterizers.py
     python benchmarks/rasterizers.py --scene training --splats 200 1000
     python benchmarks/rasterizers.py --device cuda --splats 20000 200000
+    python benchmarks/rasterizers.py --splats 300 1000 3000 10000 30000 --figure rasterizers.png
 
-A pair is a splat, a pixel and a transmitter where the splat's opacity reaches ALPHA_MIN. The ceiling is what the OpenCL
-kernels' arithmetic does with every lane live and every operand at hand: no lists, no rows that miss, no tiles to load.
-Times are medians; judge them by their ratios within one run, as other work on the machine slows all of them.
+A pair is a splat, a pixel and a transmitter where the splat's opacity reaches ALPHA_MIN. It is live if the
+transmittance in front of it is at least STOP. Customary rasterizers leave out the others; torch composites them, opencl
+as far as they change a tile by more than a float's last digit. A floor is the number of pairs times what the OpenCL
+kernels' arithmetic takes for one with every lane live and every operand at hand: no lists, no rows that miss, no tiles
+to load. Times are medians; judge them by their ratios within one run, as other work on the machine slows all of them.
 """
 
 import argparse
@@ -21,7 +24,11 @@ from pathlib import Path
 import numpy as np
 import pyopencl as cl
 import torch
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
@@ -29,6 +36,10 @@ from gaigs.projection import Plane, Splats
 from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, Rasterizer, opencl
 from gaigs.rasterizer.torch import TorchRasterizer
 from gaigs.registry import registry
+from gaigs.report.style import BLUE, COLUMN, DPI, GREEN, GREY, ORANGE, PURPLE, STYLE
+
+STOP = 1e-4
+"""Transmittance below which the rasterizer of 3D Gaussian Splatting (Kerbl et al., 2023) stops at a pixel."""
 
 CEILING = """
 /* One splat that covers a whole tile, passed over and over; memory holds its appearance and its offsets, all small. */
@@ -110,6 +121,11 @@ def training(n: int, device="cpu", dtype=torch.float32) -> Scene:
 
 SCENES = {"common": common, "training": training}
 
+WAYS = "forward", "backward"
+
+SPEED = "forward\n[ms]", "composited\n[ms]", "backward\n[ms]", "torch's\nforward", "torch's\nbackward"
+ACCURACY = "peak [MB]", "error of map", "error of gradients"
+
 
 def _uniform(device, dtype):
     generator = torch.Generator().manual_seed(0)
@@ -123,20 +139,32 @@ def _splats(means: Tensor, deviations: Tensor, uniform) -> Splats:
     return Splats(means, half @ half.mT, depths, depths > 0)
 
 
-def inspect(scene: Scene) -> tuple[int, Tensor]:
-    """How many pairs act, and which pixels (b, rows, columns) are no matter of rounding: no pair is near a bound."""
-    splats, _, opacities, _, plane = scene
-    pairs, clear = 0, torch.ones(len(opacities), *plane.shape, dtype=torch.bool, device=opacities.device)
-    for i in torch.arange(len(splats.means2d), device=opacities.device).split(16):
+def inspect(scene: Scene) -> tuple[int, int, Tensor]:
+    """How many pairs act, how many of them are live, and which pixels (b, rows, columns) are no matter of rounding: no
+    pair is near a bound."""
+    splats, _, opacities, attenuations, plane = scene
+    pairs = live = 0
+    left = torch.ones(len(opacities), *plane.shape, dtype=torch.float64, device=opacities.device)
+    clear = torch.ones_like(left, dtype=torch.bool)
+    for i in splats.depths.argsort(stable=True).split(16):
         du, dv = plane.u - splats.means2d[i, 0, None, None], plane.v - splats.means2d[i, 1, None, None]
         if plane.period is not None:
             du = du - plane.period * (du / plane.period).round()
         a, b, _, d = torch.linalg.inv(splats.covariances2d[:, i]).flatten(-2)[..., None, None].unbind(2)
-        product = opacities[:, i, None, None] * torch.exp(-0.5 * (a * du * du + 2 * b * du * dv + d * dv * dv))
-        pairs += int((product >= ALPHA_MIN).sum())
+        footprints = torch.exp(-0.5 * (a * du * du + 2 * b * du * dv + d * dv * dv))
+        product = opacities[:, i, None, None] * footprints
+        acts = product >= ALPHA_MIN
         for bound in (ALPHA_MIN, ALPHA_MAX):
             clear &= ((product / bound - 1).abs() > 1e-4).all(1)
-    return pairs, clear
+        passed = torch.where(acts, 1 - product.clamp_max(ALPHA_MAX), 1)
+        if attenuations is not None:
+            passed = torch.where(acts, passed * attenuations[:, i, None, None] ** footprints, 1)
+        behind = left[:, None] * passed.double().cumprod(1)
+        before = torch.cat((left[:, None], behind[:, :-1]), 1)
+        pairs += int(acts.sum())
+        live += int((acts & (before >= STOP)).sum())
+        left = behind[:, -1]
+    return pairs, live, clear
 
 
 def run(rasterizer: Rasterizer, scene: Scene, pixels: Tensor) -> tuple[float, float, Tensor, list[Tensor]]:
@@ -222,9 +250,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", choices=SCENES, default="common")
     parser.add_argument("--splats", type=int, nargs="+", default=[1000, 5000, 20000])
-    parser.add_argument("--rasterizers", nargs="+", default=registry("rasterizer").names())
+    names = [name for name in registry("rasterizer").names() if name != "fastest"]  # which is one of the others
+    parser.add_argument("--rasterizers", nargs="+", default=names)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--device", default="cpu", help="torch device of the tensors")
+    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="times against live pairs")
     options = parser.parse_args()
     make_scene = SCENES[options.scene]
 
@@ -242,12 +272,15 @@ def main() -> None:
             console.print(f"{name} is left out: {error}")
     ceiling = Ceiling(small[1].shape[-1], small[3] is not None)
 
-    table = Table("splats", "pairs", "rasterizer", "forward [ms]", "composited [ms]", "of ceiling", "backward [ms]")
-    for column in ("of ceiling", "peak [MB]", "error of map", "of gradients"):
-        table.add_column(column, justify="right")
+    speed = Table("", *map(escape, SPEED), box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    accuracy = Table("", *map(escape, ACCURACY), box=SIMPLE_HEAD, pad_edge=False)
+    for table in (speed, accuracy):
+        for column in table.columns[1:]:
+            column.justify = "right"
+    lines = defaultdict(list)
     for n in options.splats:
         scene = make_scene(n, options.device)
-        pairs, clear = inspect(scene)
+        pairs, live, clear = inspect(scene)
         pixels = clear.to(scene[1])
         times = defaultdict(list)
         for repeat in range(options.repeats + 1):
@@ -257,31 +290,56 @@ def main() -> None:
                 for part, seconds in found.items():
                     if repeat and seconds is not None:  # the first repeat warms up
                         times[name, part].append(1e3 * seconds)
-            for part, way in (("composited", "forward"), ("backward", "backward")):
-                times["ceiling", part].append(1e3 * pairs * ceiling.time_pair(way))
+            for way in WAYS:
+                times["ceiling", way].append(1e3 * ceiling.time_pair(way))
         medians = {key: statistics.median(milliseconds) for key, milliseconds in times.items()}
-        least, least_backward = medians["ceiling", "composited"], medians["ceiling", "backward"]
-        table.add_row(f"{n:,}", f"{pairs:,}", "ceiling", "", f"{least:.2f}", "", f"{least_backward:.2f}")
+        speed.add_row(f"{n:,} splats")
+        for count, kind in ((pairs, "pairs"), (live, "live")):
+            forward, backward = (count * medians["ceiling", way] for way in WAYS)
+            speed.add_row(f"  floor, {count:,} {kind}", "", f"{forward:.2f}", f"{backward:.2f}")
         double = make_scene(n, options.device, torch.float64)
         _, _, truth, true_gradients = run(TorchRasterizer(), double, clear.double())
         for name, rasterizer in rasterizers.items():
+            composited = medians.get((name, "composited"))
+            cells = [f"{medians[name, 'forward']:.2f}", f"{composited:.2f}" if composited else ""]
+            cells.append(f"{medians[name, 'backward']:.2f}")
+            for way in WAYS:
+                cells.append(f"{medians['torch', way] / medians[name, way]:.1f} x" if "torch" in rasterizers else "")
+                lines[name, way].append((live, medians[name, way]))
+            speed.add_row(f"  {name}", *cells)
             _, _, image, gradients = run(rasterizer, scene, pixels)
             with multiprocessing.get_context("spawn").Pool(1) as pool:
                 memory = pool.apply(peak_memory, (name, options.scene, n, options.device))
-            parts = "forward", "backward", "composited"
-            forward, backward, composited = (medians.get((name, part)) for part in parts)
-            table.add_row(
-                *("", "", name),
-                f"{forward:.2f}",
-                f"{composited:.2f}" if composited else "",
-                f"{least / (composited or forward):.0%}",
-                f"{backward:.2f}",
-                f"{least_backward / backward:.0%}",
-                f"{memory:.0f}",
-                f"{_error(image * clear[:, None], truth * clear[:, None]):.1e}",
-                f"{max(map(_error, gradients, true_gradients)):.1e}",
-            )
-    console.print(table)
+            errors = _error(image * clear[:, None], truth * clear[:, None]), max(map(_error, gradients, true_gradients))
+            accuracy.add_row(f"{n:,} splats, {name}", f"{memory:.0f}", *(f"{error:.1e}" for error in errors))
+    console.print(speed, accuracy)
+    if options.figure:
+        draw(lines, options.scene).savefig(options.figure, dpi=DPI)
+
+
+def draw(lines: dict[tuple[str, str], list[tuple[int, float]]], scene: str) -> Figure:
+    """Time against live pairs, both logarithmic.
+
+    Args:
+        lines: (live pairs, time [ms]) by rasterizer and way, "forward" or "backward".
+        scene: Its name.
+    """
+    with rc_context(STYLE):
+        figure = Figure(figsize=(COLUMN, 2.8), layout="constrained")
+        ax = figure.subplots()
+        ax.set(xscale="log", yscale="log", xlabel=f"live pairs, {scene} scene", ylabel="time [ms]")
+        colours = dict(zip((name for name, way in lines if way == "forward"), (BLUE, ORANGE, GREEN), strict=False))
+        label = "cost linear in live pairs"
+        for (name, way), points in lines.items():
+            pairs, milliseconds = np.array(sorted(points)).T
+            look = {"color": colours.get(name, PURPLE), "linewidth": 0.9, "markersize": 5, "markeredgecolor": "white"}
+            ax.plot(pairs, milliseconds, "o-" if way == "forward" else "s-", label=f"{name}, {way}", **look)
+            if way == "forward":  # through its point with most pairs
+                ax.plot(pairs, milliseconds[-1] * pairs / pairs[-1], "--", color=GREY, linewidth=0.9, label=label)
+                label = None  # one entry of the key for all such lines
+        ax.grid()
+        figure.legend(loc="outside upper center", ncols=2)
+    return figure
 
 
 def _error(found: Tensor, truth: Tensor) -> float:

@@ -12,9 +12,25 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gaigs import configuration
+from gaigs.registry import check_type
 
 
 def run(config: DictConfig) -> None:
+    """Does the task of a configuration.
+
+    Raises:
+        CompactHydraException: There is no such task, or it fails for a reason that a user can mend.
+    """
+    match config.get("task"):  # None where it is missing
+        case "train":
+            train(config)
+        case "devices":
+            list_devices()
+        case unknown:
+            raise CompactHydraException(f"gaigs: task must be train or devices, got {unknown!r}")
+
+
+def train(config: DictConfig) -> None:
     """Runs one configuration in Hydra's run folder.
 
     Raises:
@@ -23,8 +39,12 @@ def run(config: DictConfig) -> None:
     """
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        for key, annotation in {"seed": int, "save_every": float, "tensorboard": bool}.items():
+            check_type(key, plain.get(key), annotation)
     except OmegaConfBaseException as error:  # whose message Hydra adds
         raise CompactHydraException("gaigs: the configuration is not complete") from error
+    except TypeError as error:
+        raise CompactHydraException(f"gaigs: {error}") from error
     # Slow to import: here, once the configuration has proved good.
     from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
@@ -42,6 +62,22 @@ def run(config: DictConfig) -> None:
         raise SystemExit(130) from None  # as shells report Ctrl-C
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MisconfigurationException) as error:
         raise CompactHydraException(f"gaigs: {error}") from error
+
+
+def list_devices() -> None:
+    """Prints the OpenCL devices, one a line, and which of them ``rasterizer=opencl`` takes by default.
+
+    Raises:
+        CompactHydraException: There is no OpenCL driver, or GAIGS_OPENCL_DEVICE names no device.
+    """
+    try:
+        from gaigs.rasterizer import opencl  # slow to import
+
+        names, default = opencl.devices(), opencl.default_device()
+    except (ValueError, ImportError, RuntimeError) as error:
+        raise CompactHydraException(f"gaigs: {error}") from error
+    for number, name in enumerate(names):
+        print(f"{name}  <- rasterizer=opencl takes this one" if number == names.index(default) else name)
 
 
 def main() -> None:

@@ -8,18 +8,29 @@ import difflib
 import functools
 import importlib
 import inspect
+import numbers
 import re
 import sys
 import tomllib
+import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, NoneType, UnionType
 
 from omegaconf import OmegaConf
 
 KINDS = ("tokenizer", "projection", "rasterizer", "pooling", "model", "data")
+
+PLAIN = {
+    int: (numbers.Integral, "a whole number"),
+    float: (numbers.Real, "a number"),
+    str: (str, "a string"),
+    bool: (bool, "true or false"),
+    NoneType: (NoneType, "null"),
+}
+"""Annotations that options are checked against: what suits them, and what errors call it. Numbers are no bool."""
 
 
 @dataclass(frozen=True)
@@ -185,12 +196,13 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
         context: What the caller knows and no configuration says; passed where the function has such a parameter.
 
     Raises:
-        TypeError: The options are no mapping.
+        TypeError: The options are no mapping, or one is not what its parameter is annotated as; only annotations in
+            ``PLAIN`` and unions of them are checked.
         ValueError: An option is missing or unknown.
     """
     if not isinstance(options, Mapping):
         raise TypeError(f"{what} must be a mapping of options, got {options!r}")
-    parameters = inspect.signature(function).parameters.values()
+    parameters = _signature(function).parameters.values()
     named = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
     takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters)
     has = [key for key in named if key not in context]
@@ -202,7 +214,34 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
     missing = [key for key, p in named.items() if p.default is p.empty and key not in arguments]
     if missing:
         raise ValueError(f"{what} needs option {_listed(missing)}; it has: {_listed(has)}")
+    for key in options.keys() & named.keys():
+        if options[key] is not named[key].default:  # `width: int = None` is a common shorthand
+            check_type(f"{what} option {key!r}", options[key], named[key].annotation)
     return function(**arguments)
+
+
+def check_type(what: str, value: object, annotation: object) -> None:
+    """Sees to it that a value is what an annotation in ``PLAIN``, or a union of such, says; others say nothing.
+
+    Raises:
+        TypeError: It is not.
+    """
+    is_union = typing.get_origin(annotation) in (typing.Union, UnionType)
+    allowed = typing.get_args(annotation) if is_union else (annotation,)
+    if not all(isinstance(kind, type) and kind in PLAIN for kind in allowed):
+        return
+    if any(isinstance(value, PLAIN[kind][0]) and (kind is bool or not isinstance(value, bool)) for kind in allowed):
+        return
+    words = " or ".join(PLAIN[kind][1] for kind in allowed)
+    whole = int in allowed and isinstance(value, float) and value.is_integer()
+    raise TypeError(f"{what} must be {words}, got {value!r}" + (f"; write {int(value)}" if whole else ""))
+
+
+def _signature(function: Callable) -> inspect.Signature:
+    try:
+        return inspect.signature(function, eval_str=True)
+    except Exception:  # whatever an annotation in quotes raises, e.g. a name that only type checkers import
+        return inspect.signature(function)
 
 
 def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ SMALL = (
     "rasterizer=torch",
     "gaussians.count=30",
     "training.batch_size=7",
-    "training.stride=8",
+    "training.loss.stride=8",
     "trainer.accelerator=cpu",
     "trainer.max_steps=40",
     "trainer.val_check_interval=15",
@@ -132,7 +133,7 @@ def test_a_killed_run_ends_as_if_it_had_not_been(whole, interrupted):
 
 @pytest.fixture
 def run(capsys, monkeypatch, tmp_path):
-    """Runs the command line; gives its exit code and what it says on stderr."""
+    """Runs the command line; gives its exit code and what it says on stderr; ``run.out`` is the rest."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(experiment, "write_figures", lambda *_: None)
     root = logging.getLogger()
@@ -145,7 +146,8 @@ def run(capsys, monkeypatch, tmp_path):
             command_line.main()
         except SystemExit as end:
             code = end.code
-        return code, capsys.readouterr().err
+        run.out, err = capsys.readouterr()
+        return code, err
 
     yield run
     for handler in set(root.handlers) - set(handlers):
@@ -161,12 +163,19 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
     [
         (["tokenizer.anchor=3"], "Key 'anchor' is not in struct"),  # Hydra's own
         (["tokenizer=foo"], "Could not find 'tokenizer/foo'"),
-        (["+experiment=foo"], "Could not find 'experiment/foo'\n\nAvailable options in 'experiment':\n\tspectrum"),
+        (["+experiment=foo"], "Available options in 'experiment':\n\trssi\n\tspectrum"),
         (["+tokenizer.widht=3"], "gaigs: tokenizer 'euclidean' has no option 'widht' (did you mean 'width'?)"),
         (["+trainer.max_step=3"], "gaigs: trainer has no option 'max_step' (did you mean 'max_steps'?)"),
         (["trainer.accelerator=abacus"], "invalid accelerator name: `accelerator='abacus'`"),
         (["trainer.val_check_interval=1.5"], "gaigs: `val_check_interval` should be an integer"),
         (["seed=${sed}"], "gaigs: the configuration is not complete\nInterpolation key 'sed' not found"),
+        (["data.transmitters=4e1"], "gaigs: data 'synthetic' option 'transmitters' must be a whole number, got 40.0"),
+        (["trainer.max_steps=1e1"], "gaigs: trainer option 'max_steps' must be a whole number, got 10.0; write 10"),
+        (["training.batch_size=8.0"], "gaigs: training option 'batch_size' must be a whole number, got 8.0; write 8"),
+        (["save_every=null"], "gaigs: save_every must be a number, got None"),
+        (["seed=1.5"], "gaigs: seed must be a whole number, got 1.5"),
+        (["task=trian"], "gaigs: task must be train or devices, got 'trian'"),
+        (["~task"], "gaigs: task must be train or devices, got None"),
     ],
 )
 def test_what_a_user_can_mend_is_told_without_a_traceback(overrides, message, run):
@@ -174,6 +183,47 @@ def test_what_a_user_can_mend_is_told_without_a_traceback(overrides, message, ru
     assert code == 1
     assert message in err
     assert "Traceback" not in err
+
+
+@pytest.fixture
+def devices(monkeypatch):
+    """Two OpenCL devices, neither of which is asked for; to be changed."""
+    opencl = pytest.importorskip("gaigs.rasterizer.opencl", exc_type=ImportError)
+    kind, platform = opencl.cl.device_type, SimpleNamespace(name="Maker", get_devices=lambda: found)
+    found = [SimpleNamespace(name=name, type=getattr(kind, name), platform=platform) for name in ("GPU", "CPU")]
+    monkeypatch.setattr(opencl.cl, "get_platforms", lambda: [platform])
+    monkeypatch.delenv("GAIGS_OPENCL_DEVICE", raising=False)
+    return found
+
+
+@pytest.mark.usefixtures("devices")
+def test_devices_are_listed_whatever_the_rest_of_the_configuration(run, tmp_path, monkeypatch):
+    mark = "  <- rasterizer=opencl takes this one"
+    monkeypatch.setattr(experiment, "run", None)
+    assert run("task=devices", "data=nerf2_spectrum", "seed=${sed}", *HERE) == (0, "")
+    assert run.out == f"Maker: GPU (GPU)\nMaker: CPU (CPU){mark}\n"
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {".hydra", "gaigs.log"}
+    monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "gpu")
+    assert run("task=devices", *HERE) == (0, "")
+    assert run.out == f"Maker: GPU (GPU){mark}\nMaker: CPU (CPU)\n"
+
+
+def test_devices_that_are_not_there(run, devices, monkeypatch):
+    monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "abacus")
+    code, err = run("task=devices", *HERE)
+    assert code == 1
+    assert "no OpenCL device is called 'abacus'; there are: Maker: GPU (GPU); Maker: CPU (CPU)" in err
+    devices.clear()
+    code, err = run("task=devices", *HERE)
+    assert code == 1
+    assert "gaigs: rasterizer 'opencl' needs an OpenCL driver: pip install 'pyopencl[pocl]'" in err
+    assert "Traceback" not in err
+
+
+def test_of_devices_of_the_same_name_the_first_is_taken(run, devices):
+    devices.append(devices[1])
+    assert run("task=devices", *HERE) == (0, "")
+    assert [line.endswith("takes this one") for line in run.out.splitlines()] == [False, True, False]
 
 
 def test_a_value_that_must_be_set_is_named(run):

@@ -1,11 +1,15 @@
+import math
 import sys
 from pathlib import Path
+from typing import Annotated, Literal, Optional, Union
 
+import numpy as np
 import pytest
+from lightning import Trainer
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs.registry import KINDS, Registry, find_holders, register, registries, registry
+from gaigs.registry import KINDS, Registry, call, find_holders, register, registries, registry
 
 
 class Waveguide:
@@ -142,6 +146,109 @@ def test_build_refuses(models, config, message):
 def test_build_needs_a_mapping(models, config):
     with pytest.raises(TypeError, match="must be a mapping with the key 'name', got"):
         models.build(config)
+
+
+# --- types of options ---
+
+
+def tuned(
+    count: int = 1,
+    width: float = 1.0,
+    name: str = "",
+    on: bool = False,
+    most: int | None = None,
+    rate: Optional[float] = None,  # noqa: UP045
+    every: Union[int, float] = 1,  # noqa: UP007
+    tests: int | bool = 1,
+    shorthand: int = None,  # noqa: RUF013
+    root: str | Path = "",
+    octaves: tuple[int, int] | None = None,
+    heads: list[str] = (),
+    precision: Literal[16, 32] = 32,
+    tagged: Annotated[int, []] = 0,
+    free=None,
+    **rest: int,
+):
+    return {key: value for key, value in locals().items() if key != "rest"} | rest
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("count", 40.0, "a whole number, got 40.0; write 40"),
+        ("count", 0.5, "a whole number, got 0.5"),
+        ("count", math.inf, "a whole number, got inf"),
+        ("count", True, "a whole number, got True"),
+        ("count", "3", "a whole number, got '3'"),
+        ("count", None, "a whole number, got None"),
+        ("count", [3], r"a whole number, got \[3\]"),
+        ("width", False, "a number, got False"),
+        ("width", "wide", "a number, got 'wide'"),
+        ("name", 3, "a string, got 3"),
+        ("on", 1, "true or false, got 1"),
+        ("on", "yes", "true or false, got 'yes'"),
+        ("most", 8.0, "a whole number or null, got 8.0; write 8"),
+        ("rate", "1", "a number or null, got '1'"),
+        ("every", "1", "a whole number or a number, got '1'"),
+        ("every", True, "a whole number or a number, got True"),
+        ("tests", 1.0, "a whole number or true or false, got 1.0; write 1"),
+        ("shorthand", 1.5, "a whole number, got 1.5"),
+    ],
+)
+def test_an_option_of_another_type_is_refused(option, value, message):
+    with pytest.raises(TypeError, match=f"^horn option '{option}' must be {message}$"):
+        call("horn", tuned, {option: value})
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("count", 3),
+        ("count", np.int64(3)),
+        ("width", 3),
+        ("width", np.float32(0.5)),
+        ("name", "3"),
+        ("on", True),
+        ("most", None),
+        ("rate", 2),
+        ("every", 0.5),
+        ("tests", True),
+        ("shorthand", None),
+        ("root", Path("here")),
+        ("root", 3),
+        ("octaves", [0.5, "2"]),
+        ("heads", 3),
+        ("precision", "16"),
+        ("tagged", 0.5),
+        ("free", object()),
+        ("anything", 0.5),
+    ],
+)
+def test_an_option_that_fits_or_cannot_be_checked_passes(option, value):
+    assert call("horn", tuned, {option: value})[option] is value
+
+
+def test_types_of_the_context_are_the_callers_own():
+    assert call("horn", tuned, {}, count=0.5)["count"] == 0.5
+
+
+def test_annotations_in_quotes_are_checked_where_they_can_be_read():
+    def quoted(count: "int", scene: "Scene" = None): ...
+
+    with pytest.raises(ValueError, match="needs option count"):
+        call("horn", quoted, {})
+    call("horn", quoted, {"count": 0.5})  # there is no Scene here
+    quoted.__annotations__["scene"] = "Waveguide"
+    with pytest.raises(TypeError, match=r"'count' must be a whole number, got 0\.5"):
+        call("horn", quoted, {"count": 0.5})
+
+
+def test_options_of_the_trainer_are_checked_as_lightning_annotates_them(tmp_path):
+    options = {"logger": False, "enable_checkpointing": False, "accelerator": "cpu", "enable_model_summary": False}
+    with pytest.raises(TypeError, match=r"'max_steps' must be a whole number, got 10\.0; write 10"):
+        call("trainer", Trainer, options | {"max_steps": 10.0})
+    trainer = call("trainer", Trainer, options | {"max_steps": 10, "limit_val_batches": 0.5}, default_root_dir=tmp_path)
+    assert trainer.max_steps == 10
 
 
 # --- files dropped in ./plugins ---

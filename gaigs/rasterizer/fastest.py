@@ -2,7 +2,6 @@
 
 import logging
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,10 +13,15 @@ log = logging.getLogger(__name__)
 
 @register("rasterizer", "fastest")
 class FastestRasterizer:
-    """``opencl`` for float32 tensors on the CPU where a driver is installed, else ``torch``; the log says which.
+    """``opencl`` for what it takes where a driver is installed, else ``torch``; the log says which.
 
     The two agree to 2e-6 of the image's maximum, so a checkpoint may be rendered by either.
+
+    Attributes:
+        used: Which of the two the last call took, as a run's metrics have it; None before the first.
     """
+
+    used: str | None = None
 
     def __init__(self):
         self.torch = registry("rasterizer").build({"name": "torch"})
@@ -38,5 +42,9 @@ class FastestRasterizer:
         plane: Plane,
     ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
         """The map, and the transmittance left behind the last splat; see ``gaigs.rasterizer.Rasterizer``."""
-        suits = self.opencl is not None and signal.device.type == "cpu" and signal.dtype == torch.float32
-        return (self.opencl if suits else self.torch)(splats, signal, opacities, attenuations, plane)
+        arguments = splats, signal, opacities, attenuations, plane
+        if self.opencl is not None and self.opencl.takes(*arguments):
+            self.used = self.opencl.used
+            return self.opencl(*arguments)
+        self.used = "torch"
+        return self.torch(*arguments)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
+import pyopencl.tools
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -25,6 +26,9 @@ GROUP = 8
 """Transmitters that one work-item composites at most, where they share footprints; more would leave the nearest
 cache."""
 
+CHANNELS, SPLATS = 8, 2**24
+"""More channels than this, or as many splats, are too many."""
+
 
 @register("rasterizer", "opencl")
 class OpenCLRasterizer:
@@ -39,13 +43,31 @@ class OpenCLRasterizer:
             GAIGS_OPENCL_DEVICE, and without it the first CPU, for which the kernels are made.
 
     Raises:
-        RuntimeError: There is no OpenCL driver.
+        RuntimeError: There is no OpenCL driver, or it is broken.
         ValueError: No device has such a name.
     """
 
     def __init__(self, device: str | None = None):
         self.device = device
         _queue(device)
+
+    @property
+    def used(self) -> str:
+        """What a run's metrics call it: its name and its device."""
+        return f"opencl on {_name(_queue(self.device).device)}"
+
+    def takes(
+        self,
+        splats: Splats,
+        signal: Float[Tensor, "b n c"],
+        opacities: Float[Tensor, "b n"],
+        attenuations: Float[Tensor, "b n"] | None,
+        plane: Plane,
+    ) -> bool:
+        """Whether dtype, device and number of what it is given suit it; where they do not, ``torch`` takes them."""
+        floats = splats.means2d, splats.covariances2d, splats.depths, signal, opacities, attenuations, plane.u, plane.v
+        suits = (x is None or (x.dtype == torch.float32 and x.device.type == "cpu") for x in floats)
+        return all(suits) and 1 <= signal.shape[2] <= CHANNELS and signal.shape[1] < SPLATS
 
     def __call__(
         self,
@@ -72,18 +94,35 @@ def devices() -> list[str]:
     """The OpenCL devices of this machine, each as "platform: device (kind)".
 
     Raises:
-        RuntimeError: There is no OpenCL driver.
+        RuntimeError: There is no OpenCL driver, or it is broken.
     """
     return [_name(device) for device in _devices()]
 
 
+def default_device() -> str:
+    """The one of ``devices`` that is taken where none is asked for.
+
+    Raises:
+        RuntimeError: There is no OpenCL driver, or it is broken.
+        ValueError: No device has the name in GAIGS_OPENCL_DEVICE.
+    """
+    return _name(_choose(os.environ.get("GAIGS_OPENCL_DEVICE")))
+
+
 def _devices() -> list[cl.Device]:
+    """The devices of all drivers; one that is broken hurts only where it is the only one."""
+    found, causes = [], []
     try:
-        found = [device for platform in cl.get_platforms() for device in platform.get_devices()]
-    except cl.LogicError:  # the loader found no platform
-        found = []
+        for platform in cl.get_platforms():
+            try:
+                found += platform.get_devices()
+            except cl.Error as error:
+                causes.append(f"; {platform.name} lists no devices ({error})")
+    except cl.Error as error:  # with no platform, too
+        causes.append(f" ({error})")
     if not found:
-        raise RuntimeError("rasterizer 'opencl' needs an OpenCL driver: pip install 'pyopencl[pocl]'")
+        needs = "rasterizer 'opencl' needs an OpenCL driver: pip install 'pyopencl[pocl]', or use rasterizer=torch"
+        raise RuntimeError(needs + "".join(causes))
     return found
 
 
@@ -98,6 +137,18 @@ def _queue(name: str | None) -> cl.CommandQueue:
 
 @functools.cache
 def _open(name: str | None) -> cl.CommandQueue:
+    device = _choose(name)
+    try:
+        return cl.CommandQueue(cl.Context([device]))
+    except cl.Error as error:
+        raise RuntimeError(
+            f"rasterizer 'opencl': {_name(device)} cannot be opened ({error}); mend its driver, take another device "
+            "with GAIGS_OPENCL_DEVICE, or use rasterizer=torch"
+        ) from error
+
+
+def _choose(name: str | None) -> cl.Device:
+    """The first device whose name has such a part; without one the first CPU, or the first device of any kind."""
     found = _devices()
     if name:
         chosen = [device for device in found if name.lower() in _name(device).lower()]
@@ -106,7 +157,13 @@ def _open(name: str | None) -> cl.CommandQueue:
     if not chosen:
         listed = "; ".join(map(_name, found))
         raise ValueError(f"rasterizer 'opencl': no OpenCL device is called {name!r}; there are: {listed}")
-    return cl.CommandQueue(cl.Context(chosen[:1]))
+    return chosen[0]
+
+
+@functools.cache
+def _pool(queue: cl.CommandQueue) -> cl.tools.MemoryPool:
+    """Buffers that live on from call to call: fresh memory would cost a page fault every 4 KiB."""
+    return cl.tools.MemoryPool(cl.tools.ImmediateAllocator(queue))
 
 
 def _source() -> str:
@@ -122,7 +179,7 @@ def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel
     options = ["-w", *(f"-D{macro}={value}" for macro, value in macros.items())]
     try:
         program = cl.Program(queue.context, _source()).build(options)
-    except cl.RuntimeError as error:
+    except cl.Error as error:
         device = _name(queue.device)
         raise RuntimeError(f"rasterizer 'opencl': {device} cannot build the kernels; use rasterizer=torch") from error
     return {kernel.function_name: kernel for kernel in program.all_kernels()}
@@ -155,9 +212,9 @@ def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tens
         if tuple(tensor.shape) not in shapes:
             allowed = " or ".join(map(str, shapes))
             raise ValueError(f"{name} must be {allowed} where signal is {(b, n, c)}, got {tuple(tensor.shape)}")
-    if not 1 <= c <= 8:
-        raise ValueError(f"rasterizer 'opencl' takes 1 to 8 channels, got {c}; use rasterizer=torch")
-    if n >= 2**24:
+    if not 1 <= c <= CHANNELS:
+        raise ValueError(f"rasterizer 'opencl' takes 1 to {CHANNELS} channels, got {c}; use rasterizer=torch")
+    if n >= SPLATS:
         raise ValueError(f"rasterizer 'opencl' takes fewer than 2^24 splats, got {n}; use rasterizer=torch")
 
 
@@ -276,7 +333,7 @@ class _Render:
 
     def _empty(self, size):
         """Four-byte values that stay on the device; no buffer of OpenCL is empty."""
-        return cl.Buffer(self.queue.context, cl.mem_flags.READ_WRITE, 4 * max(1, size))
+        return _pool(self.queue).allocate(4 * max(1, int(size)))
 
     def _finish(self, *buffers):
         """Waits until what kernels wrote into the host's memory is there."""

@@ -56,7 +56,8 @@ class _Tiles:
     """Which splats reach which tile, in chunks of tiles whose lists have similar lengths."""
 
     def __init__(self, plane: Plane, means: Tensor, variances: Tensor, opacities: Tensor):
-        self.shape, self.period = plane.shape, plane.period
+        self.shape = plane.shape
+        self.period = None if plane.period is None else _split(plane.period, plane.u.dtype)
         self.down, self.across = (-(-edge // TILE) for edge in self.shape)
         u, v = (self._cut(coordinate) for coordinate in (plane.u, plane.v))
         self.u, self.v = u, v
@@ -72,7 +73,7 @@ class _Tiles:
         for axis, (coordinate, period) in enumerate(((u, self.period), (v, None))):
             coordinate = coordinate.flatten(1)
             low, high = coordinate.amin(1, keepdim=True), coordinate.amax(1, keepdim=True)
-            offset = _nearest(means[:, axis] - (low + high) / 2, period).abs()
+            offset = _nearest(means[:, axis], (low + high) / 2, period).abs()
             # A few roundings' slack: whoever is listed in vain is sorted out pixel by pixel.
             touches = touches & ~(offset > (halves[:, axis] + (high - low) / 2) * (1 + 1e-5) + 1e-6)
         self.chunks = self._chunks(touches, len(opacities))
@@ -104,7 +105,7 @@ class _Tiles:
 
     def offsets(self, tiles: Tensor, means: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel minus splat centre (t, k, y or 1, x or 1) in u and v for splats (t, k, 2)."""
-        du = _nearest(self.u[tiles][:, None] - means[..., 0, None, None], self.period)
+        du = _nearest(self.u[tiles][:, None], means[..., 0, None, None], self.period)
         return du, self.v[tiles][:, None] - means[..., 1, None, None]
 
     def join(self, tiled: Tensor) -> Tensor:
@@ -120,9 +121,25 @@ class _Tiles:
         return tiled.flatten(-2).flatten(-3, -2)
 
 
-def _nearest(offset: Tensor, period: float | None) -> Tensor:
-    """An offset taken to the nearest image."""
-    return offset if period is None else offset - period * (offset / period).round()
+def _split(period: float, dtype: torch.dtype) -> tuple[float, float]:
+    """A period rounded to a dtype, and what that leaves over."""
+    rounded = torch.tensor(period, dtype=dtype).item()
+    return rounded, period - rounded
+
+
+def _nearest(a: Tensor, b: Tensor, period: tuple[float, float] | None) -> Tensor:
+    """a - b taken to the nearest image, the period as ``_split`` gives it.
+
+    The period is subtracted from the exact a - b = offset + rest (Knuth's two-sum), since at the seam what remains is
+    smaller by far than the rounding error of a - b alone.
+    """
+    offset = a - b
+    if period is None:
+        return offset
+    back = offset - a
+    rest = (a - (offset - back)) - (b + back)
+    turns = (offset / period[0]).round_()
+    return (offset - turns * period[0]) + (rest - turns * period[1])
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -261,7 +262,23 @@ def test_lists_a_device_and_takes_it_by_any_part_of_its_name(monkeypatch):
     name = opencl.devices()[0]
     opencl.OpenCLRasterizer(device=name[3:-3].upper())
     monkeypatch.setenv("GAIGS_OPENCL_DEVICE", name)
-    opencl.OpenCLRasterizer()
+    assert opencl.OpenCLRasterizer().used == f"opencl on {opencl.default_device()}" == f"opencl on {name}"
+
+
+def test_the_first_processor_is_the_default(monkeypatch):
+    kind = opencl.cl.device_type
+    platform = lambda name: SimpleNamespace(name=name)
+    device = lambda name, type: SimpleNamespace(name=name, type=type, platform=platform("Maker"))
+    found = [device("one", kind.GPU), device("two", kind.CPU), device("three", kind.CPU)]
+    monkeypatch.setattr(opencl, "_devices", lambda: found)
+    monkeypatch.delenv("GAIGS_OPENCL_DEVICE", raising=False)
+    assert opencl.devices() == ["Maker: one (GPU)", "Maker: two (CPU)", "Maker: three (CPU)"]
+    assert opencl.default_device() == "Maker: two (CPU)"
+    monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "gpu")
+    assert opencl.default_device() == "Maker: one (GPU)"
+    monkeypatch.delenv("GAIGS_OPENCL_DEVICE")
+    del found[1:]
+    assert opencl.default_device() == "Maker: one (GPU)"
 
 
 def test_an_unknown_device_is_an_error_that_lists_those_there_are(monkeypatch):
@@ -279,6 +296,35 @@ def test_no_driver_is_an_error_that_says_what_to_install(monkeypatch):
     monkeypatch.setattr(opencl.cl, "get_platforms", find_no_platform)
     with pytest.raises(RuntimeError, match=r"needs an OpenCL driver: pip install 'pyopencl\[pocl\]'"):
         opencl.devices()
+
+
+def broken(message):
+    """What pyopencl raises is no RuntimeError of Python's."""
+
+    def fail(*_):
+        raise opencl.cl.RuntimeError(message)
+
+    return fail
+
+
+def test_a_broken_driver_is_an_error_that_names_it(monkeypatch):
+    good, bad = opencl.cl.get_platforms()[0], SimpleNamespace(name="Wreck", get_devices=broken("OUT_OF_HOST_MEMORY"))
+    names = opencl.devices()
+    monkeypatch.setattr(opencl.cl, "get_platforms", lambda: [bad, good])
+    assert set(opencl.devices()) <= set(names), "beside one that works it hurts nobody"
+    monkeypatch.setattr(opencl.cl, "get_platforms", lambda: [bad])
+    with pytest.raises(RuntimeError, match=r"needs an OpenCL driver.*; Wreck lists no devices \(OUT_OF_HOST_MEMORY\)"):
+        opencl.OpenCLRasterizer(device="another")
+    with pytest.raises(RuntimeError, match="Wreck"):
+        opencl.devices()
+
+
+@pytest.mark.parametrize("what", ["Context", "CommandQueue"])
+def test_a_device_that_cannot_be_opened_is_an_error_that_names_it(what, monkeypatch):
+    opencl._open.cache_clear()
+    monkeypatch.setattr(opencl.cl, what, broken("OUT_OF_RESOURCES"))
+    with pytest.raises(RuntimeError, match=r"PU\) cannot be opened \(OUT_OF_RESOURCES\); .* or use rasterizer=torch"):
+        opencl.OpenCLRasterizer()
 
 
 def test_kernels_that_do_not_build_are_an_error_that_names_the_device(monkeypatch):

@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
+from fractions import Fraction
 
 import pytest
 import torch
@@ -77,6 +78,38 @@ def assert_agrees(arguments):
             assert found[name].dtype == dtype
             tolerance *= max(true.abs().max().item(), 1.0)
             torch.testing.assert_close(found[name].double(), true, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_offsets_are_exact_at_the_seam(dtype):
+    generator = torch.Generator().manual_seed(0)
+    seam = math.pi * torch.tensor([-1, 1, 3], dtype=torch.float64)
+    ends = seam[torch.randint(3, (2, 300), generator=generator)]
+    beyond = 10 ** -(1 + 5 * torch.rand(2, 300, generator=generator, dtype=torch.float64))
+    a, b = (ends + beyond).to(dtype)
+    a, b = torch.cat((a, a.new_tensor([0.5, -2.0, math.pi]))), torch.cat((b, b.new_tensor([0.25, 2.0, -math.pi])))
+    found, eps = module._nearest(a, b, module._split(math.tau, dtype)), torch.finfo(dtype).eps
+    for x, y, offset in zip(a.tolist(), b.tolist(), found.tolist(), strict=True):
+        true = Fraction(x) - Fraction(y)
+        true -= round(true / Fraction(math.tau)) * Fraction(math.tau)
+        assert abs(Fraction(offset) - true) <= 2 * eps * (abs(true) + eps)
+
+
+def test_narrow_splats_at_the_seam_are_as_good_as_elsewhere():
+    generator = torch.Generator().manual_seed(0)
+    width, n = 1e-5, 40
+    errors = []
+    for centre in (math.pi, 0.0):
+        u = centre + width * torch.linspace(-2, 2, 9)[None]
+        means = torch.stack((centre + width * torch.randn(n, generator=generator), torch.zeros(n)), -1)
+        means[::2, 0] -= math.tau * bool(centre)  # the same places, a turn away
+        covariances = (width**2 * torch.eye(2)).expand(1, n, 2, 2)
+        splats = Splats(means, covariances, torch.arange(1.0 * n), torch.ones(n).bool())
+        arguments = splats, torch.rand(1, n, 1, generator=generator), torch.full((1, n), 0.1), None
+        plane = Plane(u, torch.zeros(1, 1), math.tau)
+        image, _ = TorchRasterizer()(*arguments, plane)
+        errors.append((image - rasterize_densely(*arguments, plane)[0]).abs().max().item())
+    assert max(errors) < 1e-5
 
 
 @pytest.mark.parametrize("attenuations", [False, True])
