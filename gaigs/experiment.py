@@ -17,20 +17,25 @@ from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.loggers import CSVLogger, Logger
 from omegaconf import OmegaConf
 from rich.console import Console
+from torch import Tensor
 
 from gaigs import checkpoint
 from gaigs.data import Links
 from gaigs.model import Model
+from gaigs.radio_map import radio_map
 from gaigs.registry import call, registry
 from gaigs.report.figures import write_figures
 from gaigs.report.table import metrics_table, verdict
 from gaigs.training.batches import Batches, Pass, take
 from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine
-from gaigs.training.metrics import spectrum_scores, summarise
+from gaigs.training.metrics import scoring
 from gaigs.training.module import Training
 
-LOOK_UPS = ({"name": "mean"}, {"name": "knn", "k": 3})
-"""What every result stands beside."""
+LOOK_UPS = ({"name": "mean"}, {"name": "knn", "k": 3, "power": 2})
+"""What every result on spectra stands beside."""
+
+RSSI_LOOK_UPS = ({"name": "mean"}, {"name": "knn", "k": 20, "power": 1}, {"name": "path_loss"})
+"""What every result on RSSI stands beside; readings are noisy, so more neighbours count, and more alike."""
 
 log = logging.getLogger(__name__)
 
@@ -100,6 +105,8 @@ def train_and_test(config: dict, folder: Path) -> dict:
     links = registry("data").build(config["data"])
     sizes = ", ".join(f"{len(part)} {name}" for name, part in links.split.parts().items())
     log.info("data: %s; split %s: %s", config["data"]["name"], links.split.name, sizes)
+    if links.remarks:
+        log.info("data: %s", links.remarks)
     model = registry("model").build(config["model"], scene=links.scene)
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
     log.info("model: %s", ", ".join([config["model"]["name"], *(f"{key} {name}" for key, name in parts.items())]))
@@ -109,11 +116,14 @@ def train_and_test(config: dict, folder: Path) -> dict:
     if any(parameter.requires_grad for parameter in model.parameters()):
         model, seconds = train(model, links, config, folder)
         size = (folder / "best.ckpt").stat().st_size
+    scores, receivers = test(model, config["model"]["name"], links, folder)
+    summarise = scoring(links.grid).summarise
     metrics = {
+        "data": links.remarks,
         "split": links.split.name,
         "seed": config["seed"],
         "device": device_name(device_of(model)),
-        "rasterizer": parts.get("rasterizer"),
+        "rasterizer": getattr(getattr(model, "rasterizer", None), "used", parts.get("rasterizer")),
         "train_seconds": seconds,
         "inference_ms": inference_ms(model, links),
         "render_ms": render_ms(model, links),
@@ -121,11 +131,14 @@ def train_and_test(config: dict, folder: Path) -> dict:
         "num_gaussians_start": start,
         "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
         "checkpoint_bytes": size,
-        "models": test(model, config["model"]["name"], links, folder),
+        "models": {name: summarise(values) for name, values in scores.items()},
+        "receivers": by_receiver(scores, receivers, links) if len(links.receivers) > 1 else {},
     }
     gaussians = getattr(model, "gaussians", None)
     if gaussians is not None:
         gaussians.save_ply(folder / "gaussians.ply")
+    if links.grid is None:
+        radio_map(model).save(folder / "radio_map.npz")
     write_figures(folder, links, gaussians)
     return metrics
 
@@ -197,39 +210,60 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
         )
 
 
-def test(model: Model, name: str, links: Links, folder: Path) -> dict[str, dict[str, float]]:
-    """Scores of the model and the look-ups on the test links; writes ``predictions.npz``."""
+def test(model: Model, name: str, links: Links, folder: Path) -> tuple[dict[str, dict[str, Tensor]], Tensor]:
+    """Scores of the model and the look-ups on every test link; writes ``predictions.npz``.
+
+    Returns:
+        The scores of each model by name, and the receiver of each test link (k,).
+    """
     models = {name: model}
-    for config in LOOK_UPS:
+    for config in LOOK_UPS if links.grid is not None else RSSI_LOOK_UPS:
         if config["name"] != name:
             models[config["name"]] = registry("model").build(config, scene=links.scene)
             models[config["name"]].fit(links)
     batches = Pass(links, links.split.test, 64)
-    scores, predictions = {}, []
-    for key, candidate in models.items():
-        parts = []
-        for batch in batches:
-            predicted = candidate.predict(batch.transmitters, batch.receiver).cpu()
-            parts.append(spectrum_scores(batch.labels, predicted))
-            if candidate is model:
-                predictions.append(predicted.half().numpy())
-        scores[key] = {metric: torch.cat([part[metric] for part in parts]) for metric in parts[0]}
     index = torch.cat(batches.parts)
+    labels = torch.cat([batch.labels for batch in batches])
+    scores, content = {}, {}
+    for key, candidate in models.items():
+        predicted = torch.cat([candidate.predict(batch.transmitters, batch.receivers).cpu() for batch in batches])
+        scores[key] = scoring(links.grid).scores(labels, predicted)
+        if candidate is model:
+            content["prediction"] = predicted
+        if links.grid is None:
+            content[f"error_{key}"] = predicted - labels
+        else:
+            content[f"ssim_{key}"] = scores[key]["ssim"]
+    if links.grid is not None:  # half of a float's digits are enough for an image, and half of the room
+        labels, content["prediction"] = labels.half(), content["prediction"].half()
     np.savez_compressed(
         folder / "predictions.npz",
         link=index.numpy(),
         transmitters=links.transmitters[index].numpy(),
-        labels=np.concatenate([batch.labels.half().numpy() for batch in batches]),
-        prediction=np.concatenate(predictions),
-        **{f"ssim_{key}": value["ssim"].numpy() for key, value in scores.items()},
+        receiver=links.receiver_index[index].numpy(),
+        labels=labels.numpy(),
+        **{key: values.numpy() for key, values in content.items()},
     )
-    return {key: summarise(value) for key, value in scores.items()}
+    return scores, links.receiver_index[index]
+
+
+def by_receiver(scores: dict[str, dict[str, Tensor]], receivers: Tensor, links: Links) -> dict[str, dict]:
+    """The numbers of a table for each receiver that has test links, by its name and the model's."""
+    summarise = scoring(links.grid).summarise
+    return {
+        receiver.name: {
+            name: summarise({metric: score[receivers == i] for metric, score in values.items()})
+            for name, values in scores.items()
+        }
+        for i, receiver in enumerate(links.receivers)
+        if (receivers == i).any()
+    }
 
 
 def inference_ms(model: Model, links: Links) -> float:
     """Milliseconds from a transmitter's position to its label, everything included."""
-    transmitter = links.transmitters[links.split.test[:1]]
-    return median_ms(lambda: model.predict(transmitter))
+    link = links.split.test[0]
+    return median_ms(lambda: model.predict(links.transmitters[link], int(links.receiver_index[link])))
 
 
 def render_ms(model: Model, links: Links) -> float | None:

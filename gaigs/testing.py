@@ -180,27 +180,35 @@ def check_rasterizer(rasterizer: Rasterizer, device: torch.device | str = "cpu")
     _check_nan_shows(rasterizer, device)
 
 
-def check_pooling(pooling: nn.Module, device: torch.device | str = "cpu") -> None:
+def check_pooling(build: Callable[[Grid], nn.Module], device: torch.device | str = "cpu") -> None:
     """A pooling: a label for each map, gradients finite even where the map is 0, independence of the batch.
+
+    One that gives RSSI (b,) must also take maps that are constant, span 12 decades or are of half precision.
+
+    Args:
+        build: Makes the pooling for a grid.
+        device: Where it works.
 
     Raises:
         AssertionError: It breaks the contract of kind ``pooling``.
     """
-    channels = pooling.channels
-    _require(isinstance(channels, int) and channels > 0, f"channels must be how many it needs, got {channels!r}")
     generator = torch.Generator().manual_seed(0)
-    shapes = ((3, 5, 8), torch.float32), ((1, 1, 1), torch.float32), ((3, 5, 8), torch.float64)
-    for (b, rows, columns), dtype in shapes:
-        module = copy.deepcopy(pooling).to(device, dtype).eval()
-        image = torch.randn(b, channels, rows, columns, generator=generator).to(device, dtype).requires_grad_()
+    pixel = Grid(torch.tensor([0.3]), torch.tensor([0.5]))
+    cases = (3, Grid.sphere(5, 8), torch.float32), (1, pixel, torch.float32), (3, Grid.sphere(5, 8), torch.float64)
+    for b, grid, dtype in cases:
+        module = build(grid).to(device, dtype).eval()
+        channels = module.channels
+        _require(isinstance(channels, int) and channels > 0, f"channels must be how many it needs, got {channels!r}")
+        image = torch.randn(b, channels, *grid.shape, generator=generator).to(device, dtype).requires_grad_()
         label = module(image)
-        shape = (b,) if label.ndim == 1 else (b, rows, columns)
-        _check_tensor("the label", label, shape, dtype, device)
+        _check_tensor("the label", label, (b,) if label.ndim == 1 else (b, *grid.shape), dtype, device)
         _require(torch.equal(label, module(image)), "two calls must give the same label")
         _close(module(image[-1:]), label[-1:], PRECISION[dtype], "a label must not depend on the other maps")
         _check_gradients([label], {**dict(module.named_parameters()), "the map": image})
         silence = torch.zeros_like(image).requires_grad_()
         _check_gradients([module(silence)], {"a silent map": silence})
+        if label.ndim == 1:
+            _check_hard_maps(module, image.detach())
 
 
 def check_model(build: Callable[[Scene], Model], links: Links, device: torch.device | str = "cpu") -> None:
@@ -217,20 +225,22 @@ def check_model(build: Callable[[Scene], Model], links: Links, device: torch.dev
     model = build(links.scene).to(device)
     model.fit(links)
     index = torch.cat((links.split.train, links.split.test))
-    index = index[links.receiver_index[index] == links.receiver_index[index[0]]][:5]
-    batch = take(links, index).to(device)
-    receiver = links.receivers[batch.receiver].pose.position
+    batch = take(links, index[links.receiver_index[index] == links.receiver_index[index[0]]][:5]).to(device)
+    receiver = links.receivers[batch.receivers[0]].pose.position
     asked = torch.cat((batch.transmitters.cpu(), receiver[None], receiver[None] + 1e3))
-    labels = model.train().predict(asked, batch.receiver)
+    receiver = int(batch.receivers[0])
+    labels = model.train().predict(asked, receiver)
     _require(model.training, "predict must leave the model in the mode it was in")
     _check_tensor("predictions", labels, (len(asked), *batch.labels.shape[1:]), torch.float32)
     _require(not labels.requires_grad, "predictions must not carry a gradient")
-    _require(torch.equal(labels, model.predict(asked, batch.receiver)), "two calls must give the same predictions")
+    _require(torch.equal(labels, model.predict(asked, receiver)), "two calls must give the same predictions")
     _close(
-        model.predict(asked, batch.receiver, batch_size=1), labels, 1e-4, "the batch size must not change predictions"
+        model.predict(asked, receiver, batch_size=1), labels, 1e-4, "the batch size must not change predictions"
     )
-    _require(len(model.predict(asked[:0], batch.receiver)) == 0, "no transmitters must give no predictions")
-    wrong = {"one axis": asked[0], "two coordinates": asked[:, :2], "NaN": asked * torch.nan}
+    _require(len(model.predict(asked[:0], receiver)) == 0, "no transmitters must give no predictions")
+    grid = model.predict(asked.expand(2, *asked.shape), receiver)
+    _close(grid, labels.expand(2, *labels.shape), 1e-4, "a grid of positions must give a grid of predictions")
+    wrong = {"two coordinates": asked[:, :2], "NaN": asked * torch.nan}
     for what, transmitters in wrong.items():
         _raises(ValueError, lambda t=transmitters: model.predict(t), f"transmitters with {what} must be a ValueError")
     for number in (-1, len(links.receivers)):
@@ -243,6 +253,9 @@ def check_model(build: Callable[[Scene], Model], links: Links, device: torch.dev
     )
     if not parameters:
         return
+    mixed = take(links, index[:8]).to(device)
+    each = torch.cat([model(take(links, index[i : i + 1]).to(device)).label for i in range(len(index[:8]))])
+    _close(model(mixed).label, each, 1e-4, "links to several receivers must come out as each by itself")
     prediction = model(batch)
     _check_tensor("the label", prediction.label, batch.labels.shape, torch.float32, device)
     for name, penalty in prediction.penalties.items():
@@ -254,7 +267,7 @@ def check_model(build: Callable[[Scene], Model], links: Links, device: torch.dev
         _close(thin, prediction.label[:, rows, columns], 1e-4, "fewer directions must get the same values")
     twin = build(Scene.from_state(links.scene.state())).to(device)
     twin.load_state_dict(model.state_dict())
-    twice = twin.train().predict(asked, batch.receiver)
+    twice = twin.train().predict(asked, receiver)
     _require(torch.equal(labels, twice), "all that predict needs must be in the state dict")
 
 
@@ -425,6 +438,21 @@ def _check_footprints(projection: Projection, device: torch.device | str) -> Non
             _require(bool(smallest.gt(0).all()), "covariances2d must be positive definite")
         shared = projection.project(means, covariances[:1], identity).covariances2d
         _close(shared, splats.covariances2d[:1], 1e-6, "covariances2d must not depend on the other transmitters")
+
+
+def _check_hard_maps(pooling: nn.Module, image: Float[Tensor, "b c rows columns"]) -> None:
+    """RSSI and its gradients are finite; float32 where the map is of half precision, whose steps are 0.06 dB."""
+    decades = torch.linspace(-6, 6, image[0].numel()).reshape(image.shape[1:]).to(image)
+    maps = {"a silent map": 0 * image, "a constant map": torch.ones_like(image), "12 decades": 10**decades * image}
+    if image.dtype == torch.float32:
+        maps |= {f"{name} in float16": m.clamp(-6e4, 6e4).half() for name, m in maps.items()}
+    for name, leaf in maps.items():
+        leaf.requires_grad_()
+        label = pooling(leaf)
+        dtype = torch.float32 if leaf.dtype == torch.half else leaf.dtype
+        _require(label.dtype == dtype, f"the label of {name} must be {dtype}, got {label.dtype}")
+        _require(bool(label.isfinite().all()), f"the label of {name} must be finite")
+        _check_gradients([label], {**dict(pooling.named_parameters()), name: leaf})
 
 
 def _check_gradients(outputs: Sequence[Tensor], leaves: dict[str, Tensor]) -> None:

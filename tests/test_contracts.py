@@ -12,6 +12,7 @@ from torch import nn
 from gaigs import configuration
 from gaigs.data import nerf2_spectrum
 from gaigs.model import Model, Prediction
+from gaigs.pooling.softmax_attention import SoftmaxAttention
 from gaigs.pooling.spectrum import Spectrum
 from gaigs.projection.equirectangular import Equirectangular
 from gaigs.projection.mercator import Mercator
@@ -59,10 +60,22 @@ def configured(kind, name, *overrides):
 @every("data")
 def test_data(name, tmp_path):
     overrides = []
-    if name == "nerf2_spectrum":
-        links = registry("data").build(configured("data", "synthetic"))
-        nerf2_spectrum.write(tmp_path, links)
-        overrides = [f"data.root={tmp_path}"]
+    match name:
+        case "nerf2_spectrum":
+            nerf2_spectrum.write(tmp_path, registry("data").build(configured("data", "synthetic")))
+            overrides = [f"data.root={tmp_path}"]
+        case "nerf2_rssi":
+            (tmp_path / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{k},{k % 3},1\n" for k in range(12)))
+            readings = "".join(f"-6{k},-100\n-5{k},-70\n" for k in range(6))
+            (tmp_path / "gateway_rssi.csv").write_text(f"one,two\n{readings}")
+            (tmp_path / "gateway_position.yml").write_text("one: [0, 0, 2]\ntwo: [5, 1, 2]\n")
+            for part, rows in (("train", range(9)), ("test", range(9, 12))):
+                (tmp_path / f"{part}_index.txt").write_text("".join(f"{row}\n" for row in rows))
+            overrides = [f"data.root={tmp_path}", "data.split.length=2"]
+        case "rssi_csv":
+            rows = "".join(f"{k},{k % 3},1,{5 * (k % 2)},1,2,-6{k % 10}\n" for k in range(20))
+            (tmp_path / "room.csv").write_text("tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm\n" + rows)
+            overrides = [f"data.file={tmp_path / 'room.csv'}"]
     check_data(registry("data").build(configured("data", name, *overrides)))
 
 
@@ -96,14 +109,31 @@ def test_rasterizer(name, device):
 @every("pooling")
 @on_every_device
 def test_pooling(name, device):
-    check_pooling(registry("pooling").build(configured("pooling", name)), device)
+    config = configured("pooling", name)
+    check_pooling(lambda grid: registry("pooling").build(config, grid=grid), device)
 
 
-@every("model")
 @on_every_device
-def test_model(name, device):
-    config = configured("model", name)
-    check_model(lambda scene: registry("model").build(config, scene=scene), example_links(), device)
+def test_learnt_pooling(device):
+    check_pooling(lambda grid: SoftmaxAttention(temperature=0.5, prior=0.1, learn=True), device)
+
+
+LABELS = {"path_loss": ["rssi"], "array_response": ["spectrum"]}
+"""The kinds of label that a model takes, where it does not take both."""
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [(name, label) for name in registry("model").names() for label in LABELS.get(name, ["spectrum", "rssi"])],
+)
+@on_every_device
+def test_model(name, label, device):
+    parts = ["model=gaigs_rssi", "pooling=softmax_attention"] if (name, label) == ("gaigs", "rssi") else []
+    config = configured("model", name, *parts)
+    links = example_links()
+    if label == "rssi":
+        links = replace(links, labels=-60 - 10 * torch.rand(len(links.transmitters)), grid=None)
+    check_model(lambda scene: registry("model").build(config, scene=scene), links, device)
 
 
 # --- and the checks can fail ---
@@ -246,17 +276,55 @@ class Flat(Spectrum):
         return super().forward(image).flatten(1)
 
 
+class Power(Spectrum):
+    """Mean power in dB, without a floor."""
+
+    def level(self, image):
+        return 10 * image.square().sum(1).mean((1, 2)).log10()
+
+    def forward(self, image):
+        return self.level(image.to(torch.promote_types(image.dtype, torch.float32)))
+
+
+class Floored(Power):
+    def level(self, image):
+        return 10 * (image.square().sum(1).mean((1, 2)) + 1e-2).log10()
+
+
+class Narrow(Floored):
+    def forward(self, image):
+        return self.level(image).to(torch.promote_types(image.dtype, torch.float32))
+
+
+class Coarse(Floored):
+    def forward(self, image):
+        return super().forward(image).to(image.dtype)
+
+
+class Clamped(Power):
+    def level(self, image):
+        return 20 * image.square().sum(1).mean((1, 2)).sqrt().clamp(min=1e-3).log10()
+
+
 @pytest.mark.parametrize(
     ("pooling", "message"),
     [
         (Root, "the gradient of a silent map must be finite"),
         (Relative, "a label must not depend on the other maps"),
         (Flat, r"the label must be of shape \(3, 5, 8\), got \(3, 40\)"),
+        (Power, "the gradient of a silent map must be finite"),
+        (Clamped, "the gradient of a silent map must be finite"),
+        (Narrow, "the label of 12 decades in float16 must be finite"),
+        (Coarse, "the label of a silent map in float16 must be torch.float32, got torch.float16"),
     ],
 )
 def test_a_broken_pooling_is_found(pooling, message):
     with pytest.raises(AssertionError, match=message):
-        check_pooling(pooling(2))
+        check_pooling(lambda grid: pooling(2))
+
+
+def test_a_pooling_with_a_noise_floor_keeps_the_contract():
+    check_pooling(lambda grid: Floored(2))
 
 
 class Grey(Model):
@@ -313,7 +381,7 @@ class Trusting(Grey):
         (Forgetful, "all that predict needs must be in the state dict"),
         (Crowded, "the batch size must not change predictions"),
         (Silent, "the gradient of grey must be finite"),
-        (Trusting, "transmitters with one axis must be a ValueError"),
+        (Trusting, "a grid of positions must give a grid of predictions"),
     ],
 )
 def test_a_broken_model_is_found(model, message):

@@ -27,7 +27,7 @@ SMALL = (
     "rasterizer=torch",
     "gaussians.count=30",
     "training.batch_size=7",  # 22 links train: batches of 7, 7, 7 and 1
-    "training.stride=8",
+    "training.loss.stride=8",
     "trainer.accelerator=cpu",
     "trainer.max_steps=14",
     "trainer.val_check_interval=5",
@@ -48,6 +48,7 @@ CASES = {
     ),
 }
 METRICS = [
+    "data",
     "split",
     "seed",
     "device",
@@ -60,6 +61,7 @@ METRICS = [
     "num_parameters",
     "checkpoint_bytes",
     "models",
+    "receivers",
 ]
 
 
@@ -312,7 +314,7 @@ def test_tensorboard_logs_beside_the_csv(tmp_path):
         (["+gaussians.conut=3"], r"gaussians has no option 'conut' \(did you mean 'count'\?\); it has: count, near"),
         (["+mapping.header=[]"], r"mapping has no option 'header' \(did you mean 'heads'\?\); it has: width"),
         (["+training.batchsize=3"], r"training has no option 'batchsize' \(did you mean 'batch_size'\?\)"),
-        (["~training.stride"], r"training needs option stride; it has: batch_size"),
+        (["~training.loss.stride"], r"training.loss needs option stride; it has: stride, ssim"),
         (["training.density={evry: 3}"], r"density has no option 'evry' \(did you mean 'every'\?\)"),
         (["training.density=3"], r"density must be a mapping of options, got 3"),
         (["+trainer.max_step=3"], r"trainer has no option 'max_step' \(did you mean 'max_steps'\?\)"),

@@ -1,5 +1,6 @@
 """Measured and simulated links: who sent from where, who heard, and the label."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,19 +30,51 @@ class Grid:
         as_radians = lambda values: torch.deg2rad(torch.tensor([float(v) for v in values]))
         return cls(as_radians(elevations), as_radians(azimuths))
 
+    @classmethod
+    def sphere(cls, rows: int, columns: int) -> "Grid":
+        """The full sphere in pixels of equal solid angle: the sines of the rows' elevations are evenly spaced.
+
+        Raises:
+            ValueError: There are fewer than 2 rows or 3 columns.
+        """
+        if rows < 2 or columns < 3:
+            raise ValueError(f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x {columns}")
+        sines = (2 * torch.arange(rows, dtype=torch.float64) + 1 - rows) / rows
+        azimuths = 2 * math.pi / columns * (torch.arange(columns, dtype=torch.float64) + 0.5)
+        return cls(sines.asin().float(), azimuths.float())
+
     @property
     def shape(self) -> tuple[int, int]:
         return len(self.elevations), len(self.azimuths)
 
     @property
     def pitch(self) -> float:
-        """Distance between neighbouring rows [rad]."""
+        """Distance between neighbouring rows, their mean [rad]."""
         rows = self.shape[0]
         return ((self.elevations[-1] - self.elevations[0]) / max(rows - 1, 1)).abs().item()
+
+    @property
+    def solid_angles(self) -> Float[Tensor, "rows columns"]:
+        """Shares of the pixels in the grid's; rows meet where the sine of the elevation is halfway between theirs.
+
+        Raises:
+            ValueError: There is a single row, whose extent is unknown.
+        """
+        if len(self.elevations) < 2:
+            raise ValueError("solid angles take at least 2 rows, got 1; use a finer grid")
+        sines = self.elevations.double().sin()
+        first, last = (3 * sines[:1] - sines[1:2]) / 2, (3 * sines[-1:] - sines[-2:-1]) / 2
+        bounds = torch.cat((first, (sines[1:] + sines[:-1]) / 2, last)).clamp(-1, 1)
+        shares = bounds.diff().abs()[:, None].expand(self.shape)
+        return (shares / shares.sum()).float()
 
     def thin(self, rows: slice, columns: slice) -> "Grid":
         """The grid of some of the rows and columns."""
         return Grid(self.elevations[rows], self.azimuths[columns])
+
+    def to(self, device: torch.device) -> "Grid":
+        """The same grid on another device."""
+        return Grid(self.elevations.to(device), self.azimuths.to(device))
 
 
 @dataclass(frozen=True)
@@ -112,12 +145,14 @@ class Links:
         transmitters: Positions, world frame (n, 3) [m], float32.
         receivers: Who hears.
         receiver_index: The receiver of each link (n,).
-        labels: Indexed by an integer tensor (k,) it gives float32 labels: (k, rows, columns) spectra in [0, 1].
+        labels: Indexed by an integer tensor (k,) it gives float32 labels: (k, rows, columns) spectra in [0, 1], or
+            (k,) RSSI [dBm].
             A tensor, or anything that reads its labels when asked.
         split: Train, validation and test links.
         grid: Directions of the label's pixels; None where the label is no spectrum.
         normalisation: How the labels were scaled, e.g. "min-max of each spectrum's amplitude".
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty where unknown.
+        remarks: What was read, and what was left out and why, in a sentence.
     """
 
     transmitters: Float[Tensor, "n 3"]
@@ -128,6 +163,7 @@ class Links:
     grid: Grid | None
     normalisation: str
     edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
+    remarks: str = ""
 
     def known(self, receiver: int) -> Int[Tensor, "k"]:
         """The links to a receiver that are not held out for the test; look-ups use them all."""

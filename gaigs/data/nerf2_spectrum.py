@@ -1,6 +1,5 @@
 """Spatial spectra in the folder layout of NeRF²; docs/data.md describes the files."""
 
-import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gaigs.data import Grid, Links, Receiver
+from gaigs.data._files import find_folder, read_lines, read_points, refuse
 from gaigs.data.splits import split as split_links
 from gaigs.geometry import Pose
 from gaigs.registry import register
@@ -25,9 +25,6 @@ NORMALISATION = "min-max of each spectrum's amplitude"
 
 PNG_COLOURS = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
 """What the colour type in a PNG file's header means."""
-
-SHOWN = 10
-"""Defects that an error lists one by one."""
 
 
 @register("data", "nerf2_spectrum")
@@ -47,20 +44,16 @@ def read(root: str | Path, split: Mapping) -> Links:
 
     Source: NeRF², https://github.com/XPengZhao/NeRF2.
     """
-    root = Path(root).expanduser()
-    if not root.is_dir():
-        raise FileNotFoundError(f"{root} must be the folder of a data set, and is none; set the data's root")
+    root = find_folder(root)
     defects: list[str] = []
-    positions = _read_positions(root, defects)
+    positions = read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one spectrum a line", defects)
     receiver = _read_receiver(root, defects)
     files = [root / "spectrum" / f"{k:05d}.png" for k in range(1, len(positions) + 1)]
     defects += _image_defects(root, files)
     official = None
     if split.get("protocol", "official") == "official":
         official = _read_official(root, len(files), defects)
-    if defects:
-        more = [f"... and {len(defects) - SHOWN} more"] if len(defects) > SHOWN else []
-        raise ValueError("\n  ".join([f"{root} has {len(defects)} defects:", *defects[:SHOWN], *more]))
+    refuse(root, defects)
     transmitters = torch.tensor(positions)
     return Links(
         transmitters=transmitters,
@@ -134,49 +127,9 @@ def write(folder: str | Path, links: Links) -> None:
         (folder / f"{name}_index.txt").write_text(text)
 
 
-def _lines(file: Path, expected: str, defects: list[str]) -> list[str]:
-    """Lines of a text file without the blank ones at its end."""
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = "missing" if isinstance(error, FileNotFoundError) else f"unreadable ({error})"
-        defects.append(f"{file.name}: {reason}; expected {expected}")
-        return []
-    lines = text.rstrip().splitlines()
-    if not lines:
-        defects.append(f"{file.name}: empty; expected {expected}")
-    return lines
-
-
-def _read_positions(root: Path, defects: list[str]) -> list[list[float]]:
-    lines = _lines(root / "tx_pos.csv", "x,y,z [m] of one spectrum a line", defects)
-    rows = [line.split(",") for line in lines]
-    names = ["x", "y", "z"]
-    header = bool(rows) and [cell.strip().lower() for cell in rows[0]] == names
-    if header and len(rows) == 1:
-        defects.append("tx_pos.csv: no positions below the header")
-    positions = []
-    for number, row in list(enumerate(rows, 1))[header:]:
-        positions.append([_number(cell) for cell in row])
-        if len(row) != 3:
-            defects.append(f"tx_pos.csv, line {number}: expected 3 columns x,y,z, got {len(row)}: {','.join(row)!r}")
-            continue
-        for name, cell, value in zip(names, row, positions[-1], strict=True):
-            if not math.isfinite(value):
-                defects.append(f"tx_pos.csv, line {number}, column {name}: expected a finite number, got {cell!r}")
-    return positions
-
-
-def _number(cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
-
-
 def _read_receiver(root: Path, defects: list[str]) -> Receiver | None:
     file = "gateway_info.yml"
-    lines = _lines(root / file, "the gateway's position [m] and orientation (quaternion x, y, z, w)", defects)
+    lines = read_lines(root / file, "the gateway's position [m] and orientation (quaternion x, y, z, w)", defects)
     if not lines:
         return None
     try:
@@ -238,7 +191,7 @@ def _read_official(root: Path, count: int, defects: list[str]) -> tuple[Tensor, 
     parts = []
     for file in ("train_index.txt", "test_index.txt"):
         part = []
-        for number, line in enumerate(_lines(root / file, "one image number from 1 a line", defects), 1):
+        for number, line in enumerate(read_lines(root / file, "one image number from 1 a line", defects), 1):
             place, text = f"{file}, line {number}", line.strip()
             if not (text.isascii() and text.isdecimal()):
                 defects.append(f"{place}: expected one image number, got {line!r}")

@@ -9,7 +9,7 @@ from torch import Tensor
 from gaigs.data import Split
 
 OPTIONS = {
-    "official": (),
+    "official": ("length",),
     "random": ("test",),
     "sparse": ("train", "test"),
     "runs": ("length", "test"),
@@ -26,6 +26,7 @@ def split(
     protocol: str = "official",
     *,
     official: tuple[Int[Tensor, "train"], Int[Tensor, "test"]] | None = None,
+    rows: Int[Tensor, "n"] | None = None,
     seed: int = 0,
     validation: float = 0.1,
     **options: float | None,
@@ -33,19 +34,24 @@ def split(
     """Parts the links by a protocol.
 
     Validation links are taken out of the training links in the way that the test links were taken out of all links
-    (whole runs for ``runs``, whole cubes for ``blocks``, else one by one), so that they predict the test error.
+    (whole runs for ``runs``, whole cubes for ``blocks``, else row by row), so that they predict the test error; where
+    the official test is another run, so do official validation links in runs of some ``length``. Links of one row
+    are never parted but by the official parts: they have their place in common, and so mostly what shadows it.
 
     Args:
         transmitters: Positions of all links [m], in the order of measurement.
-        protocol: ``official``: the parts that came with the data. ``random``: single links are held out. ``sparse``:
-            the test links are those of ``random``, and few of the others train. ``runs``: contiguous runs are held out.
+        protocol: ``official``: the parts that came with the data. ``random``: single rows are held out. ``sparse``:
+            the test rows are those of ``random``, and few of the others train. ``runs``: contiguous runs are held out.
             ``blocks``: cubes of space are held out.
         official: Training and test links that came with the data.
+        rows: Row of each link in the order of measurement, from 0: the links by which several receivers heard one
+            transmission have the same. Each link has its own unless given.
         seed: Of everything drawn at random.
         validation: Fraction of the training links to validate on; 0 for none.
         **options: ``test``, fraction of the links to test on, 0.2 unless given (all protocols but ``official``);
-            ``train``, number of links to train and validate on (``sparse``); ``length`` of a run in links (``runs``);
-            ``edge`` of a cube [m] (``blocks``). None counts as not given.
+            ``train``, number of rows to train and validate on (``sparse``); ``length`` of a run in rows (``runs``; for
+            ``official``, where it is 1 unless given, of the runs that validate); ``edge`` of a cube [m] (``blocks``).
+            None counts as not given.
 
     Returns:
         The parts, each in ascending order, disjoint, with a name that says everything that was given.
@@ -59,9 +65,11 @@ def split(
         raise ValueError(f"unknown split protocol {protocol!r}; there are: {', '.join(OPTIONS)}")
     unknown = options.keys() - OPTIONS[protocol]
     if unknown:
-        takes = ", ".join((*OPTIONS[protocol], "validation", "seed"))
-        raise ValueError(f"split protocol {protocol!r} has no option {', '.join(sorted(unknown))}; it has: {takes}")
-    if protocol != "official":
+        words, takes = ", ".join(sorted(unknown)), ", ".join((*OPTIONS[protocol], "validation", "seed"))
+        raise ValueError(f"split protocol {protocol!r} has no option {words}; it has: {takes}; set others to null")
+    if protocol == "official":
+        options.setdefault("length", 1)
+    else:
         options.setdefault("test", TEST)
     for name in OPTIONS[protocol]:
         if name not in options:
@@ -69,18 +77,19 @@ def split(
     _check("validation", validation, 0 <= validation < 1, "in [0, 1)")
 
     generator = torch.Generator().manual_seed(seed)
-    links = groups = torch.arange(len(transmitters))
+    links = torch.arange(len(transmitters))
+    rows = groups = links if rows is None else rows
     words = [protocol]
     match protocol:
         case "official" if official is None:
             raise ValueError(f"this data has no official split; choose of {', '.join([*OPTIONS][1:])}")
         case "sparse":
             words = [f"sparse {options['train']}"]
-        case "runs":
+        case "official" | "runs":
             length = options["length"]
-            _check("length", length, length >= 1 and length == int(length), "a whole number of links, at least 1")
-            groups = links // int(length)
-            words = [f"runs of {length}"]
+            _check("length", length, length >= 1 and length == int(length), "a whole number of rows, at least 1")
+            groups = rows // int(length)
+            words = [f"runs of {length}"] if protocol == "runs" else words
         case "blocks":
             edge = options["edge"]
             _check("edge", edge, 0 < edge < math.inf, "positive [m]")
@@ -97,11 +106,14 @@ def split(
         words.append(f"test {options['test']:g}")
     if protocol == "sparse":
         count = options["train"]
-        _check("train", count, 1 <= count <= len(train), f"in 1..{len(train)}, the links that do not test")
-        train = train[torch.randperm(len(train), generator=generator)[: int(count)]].sort().values
+        present = rows[train].unique()
+        _check("train", count, 1 <= count <= len(present), f"in 1..{len(present)}, the rows that do not test")
+        chosen = present[torch.randperm(len(present), generator=generator)[: int(count)]]
+        train = train[torch.isin(rows[train], chosen)]
     train, validating = _hold_out(train, groups, validation, generator)
     if validation:
-        words.append(f"validation {validation:g}")
+        runs = f" in runs of {length}" if protocol == "official" and length > 1 else ""
+        words.append(f"validation {validation:g}{runs}")
     if validation or protocol != "official":
         words.append(f"seed {seed}")
     return Split(", ".join(words), train, validating, test)

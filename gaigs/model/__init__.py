@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Grid, Links, Scene
@@ -12,17 +12,17 @@ from gaigs.data import Grid, Links, Scene
 
 @dataclass(frozen=True)
 class Batch:
-    """Links of several transmitters to one receiver.
+    """Links, each of one transmitter to one receiver.
 
     Attributes:
         transmitters: Positions, world frame (b, 3) [m].
-        receiver: Index into the scene's receivers.
+        receivers: Indices into the scene's receivers (b,).
         grid: Directions to predict; None where the label is no spectrum.
         labels: What was measured, (b, rows, columns) or (b,); None when predicting.
     """
 
     transmitters: Float[Tensor, "b 3"]
-    receiver: int
+    receivers: Int[Tensor, "b"]
     grid: Grid | None
     labels: Tensor | None = None
 
@@ -32,9 +32,8 @@ class Batch:
 
     def to(self, device: torch.device) -> "Batch":
         """The same batch on another device."""
-        grid = self.grid and Grid(self.grid.elevations.to(device), self.grid.azimuths.to(device))
-        labels = None if self.labels is None else self.labels.to(device)
-        return Batch(self.transmitters.to(device), self.receiver, grid, labels)
+        move = lambda part: None if part is None else part.to(device)
+        return Batch(*map(move, (self.transmitters, self.receivers, self.grid, self.labels)))
 
 
 class Prediction(NamedTuple):
@@ -71,33 +70,56 @@ class Model(nn.Module):
         return {"network": list(self.parameters())}
 
     @torch.no_grad()
-    def predict(self, transmitters: Float[Tensor, "n 3"], receiver: int = 0, batch_size: int = 16) -> Tensor:
-        """Labels for transmitters anywhere.
+    def predict(
+        self,
+        transmitters: Float[Tensor, "*points 3"],
+        receiver: int | str | Int[Tensor, "*points"] = 0,
+        batch_size: int = 16,
+    ) -> Tensor:
+        """Labels for transmitters anywhere: a point, a list of them, or a grid.
 
         Args:
             transmitters: Positions, world frame [m]; anything that becomes a float tensor.
-            receiver: Index into the scene's receivers.
+            receiver: Name, or index into the scene's receivers; or the index of each position's receiver.
             batch_size: Transmitters worked on at a time.
 
         Returns:
-            Spectra (n, rows, columns), scaled as the training labels were (``model.scene.normalisation``).
+            For each position a spectrum (rows, columns), scaled as the training labels were
+            (``model.scene.normalisation``), or an RSSI [dBm]; on the device of the model.
 
         Raises:
-            ValueError: The positions are not (n, 3) or not finite, or there is no such receiver.
+            ValueError: The positions are not (..., 3) or not finite, or there is no such receiver.
         """
         device = next((tensor.device for tensor in self.state_dict().values()), None)
         transmitters = torch.as_tensor(transmitters, dtype=torch.float32, device=device)
-        if transmitters.ndim != 2 or transmitters.shape[1] != 3:
-            raise ValueError(f"transmitters must be (n, 3) positions in metres, got shape {tuple(transmitters.shape)}")
-        if not torch.isfinite(transmitters).all():
-            row = int((~torch.isfinite(transmitters)).any(1).nonzero()[0])
-            raise ValueError(f"transmitters must be finite, got {transmitters[row].tolist()} in row {row}")
-        if not 0 <= receiver < len(self.scene.receivers):
-            names = ", ".join(f"{i} = {r.name}" for i, r in enumerate(self.scene.receivers))
-            raise ValueError(f"receiver must be one of {names}, got {receiver}")
+        if not transmitters.ndim or transmitters.shape[-1] != 3:
+            raise ValueError(f"transmitters must be (..., 3) positions [m], got shape {tuple(transmitters.shape)}")
+        points = transmitters.reshape(-1, 3)
+        if not torch.isfinite(points).all():
+            row = int((~torch.isfinite(points)).any(1).nonzero()[0])
+            raise ValueError(f"transmitters must be finite, got {points[row].tolist()} in row {row}")
+        receivers = self._index(receiver, transmitters)
         training = self.training
         self.eval()
-        batches = (Batch(part, receiver, self.scene.grid).to(part.device) for part in transmitters.split(batch_size))
+        parts = zip(points.split(batch_size), receivers.split(batch_size), strict=True)
+        batches = (Batch(*part, self.scene.grid).to(points.device) for part in parts)
         labels = torch.cat([self(batch).label for batch in batches])
         self.train(training)
-        return labels
+        return labels.reshape(transmitters.shape[:-1] + labels.shape[1:])
+
+    def _index(self, receiver: int | str | Tensor, transmitters: Float[Tensor, "*points 3"]) -> Int[Tensor, "n"]:
+        """The index of each position's receiver."""
+        names = [receiver.name for receiver in self.scene.receivers]
+        if isinstance(receiver, str):
+            index = torch.tensor(names.index(receiver) if receiver in names else -1)
+        else:
+            index = torch.as_tensor(receiver)
+        listed = ", ".join(f"{i} = {name}" for i, name in enumerate(names))
+        if index.is_floating_point() or ((index < 0) | (index >= len(names))).any():
+            raise ValueError(f"receiver must be one of {listed}, got {receiver!r}")
+        if index.ndim and index.shape != transmitters.shape[:-1]:
+            raise ValueError(
+                f"receivers must be one, or one for each of the {tuple(transmitters.shape[:-1])} positions, got "
+                f"{tuple(index.shape)}"
+            )
+        return index.to(transmitters.device).expand(transmitters.shape[:-1]).reshape(-1)

@@ -1,9 +1,10 @@
 """The splatting pipeline: GAI-GS, its ablations and its neighbours, put together from registered parts."""
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gaigs.data import Scene
+from gaigs.data import Grid, Links, Scene
 from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.geometry import Pose, covariances
 from gaigs.mapping import Residuals, SceneMapping
@@ -21,8 +22,14 @@ class GaussianSplatting(Model):
         tokenizer, projection, rasterizer, pooling: Configurations of registered components.
         gaussians: Options of ``gaigs.gaussians.Gaussians``.
         mapping: Options of ``gaigs.mapping.SceneMapping``.
+        grid: Rows and columns of the map over the full sphere that the pooling makes an RSSI of; None for spectra,
+            whose grid is the label's.
+        reference: Configuration of a model whose RSSI the pooled map is added to [dB]; None for spectra.
 
-    Source: GAI-GS, section "Framework".
+    Raises:
+        ValueError: ``grid`` or ``reference`` is given for spectra, or lacking for RSSI.
+
+    Source: GAI-GS, section "Framework"; the reference is ours (docs/methods.md).
     """
 
     def __init__(
@@ -34,10 +41,21 @@ class GaussianSplatting(Model):
         pooling: dict,
         gaussians: dict,
         mapping: dict,
+        grid: list[int] | None = None,
+        reference: dict | None = None,
     ):
         super().__init__(scene)
-        self.pooling = registry("pooling").build(pooling)
-        self.projection = registry("projection").build(projection, pixel=scene.grid.pitch)
+        for option, value in (("grid", grid), ("reference", reference)):
+            if (value is None) == (scene.grid is None):
+                kind, there = ("RSSI", "lacking") if value is None else ("spectra", f"{value}")
+                raise ValueError(
+                    f"model.{option} must be given for RSSI and null for spectra, and for {kind} it is {there}; take "
+                    "+experiment=rssi or +experiment=spectrum, whichever suits the data"
+                )
+        self.grid = scene.grid or Grid.sphere(*grid)
+        self.reference = reference and registry("model").build(reference, scene=scene)
+        self.pooling = registry("pooling").build(pooling, grid=self.grid)
+        self.projection = registry("projection").build(projection, pixel=self.grid.pitch)
         self.rasterizer = registry("rasterizer").build(rasterizer)
         self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, channels=self.pooling.channels)
         self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
@@ -45,37 +63,55 @@ class GaussianSplatting(Model):
         context = {"tokenizer_widths": widths, "channels": self.pooling.channels}
         self.mapping = call("mapping", SceneMapping, mapping, **context)
 
+    def fit(self, links: Links) -> None:
+        if self.reference is not None:
+            self.reference.fit(links)
+
     def forward(self, batch: Batch) -> Prediction:
-        residuals = self._residuals(batch.transmitters)
-        image, _ = self.rasterizer(*self._excite(residuals, batch))
+        # What a transmitter excites is the same for all who hear it.
+        transmitters, which = batch.transmitters.unique(dim=0, return_inverse=True)
+        residuals = self._residuals(transmitters)
+        links, labels = [], []
+        for receiver in batch.receivers.unique().tolist() or [0]:  # no links have a label's shape too
+            links.append((batch.receivers == receiver).nonzero()[:, 0])
+            image, _ = self.rasterizer(*self._excite(residuals, which[links[-1]], receiver, batch.grid))
+            labels.append(self.pooling(image))
+        label = torch.cat(labels)[torch.cat(links).argsort()]
+        if self.reference is not None:
+            label = self.reference(batch).label + label
         penalties = {}
         if residuals.delta_opacities is not None:
             penalties["opacity"] = residuals.delta_opacities.square().mean()
-        return Prediction(self.pooling(image), penalties)
+        return Prediction(label, penalties)
 
     def render_arguments(self, batch: Batch) -> tuple:
-        """What the rasterizer is called with for a batch; to time it alone."""
-        return self._excite(self._residuals(batch.transmitters), batch)
+        """What the rasterizer is called with for the first link's receiver; to time it alone."""
+        transmitters = batch.transmitters[batch.receivers == batch.receivers[0]]
+        which = torch.arange(len(transmitters), device=transmitters.device)
+        return self._excite(self._residuals(transmitters), which, int(batch.receivers[0]), batch.grid)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {name: [parameter] for name, parameter in self.gaussians.named_parameters()}
-        return groups | {"network": [*self.tokenizer.parameters(), *self.mapping.parameters()]}
+        network = [*self.tokenizer.parameters(), *self.mapping.parameters(), *self.pooling.parameters()]
+        return groups | {"network": network}
 
     def _residuals(self, transmitters: Float[Tensor, "b 3"]) -> Residuals:
         # The network says how a place responds to a transmitter; where the Gaussians go is learnt from the image alone.
         means, opacities = self.gaussians.means.detach(), self.gaussians.opacities.detach()
         return self.mapping(self.tokenizer(means, opacities, transmitters))
 
-    def _excite(self, residuals: Residuals, batch: Batch) -> tuple:
-        """The rasterizer's arguments: the Gaussians as each transmitter excites them, on the receiver's plane."""
-        gaussians, b = self.gaussians, len(batch.transmitters)
+    def _excite(self, residuals: Residuals, which: Int[Tensor, "b"], receiver: int, grid: Grid | None) -> tuple:
+        """The rasterizer's arguments: the Gaussians as some transmitters excite them, on the receiver's plane."""
+        gaussians, b = self.gaussians, len(which)
+        residuals = Residuals(*(None if values is None else values[which] for values in residuals))
         signal, opacities = gaussians.signal, gaussians.opacities
         if residuals.delta_signal is not None:
             signal = signal + residuals.delta_signal
         if residuals.delta_opacities is not None:
             opacities = (opacities + residuals.delta_opacities).clamp(0, 1)
-        splats = self._splats(residuals, self.scene.receivers[batch.receiver].pose)
-        plane = self.projection.plane(batch.grid.elevations, batch.grid.azimuths)
+        splats = self._splats(residuals, self.scene.receivers[receiver].pose)
+        grid = (grid or self.grid).to(signal.device)
+        plane = self.projection.plane(grid.elevations, grid.azimuths)
         signal = SH_DC * signal.squeeze(-1)
         return splats, signal.expand(b, -1, -1), opacities.expand(b, -1), residuals.attenuations, plane
 

@@ -1,4 +1,4 @@
-"""Curves: how SSIM is distributed over the test set, how the losses fell, and what an error costs in time."""
+"""Curves: how a score is distributed over the test set, how the losses fell, and what an error costs in time."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -16,24 +16,35 @@ from numpy import ndarray
 from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE
 
 
-def ssim_cdf(scores: Mapping[str, Float[ndarray, "t"]], split: str) -> Figure:
-    """Share of test spectra that score at most a given SSIM, one step curve a model, medians marked.
+def cdf(
+    values: Mapping[str, Float[ndarray, "t"]],
+    quantity: str,
+    samples: str,
+    split: str,
+    limits: tuple[float | None, float | None],
+) -> Figure:
+    """Share of test samples with at most a given value, one step curve a model, medians marked.
 
     Args:
-        scores: SSIM of every test spectrum by model, the run's own model first.
+        values: Of every test sample by model, the run's own model first.
+        quantity: What the values are, with their unit.
+        samples: What there is a share of.
         split: Name of the split.
+        limits: Ends of the axis of values; None for one that the data choose.
     """
     with rc_context(STYLE):
         figure = Figure(figsize=(COLUMN, 2.6), layout="constrained")
         ax = figure.subplots()
         ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
-        for (name, ssim), (colour, dash) in zip(scores.items(), cycle(LINES), strict=False):
-            median = float(np.median(ssim))
-            ax.ecdf(ssim, color=colour, linestyle=dash, label=f"{name} {median:.3f}")
+        for (name, sample), (colour, dash) in zip(values.items(), cycle(LINES), strict=False):
+            median = float(np.median(sample))
+            ax.ecdf(sample, color=colour, linestyle=dash, label=f"{name} {median:#.3g}")
             ax.plot(median, 0.5, "o", color=colour, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
-        ax.set(xlabel=f"SSIM, split {split}", ylabel="share of test spectra", ylim=(0, 1.01))
-        ax.set_xlim(right=1)
-        figure.legend(loc="outside upper center", title="median SSIM", ncols=3, handlelength=1.8, columnspacing=1.2)
+        ax.set(xlabel=f"{quantity}, split {split}", ylabel=f"share of test {samples}", ylim=(0, 1.01))
+        ax.set_xlim(*limits)
+        figure.legend(
+            loc="outside upper center", title=f"median {quantity}", ncols=3, handlelength=1.8, columnspacing=1.2
+        )
         ax.grid(axis="x")
     return figure
 

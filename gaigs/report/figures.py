@@ -8,8 +8,11 @@ from matplotlib.figure import Figure
 
 from gaigs.data import Links
 from gaigs.gaussians import SH_DC, Gaussians
-from gaigs.report.curves import loss_curves, read_curves, ssim_cdf
+from gaigs.radio_map import RadioMap
+from gaigs.report.curves import cdf, loss_curves, read_curves
+from gaigs.report.radio_map import radio_maps
 from gaigs.report.room import Cloud, room
+from gaigs.report.rssi import predicted_against_measured
 from gaigs.report.spectra import spectra
 from gaigs.report.style import DPI
 
@@ -18,11 +21,11 @@ EXAMPLES = {"10th percentile": 0.1, "median": 0.5, "90th percentile": 0.9}
 
 
 def write_figures(folder: Path, links: Links, gaussians: Gaussians | None) -> list[Path]:
-    """Draws a run: its room, its losses, and for spectra some examples and how SSIM is distributed.
+    """Draws a run: its room, its losses, how its score is distributed, and what it predicts.
 
     Args:
-        folder: Of the run. ``predictions.npz`` and, where the model was trained, ``log/*/metrics.csv`` are read from
-            it; the figures go to ``figures/``.
+        folder: Of the run. ``predictions.npz``, for RSSI ``radio_map.npz`` and, where the model was trained,
+            ``log/*/metrics.csv`` are read from it; the figures go to ``figures/``.
         links: What the run was trained and tested on.
         gaussians: The Gaussians it learnt; None for a model without.
 
@@ -30,13 +33,12 @@ def write_figures(folder: Path, links: Links, gaussians: Gaussians | None) -> li
         The files, as PNG.
 
     Raises:
-        FileNotFoundError: The labels are spectra and the folder holds no ``predictions.npz``.
+        FileNotFoundError: The folder lacks ``predictions.npz``, or ``radio_map.npz`` where the labels are RSSI.
     """
     figures = {"room": _room(links, gaussians)}
     if losses := sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime):
         figures["loss"] = loss_curves(read_curves(losses))
-    if links.grid is not None:
-        figures |= _spectra(folder / "predictions.npz", links)
+    figures |= _rssi(folder, links) if links.grid is None else _spectra(folder / "predictions.npz", links)
     (folder / "figures").mkdir(exist_ok=True)
     files = {folder / "figures" / f"{name}.png": figure for name, figure in figures.items()}
     for file, figure in files.items():
@@ -57,8 +59,33 @@ def _spectra(path: Path, links: Links) -> dict[str, Figure]:
     return {
         "spectra": spectra(*examples),
         "spectra_polar": spectra(*examples, polar=True),
-        "ssim_cdf": ssim_cdf(scores, links.split.name),
+        "ssim_cdf": cdf(scores, "SSIM", "spectra", links.split.name, (None, 1)),
     }
+
+
+def _rssi(folder: Path, links: Links) -> dict[str, Figure]:
+    with np.load(folder / "predictions.npz") as run:
+        errors = {name.removeprefix("error_"): abs(run[name]) for name in run.files if name.startswith("error_")}
+        transmitters, receiver, labels, predictions = (
+            run[name] for name in ("transmitters", "receiver", "labels", "prediction")
+        )
+    names = [receiver.name for receiver in links.receivers]
+    readings = np.column_stack((transmitters[:, :2], labels))
+    paged = {
+        "predicted_against_measured": predicted_against_measured(labels, predictions, receiver, names),
+        "radio_map": radio_maps(
+            RadioMap.load(folder / "radio_map.npz"),
+            {receiver.name: receiver.pose.position.numpy() for receiver in links.receivers},
+            {name: readings[receiver == index] for index, name in enumerate(names)},
+            links.edges.numpy(),
+        ),
+    }
+    # The last hundredth would squeeze all others.
+    furthest = max(np.quantile(error, 0.99) for error in errors.values()) or None
+    figures = {"error_cdf": cdf(errors, "|error| [dB]", "readings", links.split.name, (0, furthest))}
+    for name, drawn in paged.items():
+        figures |= {name if page == 1 else f"{name}_{page}": figure for page, figure in enumerate(drawn, 1)}
+    return figures
 
 
 @torch.no_grad()

@@ -25,7 +25,7 @@ COSTS = {
 }
 """What a reader calls the costs of ``metrics.json``."""
 
-WRITTEN_ONLY = ("ssim_mean", "ssim_p10", "ssim_p90", "num_gaussians")
+WRITTEN_ONLY = ("ssim_mean", "ssim_p10", "ssim_p90", "median_ae_db", "rmse_db", "num_gaussians")
 """Columns for which a terminal has no room."""
 
 
@@ -151,7 +151,8 @@ def report(folder: Path) -> Table:
     caption += "; all columns in ablation.md"
     table = Table(title=f"Runs of {escape(str(folder))}", caption=escape(caption), box=SIMPLE_HEAD, pad_edge=False)
     for i in shown:
-        table.add_column(escape(heads[i]), justify="right" if columns[i] in METRICS | COSTS else "left")
+        justify = "right" if columns[i] in METRICS | COSTS else "left"
+        table.add_column(escape(heads[i]), justify=justify, overflow="fold")
     for row, line in zip(rows, cells, strict=True):
         style = {"failed": "red", "look-up": "dim"}.get(row["status"])
         table.add_row(*(escape(line[i]) for i in shown), style=style)

@@ -11,15 +11,16 @@ from gaigs.model import Batch
 
 
 class Batches:
-    """Batches of a fixed number of links, each of one receiver, in an order that the seed and the step alone decide.
+    """Batches of a fixed number of transmitters with all their links, in an order that seed and step alone decide.
 
-    Every pass goes through all links once, anew shuffled. The batch of step k is the same whether or not the run was
+    What a transmitter excites is the same for all receivers, and is computed once where its links come together. Every
+    pass goes through all transmitters once, anew shuffled. The batch of step k is the same whether or not the run was
     interrupted before it, so a resumed training sees what an uninterrupted one would have.
 
     Args:
         links: The data set.
         index: The links to draw from.
-        size: Links a batch; the last ones of a receiver may be fewer.
+        size: Transmitter positions a batch; the last batch of a pass may hold fewer.
         seed: Of the order.
         steps: How many batches there are in all.
 
@@ -31,19 +32,23 @@ class Batches:
         for option, value in (("training.batch_size", size), ("trainer.max_steps", steps)):
             if value < 1:
                 raise ValueError(f"{option} must be at least 1, got {value}")
-        self.links, self.index, self.size, self.seed, self.steps = links, index, size, seed, steps
+        self.links, self.size, self.seed, self.steps = links, size, seed, steps
+        _, place, counts = links.transmitters[index].unique(dim=0, return_inverse=True, return_counts=True)
+        self.places = index[place.argsort(stable=True)].split(counts.tolist())
         self.position = 0
 
     def __len__(self) -> int:
         return self.steps
 
     def __iter__(self) -> Iterator[Batch]:
-        length = len(_by_receiver(self.links, self.index, self.size))
+        length = -(-len(self.places) // self.size)
         while self.position < self.steps:
             passed, within = divmod(self.position, length)
-            for chosen in self._shuffled(passed)[within : within + self.steps - self.position]:
+            generator = torch.Generator().manual_seed(hash((self.seed, passed)) % 2**63)
+            parts = torch.randperm(len(self.places), generator=generator).split(self.size)
+            for chosen in parts[within : within + self.steps - self.position]:
                 self.position += 1
-                yield take(self.links, chosen)
+                yield take(self.links, torch.cat([self.places[i] for i in chosen]))
 
     def state_dict(self) -> dict:
         """How far the training has come."""
@@ -53,25 +58,19 @@ class Batches:
         """Goes on from there."""
         self.position = state["position"]
 
-    def _shuffled(self, passed: int) -> list[Tensor]:
-        generator = torch.Generator().manual_seed(hash((self.seed, passed)) % 2**63)
-        order = self.index[torch.randperm(len(self.index), generator=generator)]
-        parts = _by_receiver(self.links, order, self.size)
-        return [parts[i] for i in torch.randperm(len(parts), generator=generator)]
-
 
 class Pass:
-    """One pass over links in their order, in batches of one receiver each.
+    """One pass over links in their order.
 
     Args:
         links: The data set.
         index: The links to go over.
-        size: Links a batch; the last ones of a receiver may be fewer.
+        size: Links a batch; the last one may hold fewer.
     """
 
     def __init__(self, links: Links, index: Int[Tensor, "k"], size: int):
         self.links = links
-        self.parts = _by_receiver(links, index, size)
+        self.parts = index.split(size) if len(index) else ()
 
     def __len__(self) -> int:
         return len(self.parts)
@@ -81,12 +80,5 @@ class Pass:
 
 
 def take(links: Links, index: Int[Tensor, "b"]) -> Batch:
-    """Links of one receiver as a batch with labels."""
-    receiver = int(links.receiver_index[index[0]])
-    return Batch(links.transmitters[index], receiver, links.grid, links.labels[index])
-
-
-def _by_receiver(links: Links, index: Int[Tensor, "k"], size: int) -> list[Int[Tensor, "b"]]:
-    """Links in parts of at most a size, each of one receiver, in the order in which they come."""
-    receivers = links.receiver_index[index]
-    return [part for receiver in receivers.unique() for part in index[receivers == receiver].split(size)]
+    """Links as a batch with labels."""
+    return Batch(links.transmitters[index], links.receiver_index[index], links.grid, links.labels[index])

@@ -10,7 +10,6 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from gaigs import density
-from gaigs.training.metrics import spectrum_scores
 
 
 class DensityControl(Callback):
@@ -90,11 +89,12 @@ class DensityControl(Callback):
 
 
 class KeepBest(Checkpoint):
-    """Writes the checkpoint of the best validation SSIM, or of the last step where nothing was validated.
+    """Writes the checkpoint of the best validation score (``Training.scoring``), or of the last step where nothing was
+    validated.
 
     Args:
         path: Where it goes.
-        patience: Validations without a better SSIM until the training stops; None: it goes on to the last step.
+        patience: Validations without a better score until the training stops; None: it goes on to the last step.
 
     Raises:
         ValueError: The patience is less than one validation.
@@ -104,7 +104,7 @@ class KeepBest(Checkpoint):
         if patience is not None and patience < 1:
             raise ValueError(f"training.patience must be at least 1 validation or null, got {patience}")
         self.path, self.patience = path, patience
-        self.best, self.waited = -math.inf, 0
+        self.best, self.waited = -math.inf, 0  # an error counts as its negative
 
     def state_dict(self) -> dict:
         return {"best": self.best, "waited": self.waited}
@@ -118,12 +118,8 @@ class KeepBest(Checkpoint):
     def on_validation_end(self, trainer, module) -> None:
         if trainer.sanity_checking:
             return
-        ssim = trainer.callback_metrics["validation/ssim"].item()
-        if ssim > self.best:
-            self.best, self.waited = ssim, 0
-            save(trainer, self.path)
-        else:
-            self.waited += 1
+        score = trainer.callback_metrics[f"validation/{module.scoring.watched}"].item()
+        self.waited = 0 if self._keep(trainer, module, score) else self.waited + 1
         self._stop_in_time(trainer)
 
     @torch.no_grad()
@@ -133,16 +129,21 @@ class KeepBest(Checkpoint):
             return
         module.eval()
         batches = (batch.to(module.device) for batch in trainer.val_dataloaders)
-        scores = [spectrum_scores(batch.labels, module.model(batch).label)["ssim"] for batch in batches]
+        scores = [module.scoring.scores(batch.labels, module.model(batch).label) for batch in batches]
         module.train()
-        ssim = torch.cat(scores).mean().item()
-        if ssim > self.best:
-            self.best = ssim
-            save(trainer, self.path)
+        self._keep(trainer, module, torch.cat([score[module.scoring.watched] for score in scores]).mean().item())
 
     def on_fit_end(self, trainer, module) -> None:
         if self.best == -math.inf:
             save(trainer, self.path)
+
+    def _keep(self, trainer, module, score: float) -> bool:
+        score = score if module.scoring.larger_is_better else -score
+        better = score > self.best
+        if better:
+            self.best = score
+            save(trainer, self.path)
+        return better
 
     def _stop_in_time(self, trainer) -> None:
         if self.patience is not None and self.waited >= self.patience:
@@ -207,7 +208,7 @@ def save(trainer: lightning.Trainer, path: Path) -> None:
 
 
 class ProgressLine(ProgressBar):
-    """Steps done, their rate, the time left, loss and validation SSIM in one line of the terminal."""
+    """Steps done, their rate, the time left, loss and validation score in one line of the terminal."""
 
     def on_train_start(self, trainer, module) -> None:
         bar, count, left = BarColumn(None), MofNCompleteColumn(), TimeRemainingColumn()
@@ -220,7 +221,7 @@ class ProgressLine(ProgressBar):
     def on_train_batch_end(self, trainer, module, *_) -> None:
         step, values = trainer.global_step, trainer.progress_bar_metrics
         rate = (step - self.first) / (time.monotonic() - self.start)
-        words = {"train/loss": "loss", "validation/ssim": "SSIM"}
+        words = {"train/loss": "loss", "validation/ssim": "SSIM", "validation/mae_db": "MAE [dB]"}
         scores = " ".join(f"{word} {values[name]:.3f}" for name, word in words.items() if name in values)
         self.line.update(self.task, completed=step, rate=rate, scores=scores)
 

@@ -2,10 +2,82 @@
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, huber_loss
 
+from gaigs.data import Grid
+from gaigs.model import Batch
 from gaigs.training.metrics import SSIM_WINDOW
+
+Terms = tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]
+"""The loss without penalties, its terms by name, and the model's penalties by name."""
+
+
+class SpectrumLoss:
+    """The paper's (1 - ssim) L_MAE + ssim L_SSIM, on every ``stride``-th row and column of the label, from a random one
+    on: neighbouring pixels of a spectrum are far closer than the array resolves.
+
+    Args:
+        grid: Of the labels.
+        stride: Rows and columns from one looked at to the next.
+        ssim: Weight of the SSIM term, the paper's 1 - beta.
+
+    Raises:
+        ValueError: An option is out of range.
+
+    Source: GAI-GS, "Results".
+    """
+
+    def __init__(self, grid: Grid, stride: int, ssim: float):
+        coarsest = min(grid.shape) // 3  # which leaves the SSIM's smallest window
+        if not 0 <= ssim <= 1:
+            raise ValueError(f"training.loss.ssim must be in [0, 1], got {ssim}")
+        if not 1 <= stride <= coarsest:
+            raise ValueError(f"training.loss.stride must be in 1..{coarsest} for this grid, got {stride}")
+        self.stride, self.ssim = stride, ssim
+
+    def __call__(self, model: nn.Module, batch: Batch, generator: torch.Generator) -> Terms:
+        """Of a model on a batch; the generator draws the first row and column."""
+        row, column = torch.randint(self.stride, (2,), generator=generator).tolist()
+        batch = batch.thin(slice(row, None, self.stride), slice(column, None, self.stride))
+        prediction, penalties = model(batch)
+        terms = spectrum_loss(prediction, batch.labels, self.stride)
+        return (1 - self.ssim) * terms["l1"] + self.ssim * terms["ssim"], terms, penalties
+
+
+class RssiLoss:
+    """A mean over the errors in dB: their magnitude, their square, or Huber's blend of both.
+
+    The magnitude is what the reported error averages, and robust: a reading that is far off pulls no harder than
+    another.
+
+    Args:
+        kind: ``absolute``, ``squared`` or ``huber``, which is squared up to ``bend`` and absolute beyond.
+        bend: Where Huber's loss turns [dB].
+
+    Raises:
+        ValueError: An option is out of range.
+    """
+
+    def __init__(self, kind: str, bend: float):
+        if kind not in ("absolute", "squared", "huber"):
+            raise ValueError(f"training.loss.kind must be absolute, squared or huber, got {kind!r}")
+        if not bend > 0:
+            raise ValueError(f"training.loss.bend must be more than 0 dB, got {bend}")
+        self.kind, self.bend = kind, bend
+
+    def __call__(self, model: nn.Module, batch: Batch, generator: torch.Generator) -> Terms:
+        """Of a model on a batch; nothing is drawn."""
+        prediction, penalties = model(batch)
+        errors = prediction - batch.labels
+        match self.kind:
+            case "absolute":
+                loss = errors.abs().mean()
+            case "squared":
+                loss = errors.square().mean()
+            case "huber":
+                loss = huber_loss(prediction, batch.labels, delta=self.bend)
+        return loss, {"mae_db": errors.abs().mean()}, penalties
 
 
 def spectrum_loss(

@@ -1,4 +1,4 @@
-"""The LightningModule that trains any model with parameters."""
+"""The LightningModule that trains a model on labels of any kind."""
 
 import lightning
 import torch
@@ -6,23 +6,20 @@ from torch import Tensor
 
 from gaigs.checkpoint import KEY
 from gaigs.model import Batch, Model
-from gaigs.training.losses import spectrum_loss
-from gaigs.training.metrics import spectrum_scores
+from gaigs.registry import call
+from gaigs.training.losses import RssiLoss, SpectrumLoss
+from gaigs.training.metrics import scoring
 
 
 class Training(lightning.LightningModule):
-    """The paper's loss, a learning rate for each group of parameters, and what a checkpoint must hold.
-
-    Loss: (1 - ssim) L_MAE + ssim L_SSIM + sum of weight times penalty, on every ``stride``-th row and column of the
-    label, from a random one on: neighbouring pixels of a spectrum are far closer than the array resolves.
+    """A loss with the model's penalties, a learning rate for each group of parameters, and what a checkpoint must hold.
 
     Args:
         model: What to train.
         identity: What ``gaigs.load`` needs beside the weights, and the configuration and split they come from.
-        seed: Of the random rows and columns.
+        seed: Of what the training draws at random.
         batch_size: Transmitters a step.
-        stride: Rows and columns between those that a step looks at.
-        ssim: Weight of the SSIM term, the paper's 1 - beta.
+        loss: Options of ``SpectrumLoss`` or ``RssiLoss``, whichever suits the labels.
         penalties: Weight of each of the model's penalties, the paper's alpha.
         learning_rates: Of each of the model's parameter groups, at the start.
         final_rate: Every rate falls exponentially to this fraction of itself at the last step.
@@ -34,7 +31,7 @@ class Training(lightning.LightningModule):
     Raises:
         ValueError: An option is out of range, or the model has a group of parameters without a learning rate.
 
-    Source: GAI-GS, "Results"; optimiser and schedules after the released configuration.
+    Source: optimiser and schedules after the released configuration.
     """
 
     def __init__(
@@ -43,8 +40,7 @@ class Training(lightning.LightningModule):
         identity: dict,
         seed: int,
         batch_size: int,
-        stride: int,
-        ssim: float,
+        loss: dict,
         penalties: dict[str, float],
         learning_rates: dict[str, float],
         final_rate: float,
@@ -54,21 +50,19 @@ class Training(lightning.LightningModule):
         density: dict | None,
     ):
         super().__init__()
-        coarsest = min(model.scene.grid.shape) // 3  # which leaves the SSIM's smallest window
-        for option, value, holds, bounds in (
-            ("ssim", ssim, 0 <= ssim <= 1, "in [0, 1]"),
-            ("final_rate", final_rate, 0 < final_rate <= 1, "in (0, 1]"),
-            ("warmup", warmup, warmup >= 0, "at least 0 steps"),
-            ("stride", stride, 1 <= stride <= coarsest, f"in 1..{coarsest} for this grid"),
-        ):
-            if not holds:
-                raise ValueError(f"training.{option} must be {bounds}, got {value}")
+        if not 0 < final_rate <= 1:
+            raise ValueError(f"training.final_rate must be in (0, 1], got {final_rate}")
+        if warmup < 0:
+            raise ValueError(f"training.warmup must be at least 0 steps, got {warmup}")
         if unset := set(model.parameter_groups()) - set(learning_rates):
             raise ValueError(f"training.learning_rates must give a rate for {', '.join(sorted(unset))}")
         self.model, self.identity, self.seed, self.batch_size = model, identity, seed, batch_size
-        self.stride, self.ssim, self.penalties = stride, ssim, penalties
-        self.learning_rates, self.final_rate, self.warmup = learning_rates, final_rate, warmup
+        self.penalties, self.learning_rates = penalties, learning_rates
+        self.final_rate, self.warmup = final_rate, warmup
         self.weight_decay, self.patience, self.density = weight_decay, patience, density
+        grid = model.scene.grid
+        self.loss = call("training.loss", RssiLoss if grid is None else SpectrumLoss, loss, grid=grid)
+        self.scoring = scoring(grid)
 
     def configure_optimizers(self):
         groups = [
@@ -91,11 +85,7 @@ class Training(lightning.LightningModule):
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         generator = torch.Generator().manual_seed(hash((self.seed, self.global_step)) % 2**63)
-        row, column = torch.randint(self.stride, (2,), generator=generator).tolist()
-        batch = batch.thin(slice(row, None, self.stride), slice(column, None, self.stride))
-        prediction, penalties = self.model(batch)
-        terms = spectrum_loss(prediction, batch.labels, self.stride)
-        loss = (1 - self.ssim) * terms["l1"] + self.ssim * terms["ssim"]
+        loss, terms, penalties = self.loss(self.model, batch, generator)
         for name, penalty in penalties.items():
             if name not in self.penalties:
                 raise ValueError(f"training.penalties must give a weight for {name}; 0 for none")
@@ -114,10 +104,9 @@ class Training(lightning.LightningModule):
 
     def validation_step(self, batch: Batch, _: int) -> None:
         prediction, _ = self.model(batch)
-        scores = spectrum_scores(batch.labels, prediction)
-        size = len(batch.labels)
-        self.log("validation/ssim", scores["ssim"].mean().float(), prog_bar=True, batch_size=size)
-        self.log("validation/mae", scores["mae"].mean().float(), batch_size=size)
+        for name, values in self.scoring.scores(batch.labels, prediction).items():
+            shown = name == self.scoring.watched
+            self.log(f"validation/{name}", values.mean().float(), prog_bar=shown, batch_size=len(batch.labels))
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, _: int) -> Batch:
         return batch.to(device)

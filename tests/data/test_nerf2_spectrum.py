@@ -171,7 +171,7 @@ DEFECTS = {
     ),
     "columns in another order": (
         lambda f: replace(f, "tx_pos.csv", "x,y,z", "y,x,z"),
-        "tx_pos.csv, line 1, column x: expected a finite number, got 'y'",
+        "tx_pos.csv, line 1, columns x, y, z: expected a finite number, got 'y', 'x', 'z'",
     ),
     "no positions": (lambda f: (f / "tx_pos.csv").unlink(), "tx_pos.csv: missing; expected x,y,z [m]"),
     "positions empty": (lambda f: (f / "tx_pos.csv").write_text("\n\n"), "tx_pos.csv: empty; expected x,y,z [m]"),
@@ -305,11 +305,19 @@ def test_all_files_are_reported_at_once(folder):
 
 def test_many_defects_are_cut_short(folder):
     (folder / "tx_pos.csv").write_text("nan,nan,nan\n" * 6)
+    (folder / "train_index.txt").write_text("0\n" * 12)
     with pytest.raises(ValueError, match="has 18 defects") as caught:
         read(folder, OFFICIAL)
     lines = str(caught.value).splitlines()
     assert len(lines) == 12
     assert lines[-1].strip() == "... and 8 more"
+
+
+def test_a_line_of_nan_is_one_defect(folder):
+    replace(folder, "tx_pos.csv", "2.5,-2,0.25", "nan,nan,nan")
+    message = r"has 1 defect:\n  tx_pos.csv, line 3, columns x, y, z: expected .* got 'nan', 'nan', 'nan'$"
+    with pytest.raises(ValueError, match=message):
+        read(folder, OFFICIAL)
 
 
 def test_a_missing_folder_is_no_file(folder):

@@ -118,6 +118,8 @@ def test_cubes_hold_out_about_the_fraction(transmitters):
     ("options", "name"),
     [
         ({"protocol": "official", "validation": 0.1}, "official, validation 0.1, seed 0"),
+        ({"protocol": "official", "length": 8}, "official, validation 0.1 in runs of 8, seed 0"),
+        ({"protocol": "official", "length": 8, "validation": 0}, "official"),
         ({"protocol": "random", "validation": 0, "seed": 2}, "random, test 0.2, seed 2"),
         ({"protocol": "sparse", "train": 60}, "sparse 60, test 0.2, validation 0.1, seed 0"),
         ({"protocol": "runs", "length": 20, "test": 0.3}, "runs of 20, test 0.3, validation 0.1, seed 0"),
@@ -137,7 +139,10 @@ def test_an_option_at_none_is_not_given(transmitters):
     ("options", "message"),
     [
         ({"protocol": "cubes"}, "unknown split protocol 'cubes'; there are: official, random"),
-        ({"protocol": "random", "edge": 0.5}, "'random' has no option edge; it has: test, validation, seed"),
+        (
+            {"protocol": "random", "edge": 0.5, "length": 3},
+            "'random' has no option edge, length; it has: test, validation, seed; set others to null",
+        ),
         ({"protocol": "runs", "lenght": 5}, "has no option lenght; it has: length, test, validation, seed"),
         ({"protocl": "runs"}, "'official' has no option protocl"),
         ({"protocol": "official", "test": 0.2}, "'official' has no option test"),
@@ -148,8 +153,10 @@ def test_an_option_at_none_is_not_given(transmitters):
         ({"protocol": "random", "test": 1.0}, r"'test' must be in \(0, 1\), got 1.0"),
         ({"protocol": "random", "validation": 1}, r"'validation' must be in \[0, 1\), got 1"),
         ({"protocol": "random", "validation": -0.1}, "'validation' must be"),
-        ({"protocol": "runs", "length": 0}, "'length' must be a whole number of links"),
-        ({"protocol": "runs", "length": 2.5}, "'length' must be a whole number of links"),
+        ({"protocol": "official", "length": 0}, "'length' must be a whole number of rows"),
+        ({"protocol": "official", "length": N}, "takes two groups of them or more, got 1"),
+        ({"protocol": "runs", "length": 0}, "'length' must be a whole number of rows"),
+        ({"protocol": "runs", "length": 2.5}, "'length' must be a whole number of rows"),
         ({"protocol": "blocks", "edge": 0}, r"'edge' must be positive \[m\], got 0"),
         ({"protocol": "blocks", "edge": float("nan")}, "'edge' must be positive"),
         ({"protocol": "sparse", "train": 321}, r"'train' must be in 1\.\.320"),
@@ -165,3 +172,67 @@ def test_unusable_options_are_refused(transmitters, options, message):
 def test_data_without_official_parts_says_so(transmitters):
     with pytest.raises(ValueError, match="no official split; choose of random, sparse, runs, blocks"):
         split(transmitters, "official")
+
+
+# --- several links a row ---
+
+
+@pytest.fixture
+def heard():
+    """Places of 120 rows, and the rows of the links by which up to six receivers heard them; row 7 was not heard."""
+    generator = torch.Generator().manual_seed(5)
+    heard = torch.rand(120, 6, generator=generator) < 0.6
+    heard[7] = False
+    return 3 * torch.rand(120, 3, generator=generator), heard.nonzero()[:, 0]
+
+
+@pytest.mark.parametrize("options", PROTOCOLS, ids=lambda options: options["protocol"])
+@pytest.mark.parametrize("seed", range(3))
+def test_links_of_a_row_are_never_parted(heard, options, seed):
+    places, rows = heard
+    early = rows < 90
+    official = early.nonzero()[:, 0], (~early).nonzero()[:, 0]
+    result = split(places[rows], rows=rows, official=official, seed=seed, validation=0.2, **options)
+    parts = [set(rows[part].tolist()) for part in result.parts().values()]
+    assert all(parts)
+    assert sum(map(len, parts)) == len(set.union(*parts))
+    training = len(result.train) + len(result.validation)
+    if options["protocol"] != "blocks":
+        assert len(result.validation) == pytest.approx(0.2 * training, abs=40)
+    if options["protocol"] != "sparse":
+        assert training + len(result.test) == len(rows)
+
+
+def test_sparse_counts_rows(heard):
+    places, rows = heard
+    few, more = (split(places[rows], "sparse", rows=rows, train=count, validation=0) for count in (5, 40))
+    assert (len(rows[few.train].unique()), len(rows[more.train].unique())) == (5, 40)
+    assert set(few.train.tolist()) < set(more.train.tolist())
+    assert len(few.train) > 5
+    with pytest.raises(ValueError, match=r"'train' must be in 1\.\.\d\d, the rows that do not test"):
+        split(places[rows], "sparse", rows=rows, train=119)
+
+
+def test_runs_count_rows(heard):
+    places, rows = heard
+    result = split(places[rows], "runs", rows=rows, length=10, validation=0)
+    runs = [set((rows[part] // 10).tolist()) for part in (result.train, result.test)]
+    assert runs[0].isdisjoint(runs[1])
+    assert runs[0] | runs[1] == set(range(12))
+    assert len(result.test) == pytest.approx(0.2 * len(rows), abs=30)
+
+
+def test_official_validation_in_runs_of_rows(heard):
+    places, rows = heard
+    official = (rows < 100).nonzero()[:, 0], (rows >= 100).nonzero()[:, 0]
+    result = split(places[rows], rows=rows, official=official, length=10, validation=0.3)
+    validating = rows[result.validation].unique()
+    assert {(row // 10).item() for row in validating}.isdisjoint((rows[result.train] // 10).tolist())
+    assert len(validating) == pytest.approx(30, abs=10)
+    assert torch.equal(result.test, official[1])
+
+
+def test_each_link_is_a_row_of_its_own_unless_given(transmitters):
+    for options in PROTOCOLS[1:]:
+        plain, numbered = (split(transmitters, **options, **o) for o in ({}, {"rows": torch.arange(N)}))
+        assert all(torch.equal(a, b) for a, b in zip(plain.parts().values(), numbered.parts().values(), strict=True))

@@ -5,9 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gaigs.data import Split
 from gaigs.geometry import covariances
 from gaigs.model import Batch
 from gaigs.model.gaigs import GaussianSplatting
+from gaigs.registry import registry
 from gaigs.testing import example_links, rasterize_densely
 from gaigs.training.batches import take
 
@@ -144,15 +146,85 @@ def test_predict_takes_lists_and_leaves_the_mode(build):
     assert model.predict(torch.zeros(0, 3)).shape == (0, 18, 36)
 
 
+def test_predict_takes_points_grids_and_receivers_of_any_kind(build):
+    model, points = build(), torch.rand(2, 3, 3)
+    each = torch.stack([model.predict(points.flatten(0, 1), receiver) for receiver in (0, 1)])
+    close = lambda found, true: torch.testing.assert_close(found, true, rtol=0, atol=1e-5)
+    close(model.predict(points, "gateway1"), each[1].unflatten(0, (2, 3)))
+    close(model.predict(points[1, 2], 1), each[1, 5])
+    receivers = torch.tensor([0, 1, 1, 0, 1, 0])
+    close(model.predict(points.flatten(0, 1), receivers), each[receivers, torch.arange(6)])
+
+
+# --- received signal strength ---
+
+
+@pytest.fixture
+def readings(links):
+    """Two receivers, who hear the same places; one place is heard twice by the first."""
+    places, receivers = torch.rand(6, 3), torch.tensor([0, 1])
+    transmitters = torch.cat((places.repeat_interleave(2, 0), places[:1]))
+    n = len(transmitters)
+    split = Split("all", torch.arange(n), torch.arange(0), torch.arange(n))
+    index = torch.cat((receivers.repeat(6), receivers[:1]))
+    return replace(
+        links, transmitters=transmitters, receiver_index=index, labels=-60 - 9 * torch.rand(n), grid=None, split=split
+    )
+
+
+@pytest.fixture
+def rssi(readings):
+    torch.manual_seed(0)
+    mapping = {"width": 16, "attenuation_layers": 1, "signal_layers": 1, "heads": ["signal", "opacity"]}
+    pooling = {"name": "softmax_attention", "temperature": 0.3, "prior": 0.2}
+    options = PARTS | {"pooling": pooling, "grid": [4, 8], "reference": {"name": "path_loss"}, "mapping": mapping}
+    model = GaussianSplatting(readings.scene, **options)
+    model.fit(readings)
+    return model
+
+
+def test_rssi_is_the_pooled_map_on_top_of_the_reference(rssi, readings):
+    batch = take(readings, torch.tensor([0, 2, 4]))  # all of the first receiver
+    image, _ = rssi.rasterizer(*rssi.render_arguments(batch))
+    assert image.shape == (3, 1, 4, 8)
+    reference = registry("model").build({"name": "path_loss"}, scene=readings.scene)
+    reference.fit(readings)
+    expected = reference(batch).label + rssi.pooling(image)
+    torch.testing.assert_close(rssi(batch).label, expected)
+    assert (rssi.pooling(image).abs() > 0.1).all()
+
+
+def test_links_of_several_receivers_come_out_in_their_order(rssi, readings):
+    index = torch.randperm(13)
+    together = rssi(take(readings, index)).label
+    alone = torch.cat([rssi(take(readings, i[None])).label for i in index])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-4)
+
+
+def test_a_place_is_mapped_once_for_all_who_hear_it(rssi, readings):
+    asked = []
+    rssi.mapping.register_forward_pre_hook(lambda _, arguments: asked.append(len(arguments[0].transmitters)))
+    rssi(take(readings, torch.arange(13)))
+    assert asked == [6]
+
+
+@pytest.mark.parametrize("options", [{"grid": [4, 8]}, {"reference": {"name": "mean"}}])
+def test_spectra_have_a_grid_of_their_own_and_no_reference(build, options):
+    with pytest.raises(ValueError, match=rf"model\.{next(iter(options))} must be given for RSSI and null for spectra"):
+        build(**options)
+
+
 @pytest.mark.parametrize(
     ("transmitters", "receiver", "message"),
     [
-        ([1.0, 2, 3], 0, r"\(n, 3\) positions in metres, got shape \(3,\)"),
+        ([1.0, 2], 0, r"\(..., 3\) positions \[m\], got shape \(2,\)"),
         ([[1.0, 2]], 0, r"got shape \(1, 2\)"),
         ([[1.0, 2, 3], [0, float("nan"), 1]], 0, r"must be finite, got \[0.0, nan, 1.0\] in row 1"),
         ([[1.0, float("inf"), 3]], 0, "must be finite"),
         ([[1.0, 2, 3]], 2, "must be one of 0 = gateway0, 1 = gateway1, got 2"),
         ([[1.0, 2, 3]], -1, "got -1"),
+        ([[1.0, 2, 3]], "gateway2", "must be one of 0 = gateway0, 1 = gateway1, got 'gateway2'"),
+        ([[1.0, 2, 3]], torch.tensor([0, 1]), r"one for each of the \(1,\) positions, got \(2,\)"),
     ],
 )
 def test_impossible_questions_are_refused(build, transmitters, receiver, message):
@@ -171,4 +243,4 @@ def test_a_batch_moves_and_thins(batch):
     moved = batch.to(torch.device("meta"))
     assert {moved.transmitters.device.type, moved.labels.device.type, moved.grid.azimuths.device.type} == {"meta"}
     bare = replace(batch, labels=None, grid=None).to(torch.device("meta"))
-    assert bare == Batch(bare.transmitters, 0, None, None)
+    assert bare == Batch(bare.transmitters, bare.receivers, None, None)

@@ -13,7 +13,7 @@ from gaigs.data import Grid, Links, Receiver, Split
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Pose, covariances
 from gaigs.report import figures
-from gaigs.report.curves import loss_curves, read_curves, speed_against_error, ssim_cdf
+from gaigs.report.curves import cdf, loss_curves, read_curves, speed_against_error
 from gaigs.report.figures import write_figures
 from gaigs.report.room import DRAWN, Cloud, room
 from gaigs.report.spectra import spectra
@@ -80,7 +80,7 @@ def test_pixels_lie_where_their_directions_are():
 
 def test_cdf_is_the_empirical_one(rng):
     scores = {"gaigs": rng.random(40), "mean": rng.random(41), "knn": rng.random(40)}
-    figure = ssim_cdf(scores, "runs of 20")
+    figure = cdf(scores, "SSIM", "spectra", "runs of 20", (None, 1))
     ax = figure.axes[0]
     steps = [line for line in ax.lines if line.get_drawstyle().startswith("steps")]
     dots = [line for line in ax.lines if line.get_marker() == "o"]
@@ -92,7 +92,17 @@ def test_cdf_is_the_empirical_one(rng):
         np.testing.assert_allclose(y[1:], truth.probabilities)
         assert dot.get_xydata()[0] == pytest.approx((np.median(ssim), 0.5))
         assert step.get_label() == f"{name} {np.median(ssim):.3f}"
-    assert "runs of 20" in ax.get_xlabel()
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("SSIM, split runs of 20", "share of test spectra")
+    assert ax.get_xlim()[1] == 1
+    assert figure.legends[0].get_title().get_text() == "median SSIM"
+
+
+def test_ends_of_the_cdf_are_those_asked_for(rng):
+    errors = {"gaigs": 10 * rng.random(40)}
+    (ax,) = cdf(errors, "|error| [dB]", "readings", "official", (0, 7.5)).axes
+    assert ax.get_xlim() == (0, 7.5)
+    (line,) = (line for line in ax.lines if line.get_label().startswith("gaigs"))
+    assert line.get_label() == f"gaigs {np.median(errors['gaigs']):.2f}"
 
 
 def write_losses(path, steps=30):

@@ -5,10 +5,12 @@ import json
 import re
 import subprocess
 import sys
+from io import StringIO
 
 import pytest
 import yaml
 from matplotlib import image
+from rich.console import Console
 
 from gaigs.report import multirun
 from gaigs.report.multirun import ablation, read_runs, report
@@ -43,6 +45,11 @@ def write_run(folder, number, overrides, **metrics):
 def scores(gaigs, mean=0.6, knn=0.95):
     medians = {"gaigs": gaigs, "mean": mean, "knn": knn}
     return {name: {"ssim_median": median, "mae": 1 - median} for name, median in medians.items()}
+
+
+def errors(gaigs, knn=4.158, path_loss=4.974):
+    means = {"gaigs": gaigs, "knn": knn, "path_loss": path_loss}
+    return {name: {"mae_db": e, "median_ae_db": 0.8 * e, "rmse_db": 1.3 * e} for name, e in means.items()}
 
 
 def read_csv(folder):
@@ -121,6 +128,30 @@ def test_speed_is_drawn_from_the_runs_that_ended(tmp_path, monkeypatch):
     assert [str(time) for time in times["inference [ms a transmitter]"]] == ["17.25", "nan"]
     assert times["training [s]"].tolist() == [60.5, 60.5]
     assert (label, lookups) == ("median SSIM", {"mean": 0.6, "knn": 0.95})
+
+
+def test_runs_of_rssi(tmp_path, monkeypatch):
+    common = ["+experiment=rssi", "data=nerf2_rssi"]
+    write_run(tmp_path, "0", [*common, "pooling=softmax_attention"], models=errors(3.859), receivers={"g": errors(3.0)})
+    write_run(tmp_path, "1", [*common, "pooling=mean_power"], models=errors(4.021), receivers={"g": errors(3.0)})
+    drawn = []
+    original = multirun.speed_against_error
+    monkeypatch.setattr(multirun, "speed_against_error", lambda *args: drawn.append(args) or original(*args))
+    table = report(tmp_path)
+    rows = read_csv(tmp_path)
+    assert list(rows[0])[3:7] == ["pooling", "mae_db", "median_ae_db", "rmse_db"]
+    assert [row["mae_db"] for row in rows] == ["3.859", "4.021", "4.158", "4.974"]
+    assert [row["model"] for row in rows[2:]] == ["knn", "path_loss"]  # once, for they are the same in both runs
+    assert not any("ssim" in column for column in rows[0])
+    names, values, _, label, lookups = drawn[0]
+    assert names == ["pooling=softmax_attention", "pooling=mean_power"]
+    assert values.tolist() == [3.859, 4.021]
+    assert (label, lookups) == ("MAE [dB]", {"knn": 4.158, "path_loss": 4.974})
+    console = Console(width=80, file=StringIO())
+    console.print(table)
+    printed = console.file.getvalue()
+    assert all(score in printed for score in ("3.859", "4.021", "4.158", "4.974"))
+    assert "…" not in printed  # long names are folded
 
 
 def test_models_may_vary(tmp_path):

@@ -11,6 +11,7 @@ from gaigs.data import Grid, Receiver, Scene
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Pose
 from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine, save
+from gaigs.training.metrics import scoring
 
 MIDDLE = (1.0, 2.0, 0.5)
 
@@ -104,6 +105,8 @@ def test_density_control_refuses():
 
 # --- checkpoints ---
 
+SPECTRA, RSSI = scoring(Grid.degrees()), scoring(None)
+
 
 class Trainer(SimpleNamespace):
     """What the checkpoint callbacks see of Lightning's trainer; a checkpoint is the number of its step."""
@@ -116,18 +119,20 @@ class Trainer(SimpleNamespace):
         assert not weights_only, "the optimizer's state belongs to it"
         path.write_text(str(self.global_step))
 
-    def validate(self, callback, ssim):
+    def validate(self, callback, score, scoring=SPECTRA):
         self.global_step += 1
-        self.callback_metrics = {"validation/ssim": torch.tensor(ssim)}
-        callback.on_validation_end(self, None)
+        self.callback_metrics = {f"validation/{scoring.watched}": torch.tensor(score)}
+        callback.on_validation_end(self, SimpleNamespace(scoring=scoring))
 
 
-def test_the_best_checkpoint_is_that_of_the_highest_ssim(tmp_path):
+@pytest.mark.parametrize(("scoring", "sign"), [(SPECTRA, 1), (RSSI, -1)])
+def test_the_best_checkpoint_is_that_of_the_best_score(tmp_path, scoring, sign):
+    """The highest similarity, or the smallest error."""
     path, trainer = tmp_path / "best.ckpt", Trainer()
     callback = KeepBest(path, patience=None)
     saved = []
-    for ssim in (0.3, 0.5, 0.4, 0.5, 0.6, float("nan"), 0.1):
-        trainer.validate(callback, ssim)
+    for score in (0.3, 0.5, 0.4, 0.5, 0.6, float("nan"), 0.1):
+        trainer.validate(callback, sign * score, scoring)
         saved.append(path.read_text())
     callback.on_fit_end(trainer, None)
     assert saved == ["1", "2", "2", "2", "5", "5", "5"]
@@ -152,7 +157,7 @@ def test_lightnings_trial_validation_counts_for_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("kill", range(6))
-def test_patience_counts_validations_without_a_better_ssim(tmp_path, kill):
+def test_patience_counts_validations_without_a_better_score(tmp_path, kill):
     callback, trainer = KeepBest(tmp_path / "best.ckpt", patience=2), Trainer()
     stops = []
     for number, ssim in enumerate((0.3, 0.2, 0.4, 0.4, 0.1)):

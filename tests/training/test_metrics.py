@@ -5,7 +5,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from gaigs.training.metrics import spectrum_scores, summarise
+from gaigs.training.metrics import rssi_scores, spectrum_scores, summarise_rssi, summarise_spectra
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_predictions_may_carry_a_gradient(pairs):
 
 def test_summary_is_that_of_numpy():
     ssim, mae = np.random.default_rng(0).random((2, 17))
-    summary = summarise({"ssim": torch.tensor(ssim), "mae": torch.tensor(mae)})
+    summary = summarise_spectra({"ssim": torch.tensor(ssim), "mae": torch.tensor(mae)})
     expected = {
         "ssim_median": np.median(ssim),
         "ssim_mean": ssim.mean(),
@@ -66,4 +66,26 @@ def test_unusable_spectra_are_refused(labels, predictions, message):
 
 def test_nothing_to_summarise_is_refused():
     with pytest.raises(ValueError, match="at least one sample"):
-        summarise(spectrum_scores(torch.zeros(0, 9, 9), torch.zeros(0, 9, 9)))
+        summarise_spectra(spectrum_scores(torch.zeros(0, 9, 9), torch.zeros(0, 9, 9)))
+
+
+def test_rssi_is_scored_in_db():
+    labels, predictions = torch.tensor([-50.0, -60.0, -70.0, -80.0]), torch.tensor([-49.0, -62.0, -70.0, -75.0])
+    scores = rssi_scores(labels, predictions)
+    assert scores["mae_db"].tolist() == [1, 2, 0, 5]
+    assert summarise_rssi(scores) == {"mae_db": 2, "median_ae_db": 1.5, "rmse_db": pytest.approx(7.5**0.5)}
+
+
+@pytest.mark.parametrize(
+    ("labels", "predictions", "message"),
+    [
+        (torch.zeros(3), torch.zeros(4), r"must both be \(k,\), got \(3,\) and \(4,\)"),
+        (torch.zeros(3, 1), torch.zeros(3, 1), r"must both be \(k,\)"),
+        (torch.zeros(3), torch.tensor([0, torch.nan, 0]), "predictions must be finite, got NaN or infinity in 1 of 3"),
+    ],
+)
+def test_impossible_rssi_is_refused(labels, predictions, message):
+    with pytest.raises(ValueError, match=message):
+        rssi_scores(labels, predictions)
+    with pytest.raises(ValueError, match="at least one sample, got none"):
+        summarise_rssi(rssi_scores(torch.zeros(0), torch.zeros(0)))

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import lightning
 import pytest
 import torch
@@ -11,7 +13,8 @@ from gaigs.data import Grid, Links, Receiver, Split
 from gaigs.geometry import Pose
 from gaigs.model import Model, Prediction
 from gaigs.report.curves import read_curves
-from gaigs.training.batches import Batches, Pass
+from gaigs.training.batches import Batches, Pass, take
+from gaigs.training.losses import RssiLoss
 from gaigs.training.module import Training
 
 
@@ -36,8 +39,7 @@ class Plane(Model):
 
 OPTIONS = {
     "batch_size": 4,
-    "stride": 3,
-    "ssim": 0.25,
+    "loss": {"stride": 3, "ssim": 0.25},
     "penalties": {"gain": 0.5},
     "learning_rates": {"slope": 0.01, "network": 0.02, "elsewhere": 1.0},
     "final_rate": 0.1,
@@ -183,9 +185,55 @@ def test_a_loss_that_is_not_finite_ends_the_training(module, links, tmp_path):
         fit(module, links, tmp_path, 3)
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("ssim", 2), ("final_rate", 0), ("warmup", -1), ("stride", 0), ("stride", 40)]
-)
+@pytest.mark.parametrize(("option", "value"), [("final_rate", 0.0), ("warmup", -1)])
 def test_an_option_out_of_range_is_refused(links, option, value):
     with pytest.raises(ValueError, match=rf"training\.{option} must be .*, got {value}"):
         Training(Plane(links.scene), {}, seed=0, **OPTIONS | {option: value})
+
+
+@pytest.mark.parametrize(("option", "value"), [("ssim", 2.0), ("stride", 0), ("stride", 40)])
+def test_an_option_of_the_loss_out_of_range_is_refused(links, option, value):
+    with pytest.raises(ValueError, match=rf"training\.loss\.{option} must be .*, got {value}"):
+        Training(Plane(links.scene), {}, seed=0, **OPTIONS | {"loss": OPTIONS["loss"] | {option: value}})
+
+
+class Slope(Model):
+    """An RSSI that rises with x."""
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.slope = nn.Parameter(torch.tensor(2.0))
+
+    def forward(self, batch):
+        return Prediction(self.slope * batch.transmitters[:, 0], {})
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [("absolute", lambda e: e.abs()), ("squared", lambda e: e**2), ("huber", lambda e: huber(e.abs()))],
+)
+def test_rssi_is_trained_and_scored_in_db(links, tmp_path, kind, expected):
+    labels = torch.linspace(-90, -40, 12)
+    readings = replace(links, labels=labels, grid=None)
+    options = OPTIONS | {"loss": {"kind": kind, "bend": 60.0}, "penalties": {}}
+    module = Training(Slope(readings.scene), {}, seed=0, **options)
+    batch = take(readings, torch.arange(12))
+    loss, terms, _ = module.loss(module.model, batch, torch.Generator())
+    errors = 2 * readings.transmitters[:, 0] - labels
+    assert loss.item() == pytest.approx(expected(errors).mean().item())
+    assert terms["mae_db"].item() == pytest.approx(errors.abs().mean().item())
+    trainer = fit(module, readings, tmp_path, 5)
+    index = readings.split.validation
+    errors = module.model.predict(readings.transmitters[index]) - labels[index]
+    assert trainer.callback_metrics["validation/mae_db"].item() == pytest.approx(errors.abs().mean().item(), rel=1e-6)
+
+
+def huber(errors, bend=60.0):
+    return torch.where(errors < bend, errors**2 / 2, bend * (errors - bend / 2))
+
+
+def test_an_rssi_loss_refuses():
+    with pytest.raises(ValueError, match=r"training\.loss\.kind must be absolute, squared or huber, got 'cubic'"):
+        RssiLoss("cubic", 5.0)
+    with pytest.raises(ValueError, match=r"training\.loss\.bend must be more than 0 dB, got 0"):
+        RssiLoss("huber", 0.0)

@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Grid, Links, Receiver
@@ -63,11 +63,8 @@ def furnished_room(
 
     Source: the defaults for frequency and bandwidth are those of channel 5 of IEEE 802.15.4 (ultra-wideband).
     """
-    if transmitters < 2:
-        raise ValueError(f"transmitters must be at least 2, one to train and one to test on, got {transmitters}")
+    official = last_fifth(transmitters)
     positions = place(transmitters, seed)
-    testing = max(1, round(TEST * transmitters))
-    official = torch.arange(transmitters).split((transmitters - testing, testing))
     grid = Grid.degrees()
     return Links(
         transmitters=positions,
@@ -79,6 +76,18 @@ def furnished_room(
         normalisation=NORMALISATION,
         edges=edges(ROOM),
     )
+
+
+def last_fifth(transmitters: int) -> tuple[Int[Tensor, "train"], Int[Tensor, "test"]]:
+    """The official split of so many transmitters: the last fifth of them tests.
+
+    Raises:
+        ValueError: There are fewer than 2.
+    """
+    if transmitters < 2:
+        raise ValueError(f"transmitters must be at least 2, one to train and one to test on, got {transmitters}")
+    testing = max(1, round(TEST * transmitters))
+    return torch.arange(transmitters).split((transmitters - testing, testing))
 
 
 def place(count: int, seed: int) -> Float[Tensor, "count 3"]:

@@ -255,16 +255,49 @@ def respond(
 
     Source: Friis, A note on a simple transmission formula, 1946.
     """
-    if frequency + offsets.min() <= 0:
-        raise ValueError(f"frequencies must be positive, got {frequency + offsets.min():.6g} Hz; narrow the bandwidth")
     paths = trace(room, transmitters, pose.position, frequency, order)
     local = (paths.images - pose.position.double()) @ pose.rotation.double()
     pattern = (local[..., 2] / local.norm(dim=-1)).clamp(min=0)
     elements = array_elements(pose, speed_of_light / frequency)
-    distances = (paths.images[:, :, None] - elements).norm(dim=-1)[..., None]
-    phases = distances * (2 * math.pi * (frequency + offsets.double()) / speed_of_light)
+    distances = (paths.images[:, :, None] - elements).norm(dim=-1)
+    return _add_up(paths.gains * pattern, distances, frequency + offsets.double())
+
+
+def respond_isotropic(
+    room: Room,
+    transmitters: Float[Tensor, "b 3"],
+    receiver: Float[Tensor, "3"],
+    frequency: float,
+    offsets: Float[Tensor, "f"],
+    order: int,
+) -> Complex[Tensor, "b 1 f"]:
+    """What a single antenna that hears all directions alike receives from a unit-power isotropic transmitter.
+
+    Args:
+        room: Walls and furniture.
+        transmitters: Positions [m].
+        receiver: Position of the antenna [m].
+        frequency: Of the carrier [Hz].
+        offsets: Frequencies to evaluate, relative to the carrier [Hz].
+        order: Largest number of reflections.
+
+    Raises:
+        ValueError: A frequency is not positive, or as for ``trace``.
+    """
+    paths = trace(room, transmitters, receiver, frequency, order)
+    distances = (paths.images - receiver.double()).norm(dim=-1, keepdim=True)
+    return _add_up(paths.gains, distances, frequency + offsets.double())
+
+
+def _add_up(
+    gains: Complex[Tensor, "b p"], distances: Float[Tensor, "b p elements"], frequencies: Float[Tensor, "f"]
+) -> Complex[Tensor, "b elements f"]:
+    """The sum of spherical waves over all paths, by path length [m] and frequency [Hz]."""
+    if frequencies.min() <= 0:
+        raise ValueError(f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth")
+    phases = distances[..., None] * (2 * math.pi * frequencies / speed_of_light)
     # Friis: wavelength / (4 pi distance), which is 1 / (2 phase).
-    return torch.einsum("bp,bpnf->bnf", paths.gains * pattern, torch.polar(0.5 / phases, -phases))
+    return torch.einsum("bp,bpnf->bnf", gains, torch.polar(0.5 / phases, -phases))
 
 
 def bartlett(responses: Complex[Tensor, "b elements f"], grid: Grid) -> Float[Tensor, "b rows columns"]:

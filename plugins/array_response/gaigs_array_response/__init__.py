@@ -68,7 +68,8 @@ class ArrayResponse(Model):
 
     def forward(self, batch: Batch) -> Prediction:
         features = fourier_features(batch.transmitters - self.middle, self.frequencies)
-        fields = self.network(features).unflatten(-1, self.fields)[:, batch.receiver]
+        fields = self.network(features).unflatten(-1, self.fields)
+        fields = fields[torch.arange(len(fields), device=fields.device), batch.receivers]
         # A minimum's gradient is that of one pixel: where it lies is searched without the gradients of all the others.
         with torch.no_grad():
             powers = torch.einsum("bf,fcp->bcp", fields, self.steering).square().sum(1)

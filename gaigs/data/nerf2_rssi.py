@@ -1,0 +1,210 @@
+"""Received signal strength in the folder layout of NeRF²; docs/data.md describes the files."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.data import Links, Receiver
+from gaigs.data._files import find_folder, has_columns, read_lines, read_points, refuse, to_cells, to_number, to_numbers
+from gaigs.data.splits import split as split_links
+from gaigs.geometry import Pose
+from gaigs.registry import register
+
+NORMALISATION = "dBm"
+
+NOT_HEARD = -100.0
+"""What stands for a reading that was not heard [dBm]."""
+
+LOUDEST = 0.0
+"""No reading reaches it [dBm]: over 0.3 m alone, 2.4 GHz loses 30 dB, more than the 20 dBm that Bluetooth may send. So
+0 and above are other units, a lost sign or other marks of "not heard"."""
+
+POSITIONS, READINGS, LAYOUT = "gateway_position.yml", "gateway_rssi.csv", "layout.csv"
+INDICES = ("train_index.txt", "test_index.txt")
+
+
+@register("data", "nerf2_rssi")
+def read(root: str | Path, split: Mapping) -> Links:
+    """A data set from its folder, which is only read: one link for each reading that a gateway heard.
+
+    Readings of -100 dBm were not heard; they, and gateways that heard nothing, are left out and counted in the remarks.
+    Gateways look along the world's axes.
+
+    Args:
+        root: Folder with ``tx_pos.csv``, ``gateway_rssi.csv``, ``gateway_position.yml``, for the official split
+            ``train_index.txt`` and ``test_index.txt``, and where there is one ``layout.csv``.
+        split: Options of ``gaigs.data.splits.split``; the readings of one row stay together.
+
+    Raises:
+        FileNotFoundError: There is no such folder.
+        ValueError: Something is wrong with the files; the message lists the defects by file, line and value.
+
+    Source: NeRF², https://github.com/XPengZhao/NeRF2.
+    """
+    root = find_folder(root)
+    defects: list[str] = []
+    positions = read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one measurement a line", defects)
+    gateways = _read_gateways(root, defects)
+    names, readings = _read_readings(root, gateways, defects)
+    if positions and readings and len(positions) != len(readings):
+        defects.append(f"{READINGS}: expected {len(positions)} rows of readings as in tx_pos.csv, got {len(readings)}")
+    walls = read_walls(root / LAYOUT, defects) if (root / LAYOUT).exists() else torch.zeros(0, 2, 3)
+    is_official = split.get("protocol", "official") == "official"
+    entries = _read_official(root, len(positions), names, defects) if is_official else None
+    refuse(root, defects)
+
+    dbm = np.array(readings)
+    heard = dbm > NOT_HEARD
+    official = entries and tuple(_listed(part, heard) for part in entries)
+    for file, part in zip(INDICES, official or (), strict=False):
+        if not len(part):
+            defects.append(f"{file}: expected a reading that was heard, got none but {NOT_HEARD:g} in {READINGS}")
+    refuse(root, defects)
+    rows, columns = (torch.from_numpy(index) for index in heard.nonzero())
+    present, receiver_index = columns.unique(return_inverse=True)
+    transmitters = torch.tensor(positions)[rows]
+    remarks = (
+        f"{len(rows)} readings of {len(dbm)} rows at {len(present)} gateways; "
+        f"{int((~heard).sum())} of {NOT_HEARD:g} dBm were not heard and are left out"
+    )
+    deaf = [name for name, hears in zip(names, heard.any(0), strict=True) if not hears]
+    if deaf:
+        remarks += f", and so are the gateways that heard nothing: {', '.join(deaf)}"
+    if official and (unlisted := len(rows) - sum(map(len, official))):
+        remarks += f"; {unlisted} readings stand in no index file"
+    return Links(
+        transmitters=transmitters,
+        receivers=tuple(gateway(names[k], gateways[names[k]][1]) for k in present.tolist()),
+        receiver_index=receiver_index,
+        labels=torch.from_numpy(dbm[heard]).float(),
+        split=split_links(transmitters, official=official, rows=rows, **split),
+        grid=None,
+        normalisation=NORMALISATION,
+        edges=walls,
+        remarks=remarks,
+    )
+
+
+def gateway(name: str, position: Sequence[float]) -> Receiver:
+    """A receiver without orientation: its axes are the world's."""
+    return Receiver(name, Pose(torch.tensor(position), torch.eye(3)))
+
+
+def read_walls(file: Path, defects: list[str]) -> Float[Tensor, "k 2 3"]:
+    """Walls of a floor plan, at z = 0 [m]: segments from each vertex x,y of the file to the next."""
+    vertices = read_points(file, "xy", "consecutive wall vertices x,y [m], one a line", defects)
+    if len(vertices) == 1:
+        defects.append(f"{file.name}: expected two wall vertices or more, got 1")
+    if defects or not vertices:
+        return torch.zeros(0, 2, 3)
+    corners = torch.nn.functional.pad(torch.tensor(vertices), (0, 1))
+    return torch.stack((corners[:-1], corners[1:]), 1)
+
+
+def to_dbm(place: str, names: Sequence[str], cells: Sequence[str], lowest: float, defects: list[str]) -> list[float]:
+    """Cells of a line as readings [dBm], from the lowest that may stand there to below 0."""
+    bounds = f"below {LOUDEST:g}" if lowest == -math.inf else f"from {lowest:g} to below {LOUDEST:g}"
+    expected = f"an RSSI {bounds} dBm ({NOT_HEARD:g} where nothing was heard)"
+    return to_numbers(place, names, cells, lambda value: lowest <= value < LOUDEST, expected, defects)
+
+
+def _read_gateways(root: Path, defects: list[str]) -> dict[str, tuple[int, list[float]]]:
+    """Line and position [m] of each gateway."""
+    text = "\n".join(read_lines(root / POSITIONS, "each gateway's name: [x, y, z] [m]", defects))
+    try:
+        # Nodes have lines, and keys as they are written: PyYAML takes the name 010 for 8, and the last of two alike.
+        node = yaml.compose(text, yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        defects.append(f"{POSITIONS}: no YAML: {' '.join(str(error).split())}")
+        return {}
+    entries = node.value if isinstance(node, yaml.MappingNode) else []
+    if text and not entries:
+        defects.append(f"{POSITIONS}: expected each gateway's name: [x, y, z], got {text.splitlines()[0]!r}")
+    gateways = {}
+    for key, value in entries:
+        name, line = str(key.value), key.start_mark.line + 1
+        place = f"{POSITIONS}, line {line}: {name}"
+        items = value.value if isinstance(value, yaml.SequenceNode) else []
+        position = [to_number(item.value) for item in items if isinstance(item, yaml.ScalarNode)]
+        if len(items) != 3 or len(position) != 3 or not np.isfinite(position).all():
+            written = " ".join(text[value.start_mark.index : value.end_mark.index].split())
+            defects.append(f"{place}: position must be 3 finite numbers x, y, z, got {written!r}")
+        if name in gateways:
+            defects.append(f"{place} has a position in line {gateways[name][0]} already")
+        gateways[name] = line, position
+    return gateways
+
+
+def _read_readings(root: Path, gateways: Mapping, defects: list[str]) -> tuple[list[str], list[list[float]]]:
+    """The gateway of each column, and the readings [dBm] of each row."""
+    lines = read_lines(root / READINGS, "an RSSI [dBm] of each gateway, one measurement a line", defects)
+    if not lines:
+        return [], []
+    first = to_cells(lines[0])  # names, or numbers already
+    header = any(cell in gateways for cell in first) or all(math.isnan(to_number(cell)) for cell in first)
+    names = first if header else [*gateways] or [str(k) for k in range(len(first))]
+    if header and gateways:
+        place = f"{READINGS}, line 1"
+        have = ", ".join(gateways)
+        for k, name in enumerate(names):
+            if name in names[:k]:
+                defects.append(f"{place}: column {name!r} stands there twice")
+            elif name not in gateways:
+                defects.append(f"{place}: column {name!r} has no position in {POSITIONS}, which has {have}")
+        for name, (line, _) in gateways.items():
+            if name not in names:
+                defects.append(f"{POSITIONS}, line {line}: {name} has no column in {READINGS}")
+    if header and len(lines) == 1:
+        defects.append(f"{READINGS}: no readings below the header")
+    readings = []
+    for number, line in [*enumerate(lines, 1)][header:]:
+        place = f"{READINGS}, line {number}"
+        fits = has_columns(place, line, names, defects)
+        readings.append(to_dbm(place, names, to_cells(line), NOT_HEARD, defects) if fits else [])
+    if readings and all(value == NOT_HEARD for row in readings for value in row):
+        defects.append(f"{READINGS}: expected readings above {NOT_HEARD:g} dBm, got none; no gateway heard anything")
+    return names, readings
+
+
+def _read_official(root: Path, count: int, names: Sequence[str], defects: list[str]) -> tuple[list[tuple], list[tuple]]:
+    """Rows, or pairs of row and column, of the training and test files, from 0."""
+    # A gateway is named by its column's number unless numbers are names.
+    columns = {} if any(name.isdecimal() for name in names) else {str(k): k for k in range(len(names))}
+    columns |= {name: k for k, name in enumerate(names)}
+    expected = {None: "a row from 0, or a row and a gateway", False: "one row from 0", True: "a row and a gateway"}
+    paired, seen, parts = None, {}, ([], [])
+    for file, part in zip(INDICES, parts, strict=True):
+        for number, line in enumerate(read_lines(root / file, f"{expected[None]}, on each line", defects), 1):
+            place = f"{file}, line {number}"
+            row, *column = re.split(r"\s*,\s*|\s+", line.strip(), maxsplit=1)
+            is_row = row.isascii() and row.isdecimal()
+            paired = bool(column) if paired is None and is_row else paired
+            if not is_row or bool(column) != paired:
+                defects.append(f"{place}: expected {expected[paired]}, got {line!r}")
+                continue
+            entry = (int(row), *(columns.get(name) for name in column))
+            if count and int(row) >= count:
+                defects.append(f"{place}: expected a row in 0..{count - 1}, got {row}")
+            elif names and None in entry:
+                defects.append(f"{place}: expected a gateway by name or column from 0, got {column[0]!r}")
+            elif entry in seen:
+                defects.append(f"{place}: {line.strip()!r} stands in {seen[entry]} already")
+            else:
+                seen[entry] = place
+                part.append(entry)
+    return parts
+
+
+def _listed(entries: list[tuple], heard: np.ndarray) -> Tensor:
+    """Links, which are the heard readings row by row, that stand in an index file."""
+    chosen = np.zeros_like(heard)
+    for entry in entries:
+        chosen[entry] = True
+    return torch.from_numpy(chosen[heard]).nonzero().flatten()

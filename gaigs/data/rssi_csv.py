@@ -1,0 +1,123 @@
+"""Received signal strength from one table; docs/data.md describes its columns."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gaigs.data import Links
+from gaigs.data._files import has_columns, read_lines, refuse, to_cells, to_numbers
+from gaigs.data.nerf2_rssi import NORMALISATION, NOT_HEARD, gateway, read_walls, to_dbm
+from gaigs.data.splits import split as split_links
+from gaigs.registry import register
+
+ENDS = ("tx", "rx")
+COLUMNS = (*(f"{end}_{axis}" for end in ENDS for axis in "xyz"), "rss_dbm")
+"""Positions of transmitter and receiver [m], and the reading [dBm]."""
+
+FIXED = 64
+"""Places that the end which stands still may have, each a receiver of its own."""
+
+
+@register("data", "rssi_csv")
+def read(file: str | Path, split: Mapping, layout: str | Path | None = None) -> Links:
+    """A data set from a table with a heading, one reading a line: one link for each reading that was heard.
+
+    The end with fewer places is the fixed one, the receiver's in a tie. Its places become the receivers, ``rx1`` ... or
+    ``tx1`` ... in the order in which they appear, and look along the world's axes; the other end moves and gives the
+    transmitters. A fixed transmitter with a moving receiver is thus read as the reverse, which reciprocity allows: a
+    channel attenuates alike either way, so where an antenna's gain is the same for sending and hearing, the reading is
+    what the fixed end would hear if the moving one sent with the fixed one's power.
+
+    Readings of -100 dBm or below were not heard; they, and fixed places that nothing was heard at, are left out and
+    counted in the remarks. There is no official split.
+
+    Args:
+        file: Has the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m] and ``rss_dbm`` in any
+            order; others are ignored, and named in the remarks.
+        split: Options of ``gaigs.data.splits.split``; the readings of one place of the moving end stay together.
+        layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; none unless given.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: Both ends move, or something is wrong with the files; the message lists the defects by file, line
+            and value.
+    """
+    file = Path(file).expanduser()
+    if not file.is_file():
+        raise FileNotFoundError(f"{file} must be a table of readings, and is no file; set the data's file")
+    defects: list[str] = []
+    points, dbm, ignored = _read_table(file, defects)
+    walls = torch.zeros(0, 2, 3) if layout is None else read_walls(Path(layout).expanduser(), defects)
+    refuse(file, defects)
+
+    numbered = {end: _number(points[end]) for end in ENDS}
+    fixed, moving = sorted(ENDS, key=lambda end: (len(numbered[end][0]), end != "rx"))
+    places, at = numbered[fixed]
+    if len(places) > FIXED:
+        tx, rx = (len(numbered[end][0]) for end in ENDS)
+        raise ValueError(
+            f"{file}: one end must stand at {FIXED} places at most, got {tx} of the transmitter and {rx} of the "
+            "receiver: both ends move; keep the readings of a few places of one end"
+        )
+    heard = torch.tensor([value > NOT_HEARD for value in dbm])
+    present, receiver_index = at[heard].unique(return_inverse=True)
+    transmitters = torch.tensor(points[moving])[heard]
+    words = {"tx": "transmitter", "rx": "receiver"}
+    remarks = (
+        f"{len(transmitters)} readings of a moving {words[moving]} at {len(present)} places of a fixed {words[fixed]}; "
+        f"{int((~heard).sum())} of {NOT_HEARD:g} dBm or below were not heard and are left out"
+    )
+    deaf = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
+    if deaf:
+        remarks += f", and so are the places that nothing was heard at: {', '.join(deaf)}"
+    if ignored:
+        remarks += f"; columns ignored: {', '.join(ignored)}"
+    return Links(
+        transmitters=transmitters,
+        receivers=tuple(gateway(f"{fixed}{k + 1}", places[k]) for k in present.tolist()),
+        receiver_index=receiver_index,
+        labels=torch.tensor(dbm)[heard],
+        split=split_links(transmitters, rows=numbered[moving][1][heard], **split),
+        grid=None,
+        normalisation=NORMALISATION,
+        edges=walls,
+        remarks=remarks,
+    )
+
+
+def _read_table(file: Path, defects: list[str]) -> tuple[dict[str, list], list[float], list[str]]:
+    """Positions of either end [m], readings [dBm], and the columns that are none of ours."""
+    lines = read_lines(file, f"a heading with {','.join(COLUMNS)}", defects)
+    names = to_cells(lines[0]) if lines else []
+    points, dbm = {end: [] for end in ENDS}, []
+    for name in COLUMNS:
+        if lines and names.count(name) != 1:
+            defects.append(f"{file.name}, line 1: expected one column {name}, got {names.count(name)} in {lines[0]!r}")
+    if len(lines) == 1:
+        defects.append(f"{file.name}: no readings below the heading")
+    if defects:
+        return points, dbm, []
+    at = [names.index(name) for name in COLUMNS]
+    for number, line in enumerate(lines[1:], 2):
+        place = f"{file.name}, line {number}"
+        if not has_columns(place, line, names, defects):
+            continue
+        cells = to_cells(line)
+        cells = [cells[k] for k in at]
+        coordinates = to_numbers(place, COLUMNS, cells[:6], math.isfinite, "a finite number", defects)
+        points["tx"].append(coordinates[:3])
+        points["rx"].append(coordinates[3:])
+        dbm += to_dbm(place, COLUMNS[6:], cells[6:], -math.inf, defects)
+    if not defects and max(dbm) <= NOT_HEARD:
+        defects.append(f"{file.name}: expected readings above {NOT_HEARD:g} dBm, got none; nothing was heard")
+    return points, dbm, [name for name in names if name not in COLUMNS]
+
+
+def _number(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:
+    """The distinct points in the order in which they appear, and which of them each one is."""
+    numbers: dict[tuple, int] = {}
+    index = [numbers.setdefault(tuple(point), len(numbers)) for point in points]
+    return [*numbers], torch.tensor(index)

@@ -1,0 +1,93 @@
+"""Received signal strength in the built-in room, as Bluetooth gateways on its walls report it."""
+
+import math
+from collections.abc import Mapping
+
+import torch
+
+from gaigs.data import Links, Receiver
+from gaigs.data.splits import split as split_links
+from gaigs.data.synthetic import ROOM, edges, last_fifth, place
+from gaigs.data.synthetic.image_source import frequency_offsets, respond_isotropic, rss_dbm
+from gaigs.geometry import Pose
+from gaigs.registry import register
+
+FREQUENCY, BANDWIDTH = 2.441e9, 78e6
+"""Middle and width of the band that Bluetooth's advertising channels span, 2.402 to 2.480 GHz [Hz]."""
+
+GATEWAYS = {
+    "west": (0.1, 2.6, 2.4),
+    "south": (1.7, 0.1, 1.2),  # the partition stands between it and most of the room
+    "east": (6.9, 1.4, 1.6),
+    "north": (2.4, 4.9, 2.0),
+}
+"""Positions by the wall that the gateway hangs on, world frame [m]."""
+
+
+@register("data", "synthetic_rssi")
+def furnished_room_rssi(
+    split: Mapping,
+    transmitters: int = 600,
+    noise: float = 2.0,
+    sensitivity: float = -95.0,
+    order: int = 2,
+    seed: int = 0,
+) -> Links:
+    """Signal strength of transmitters of 0 dBm at random places in the default room, at four gateways.
+
+    Every antenna is isotropic, so a gateway has no orientation: its axes are the world's. Power is averaged over the
+    band before it is told in dB. The official split tests on the last fifth of the places.
+
+    Args:
+        split: Options of ``gaigs.data.splits.split``; the links of one place stay together.
+        transmitters: How many places.
+        noise: Standard deviation of the Gaussian error of each reading [dB].
+        sensitivity: Readings below it are not heard, and left out [dBm].
+        order: Largest number of reflections of a path.
+        seed: Of the places and the noise.
+
+    Raises:
+        ValueError: An option is out of range, or a gateway hears nothing.
+    """
+    if not 0 <= noise < math.inf:
+        raise ValueError(f"noise must be a standard deviation, 0 or more [dB], got {noise}")
+    official = last_fifth(transmitters)
+    places = place(transmitters, seed)
+    offsets = frequency_offsets(ROOM, BANDWIDTH, order)
+    readings = torch.stack(
+        [
+            rss_dbm(respond_isotropic(ROOM, places, torch.tensor(position), FREQUENCY, offsets, order))
+            for position in GATEWAYS.values()
+        ],
+        1,
+    )
+    # A seed of its own: from the places' seed come the random numbers that the places are made of.
+    generator = torch.Generator().manual_seed(hash((seed, 1)) % 2**63)
+    readings += noise * torch.randn(readings.shape, dtype=readings.dtype, generator=generator)
+    heard = readings >= sensitivity
+    for name, any_heard in zip(GATEWAYS, heard.any(0), strict=True):
+        if not any_heard:
+            raise ValueError(
+                f"sensitivity must let each gateway hear a reading, but {name!r} hears none of {transmitters} at "
+                f"{sensitivity:g} dBm; lower it"
+            )
+    rows, receiver_index = heard.nonzero(as_tuple=True)
+    return Links(
+        transmitters=places[rows],
+        receivers=tuple(Receiver(name, Pose(torch.tensor(p), torch.eye(3))) for name, p in GATEWAYS.items()),
+        receiver_index=receiver_index,
+        labels=readings[heard].float(),
+        split=split_links(
+            places[rows],
+            rows=rows,
+            official=tuple(torch.isin(rows, part).nonzero().flatten() for part in official),
+            **split,
+        ),
+        grid=None,
+        normalisation="dBm",
+        edges=edges(ROOM),
+        remarks=(
+            f"{len(rows)} readings of {transmitters} places at {len(GATEWAYS)} gateways; "
+            f"{int((~heard).sum())} below {sensitivity:g} dBm were not heard and are left out"
+        ),
+    )

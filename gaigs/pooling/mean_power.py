@@ -1,0 +1,53 @@
+"""RSSI by physics: the power that arrives from all directions together."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.data import Grid
+from gaigs.registry import register
+
+
+@register("pooling", "mean_power")
+class MeanPower(nn.Module):
+    """The mean over the grid's solid angle of |C_0|^2, or |C_0|^2 + |C_1|^2, and the receiver's noise, in dB.
+
+    Powers add, so paths do not cancel: RSSI is averaged over bandwidth and time. A receiver hears its own noise even
+    where nothing arrives, so a silent map is at the floor, with a gradient of 0.
+
+    Args:
+        grid: Directions of the map's pixels; those of a single row weigh the same.
+        channels: 1 (real) or 2 (complex).
+        floor_db: Power of the noise relative to the model's reference, between -300 and 0 [dB].
+
+    Raises:
+        ValueError: An option is out of range.
+    """
+
+    def __init__(self, grid: Grid, channels: int, floor_db: float):
+        super().__init__()
+        if channels not in (1, 2):
+            raise ValueError(f"pooling 'mean_power' renders 1 real or 2 complex channels, got channels={channels}")
+        if not -300 <= floor_db <= 0:
+            raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
+        self.channels = channels
+        self.floor = 10 ** (floor_db / 20)
+        solid_angles = grid.solid_angles if len(grid.elevations) > 1 else torch.ones(grid.shape)
+        self.register_buffer("weights", solid_angles / solid_angles.sum(), persistent=False)
+
+    def forward(self, image: Float[Tensor, "b c rows columns"]) -> Float[Tensor, "b"]:
+        """Level relative to the model's reference [dB]; float32 where the map is of half precision.
+
+        Raises:
+            ValueError: The map is not of the grid's size.
+        """
+        if image.shape[2:] != self.weights.shape:
+            raise ValueError(
+                f"pooling 'mean_power' was built for maps of {tuple(self.weights.shape)} pixels, got "
+                f"{tuple(image.shape[2:])}; build it with the map's own grid"
+            )
+        image = image.to(torch.promote_types(image.dtype, torch.float32))
+        # Squares of what is scaled by the largest neither overflow nor underflow.
+        largest = image.detach().abs().amax((1, 2, 3)).clamp(min=self.floor)
+        power = (image / largest[:, None, None, None]).square().sum(1).mul(self.weights).sum((1, 2))
+        return 20 * largest.log10() + 10 * (power + (self.floor / largest).square()).log10()

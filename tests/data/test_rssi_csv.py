@@ -1,0 +1,184 @@
+"""Reading one table of signal strengths; tables are written here by hand."""
+
+import re
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from gaigs.configuration import conf_dir
+from gaigs.data.rssi_csv import read
+from gaigs.registry import registry
+from gaigs.testing import check_data
+
+RANDOM = {"protocol": "random", "test": 0.4, "validation": 0}
+
+FORTH = """\
+tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm
+1.5,1,1,5,0,2,-40
+1.5,1,1,0,0,2.5,-50.25
+2.5,1,1,5,0,2,-41
+2.5,1,1,0,0,2.5,-100
+3.5,1,1,5,0,2,-42
+2.5,1,1,5,0,2,-43
+3.5,1,1,0,0,2.5,-120.5
+4.5,1,1,0,0,2.5,-53
+"""
+"""A transmitter at four places, heard at two: six readings that were heard, two of them repeated, and two not."""
+
+BACK = FORTH.replace("tx_x,tx_y,tx_z,rx_x,rx_y,rx_z", "rx_x,rx_y,rx_z,tx_x,tx_y,tx_z")
+"""The same, but the one that moves is the receiver."""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "room.csv"
+    path.write_text(FORTH)
+    return path
+
+
+def named(links):
+    """Links as (x of the moving end, fixed end, label)."""
+    names = [links.receivers[k].name for k in links.receiver_index.tolist()]
+    return [*zip(links.transmitters[:, 0].tolist(), names, links.labels.tolist(), strict=True)]
+
+
+HEARD = [(1.5, 1, -40), (1.5, 2, -50.25), (2.5, 1, -41), (3.5, 1, -42), (2.5, 1, -43), (4.5, 2, -53)]
+
+
+@pytest.mark.parametrize(("text", "end", "moving"), [(FORTH, "rx", "transmitter"), (BACK, "tx", "receiver")])
+def test_the_end_with_fewer_places_is_the_fixed_one(file, text, end, moving):
+    file.write_text(text)
+    links = read(file, RANDOM)
+    assert named(links) == [(x, f"{end}{k}", dbm) for x, k, dbm in HEARD]
+    assert [r.name for r in links.receivers] == [f"{end}1", f"{end}2"]
+    assert [r.pose.position.tolist() for r in links.receivers] == [[5, 0, 2], [0, 0, 2.5]]
+    assert all(torch.equal(r.pose.rotation, torch.eye(3)) for r in links.receivers)
+    assert (links.grid, links.normalisation) == (None, "dBm")
+    fixed = {"rx": "receiver", "tx": "transmitter"}[end]
+    assert links.remarks == (
+        f"6 readings of a moving {moving} at 2 places of a fixed {fixed}; "
+        "2 of -100 dBm or below were not heard and are left out"
+    )
+    check_data(links)
+
+
+def test_in_a_tie_the_receiver_is_the_fixed_one(file):
+    file.write_text(f"{BACK.splitlines()[0]}\n1,2,3,4,5,6,-50\n2,2,3,5,5,6,-51\n")
+    assert [receiver.name for receiver in read(file, {**RANDOM, "test": 0.5}).receivers] == ["rx1", "rx2"]
+
+
+def test_columns_are_found_by_name_and_others_named(file):
+    rows = [line.split(",") for line in FORTH.splitlines()]
+    heading, *rows = [["time", row[6], *row[3:6][::-1], "note", *row[:3]] for row in rows]
+    heading[5], heading[0] = '"remark"', "\ufefftime"
+    file.write_text("\r\n".join(" , ".join(row) for row in [heading, *rows]) + "\r\n\r\n")
+    links = read(file, RANDOM)
+    assert named(links) == [(x, f"rx{k}", dbm) for x, k, dbm in HEARD]
+    assert links.receivers[0].pose.position.tolist() == [5, 0, 2]
+    assert links.remarks.endswith("left out; columns ignored: time, remark")
+
+
+def test_a_fixed_place_that_nothing_was_heard_at_is_left_out(file):
+    file.write_text(re.sub(r"(5,0,2),-\d+", r"\1,-100", FORTH))
+    links = read(file, RANDOM)
+    assert named(links) == [(1.5, "rx2", -50.25), (4.5, "rx2", -53)]
+    assert "6 of -100 dBm" in links.remarks
+    assert links.remarks.endswith("and so are the places that nothing was heard at: rx1")
+
+
+@pytest.mark.parametrize("text", [FORTH, BACK])
+def test_readings_of_one_place_of_the_moving_end_stay_together(file, text):
+    file.write_text(text)
+    for seed in range(6):
+        links = read(file, {**RANDOM, "seed": seed})
+        places = [set(links.transmitters[part, 0].tolist()) for part in (links.split.train, links.split.test)]
+        assert all(places)
+        assert places[0].isdisjoint(places[1])
+
+
+def test_walls_come_from_a_file_where_one_is_given(file, tmp_path):
+    (tmp_path / "walls.csv").write_text("x,y\n0,0\n5,0\n5,4\n")
+    assert read(file, RANDOM).edges.shape == (0, 2, 3)
+    edges = read(file, RANDOM, layout=tmp_path / "walls.csv").edges
+    assert edges.tolist() == [[[0, 0, 0], [5, 0, 0]], [[5, 0, 0], [5, 4, 0]]]
+    with pytest.raises(ValueError, match=r"no\.csv: missing; expected consecutive wall vertices x,y \[m\]"):
+        read(file, RANDOM, layout=tmp_path / "no.csv")
+
+
+def test_the_configuration_reads_a_small_room(file):
+    config = OmegaConf.load(conf_dir() / "data" / "rssi_csv.yaml")
+    config.file = str(file)
+    before = file.stat().st_mtime_ns
+    links = registry("data").build(config)
+    assert links.split.name == "random, test 0.2, validation 0.1, seed 0"
+    check_data(links)
+    assert file.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("protocol", [{"protocol": "official"}, {}])
+def test_there_is_no_official_split(file, protocol):
+    with pytest.raises(ValueError, match="no official split; choose of random"):
+        read(file, protocol)
+
+
+def test_both_ends_may_not_move(file):
+    row = "{0},1,1,{0},0,2,-40\n"
+    file.write_text(FORTH.splitlines()[0] + "\n" + "".join(map(row.format, range(64))) + "99,1,1,1,0,2,-40\n")
+    assert len(read(file, RANDOM).receivers) == 64
+    file.write_text(FORTH.splitlines()[0] + "\n" + "".join(map(row.format, range(65))) + "99,1,1,1,0,2,-40\n")
+    with pytest.raises(ValueError, match="64 places at most, got 66 of the transmitter and 65 of the receiver: both"):
+        read(file, RANDOM)
+
+
+DEFECTS = {
+    "row of nan": (
+        ("2.5,1,1,5,0,2,-41", "nan,nan,nan,5,0,2,-41"),
+        "room.csv, line 4, columns tx_x, tx_y, tx_z: expected a finite number, got 'nan', 'nan', 'nan'",
+    ),
+    "reading nan": (
+        (",-41", ",nan"),
+        "room.csv, line 4, column rss_dbm: expected an RSSI below 0 dBm "
+        "(-100 where nothing was heard), got 'nan'",
+    ),
+    "loud": ((",-41", ",20"), "room.csv, line 4, column rss_dbm: expected an RSSI below 0 dBm"),
+    "zero": ((",-41", ",0"), "room.csv, line 4, column rss_dbm: expected an RSSI"),
+    "word": (("1.5,1,1,0", "1.5,one,1,0"), "room.csv, line 3, column tx_y: expected a finite number, got 'one'"),
+    "row too long": ((",-41", ",-41,9"), "line 4: expected 7 columns tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm, got 8"),
+    "blank line between": (("2.5,", "\n2.5,"), "room.csv, line 4: expected 7 columns"),
+    "no column": (("rss_dbm", "rssi"), "room.csv, line 1: expected one column rss_dbm, got 0 in 'tx_x,tx_y,tx_z,rx_x"),
+    "column twice": (("tx_y", "tx_x"), "room.csv, line 1: expected one column tx_x, got 2 in 'tx_x,tx_x,"),
+    "other delimiter": ((",tx_y", ";tx_y"), "room.csv, line 1: expected one column tx_x, got 0"),
+    "no heading": (
+        (FORTH.splitlines()[0] + "\n", ""),
+        "room.csv, line 1: expected one column tx_x, got 0 in '1.5,1,1,5,0,2,-40'",
+    ),
+    "only a heading": ((FORTH, FORTH.splitlines()[0]), "room.csv: no readings below the heading"),
+    "empty": ((FORTH, "\n"), "room.csv: empty; expected a heading with tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm"),
+    "nothing heard": (
+        (FORTH, FORTH.splitlines()[0] + "\n1,2,3,4,5,6,-100\n2,2,3,4,5,6,-101\n"),
+        "room.csv: expected readings above -100 dBm, got none; nothing was heard",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_defect_is_named_with_its_place(file, name):
+    (old, new), message = DEFECTS[name]
+    assert old in FORTH
+    file.write_text(FORTH.replace(old, new, 1))
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        read(file, RANDOM)
+    assert str(file) in str(caught.value)
+
+
+def test_defects_are_reported_at_once(file, tmp_path):
+    file.write_text(FORTH.replace("-41", "41").replace("-53", "").replace("3.5,1,1,5", "3.5,inf,1,5"))
+    (tmp_path / "walls.csv").write_text("0,zero\n1,1\n")
+    with pytest.raises(ValueError, match="has 4 defects:"):
+        read(file, RANDOM, layout=tmp_path / "walls.csv")
+
+
+def test_a_missing_file_is_named(file):
+    with pytest.raises(FileNotFoundError, match=r"none\.csv must be a table of readings, and is no file"):
+        read(file.with_name("none.csv"), RANDOM)

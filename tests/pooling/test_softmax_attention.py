@@ -1,0 +1,179 @@
+"""Attention over the map against the paper's formula, its limits, and maps on which it could break."""
+
+import math
+
+import pytest
+import torch
+
+from gaigs.pooling.softmax_attention import SoftmaxAttention
+from gaigs.registry import registry
+
+LEARN = pytest.mark.parametrize("learn", [False, True])
+
+
+def paper(image, temperature, prior):
+    """The paper's words one by one, in float64."""
+    m = image.double().flatten(1)
+    z = (m - m.mean(1, keepdim=True)) / temperature
+    z = z - z.amax(1, keepdim=True)
+    weights = (1 - prior) * z.exp() / z.exp().sum(1, keepdim=True) + prior / m.shape[1]
+    return 10 * (weights * m).sum(1)
+
+
+def graded(pooling, image):
+    """Label and gradients of a map, in its dtype."""
+    image = image.detach().requires_grad_()
+    label = pooling(image)
+    label.sum().backward()
+    return label.detach(), image.grad
+
+
+@pytest.fixture
+def image():
+    return torch.randn(3, 1, 6, 9, generator=torch.Generator().manual_seed(0))
+
+
+@LEARN
+@pytest.mark.parametrize(("temperature", "prior"), [(0.434, 0.1), (3.0, 0.0), (0.05, 0.7)])
+def test_it_is_the_formula_of_the_paper(image, temperature, prior, learn):
+    if learn and prior == 0:
+        prior = 1e-3
+    pooling = SoftmaxAttention(temperature, prior, learn)
+    torch.testing.assert_close(pooling(image).double(), paper(image, temperature, prior), rtol=1e-5, atol=1e-5)
+
+
+def test_a_map_in_bels_gives_a_label_in_decibels():
+    assert SoftmaxAttention(0.5, 0.2)(torch.full((2, 1, 4, 5), -3.0)).tolist() == pytest.approx([-30, -30])
+
+
+def test_a_louder_map_is_louder_by_as_much(image):
+    pooling = SoftmaxAttention(0.5, 0.2)
+    torch.testing.assert_close(pooling(image + 2), pooling(image) + 20)
+
+
+def test_attention_is_proportional_to_power_at_the_default_temperature(image):
+    m = image.double().flatten(1)
+    expected = 10 * (m * 10**m).sum(1) / (10**m).sum(1)
+    torch.testing.assert_close(SoftmaxAttention(1 / math.log(10), 0)(image).double(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_limits(image):
+    mean, most = 10 * image.mean((1, 2, 3)), 10 * image.amax((1, 2, 3))
+    for pooling, limit in (
+        (SoftmaxAttention(0.434, 1), mean),
+        (SoftmaxAttention(1e6, 0), mean),
+        (SoftmaxAttention(1e-6, 0), most),
+        (SoftmaxAttention(1e-6, 0.25), 0.75 * most + 0.25 * mean),
+    ):
+        torch.testing.assert_close(pooling(image), limit, rtol=1e-5, atol=1e-4)
+
+
+def test_the_order_of_pixels_does_not_matter(image):
+    order = torch.randperm(54, generator=torch.Generator().manual_seed(1))
+    pooling = SoftmaxAttention(0.434, 0.1)
+    shuffled = image.flatten(1)[:, order].reshape(3, 1, 9, 6)
+    torch.testing.assert_close(pooling(shuffled), pooling(image))
+
+
+def test_the_prior_gives_every_pixel_a_gradient():
+    image = torch.zeros(1, 1, 3, 4)
+    image[..., 0, 0] = 1e3
+    for prior in (0, 0.24):
+        _, gradient = graded(SoftmaxAttention(0.434, prior), image)
+        assert gradient[0, 0, 1:].flatten().tolist() == pytest.approx([10 * prior / 12] * 8)
+
+
+@LEARN
+def test_gradients_are_the_derivatives(image, learn):
+    pooling = SoftmaxAttention(0.434, 0.1, learn).double()
+    leaves = [image[:, :, :3, :4].double().requires_grad_(), *pooling.parameters()]
+    assert len(leaves) == (3 if learn else 1)
+    assert torch.autograd.gradcheck(lambda image, *_: pooling(image), leaves)
+
+
+@LEARN
+def test_a_constant_map_pulls_all_pixels_alike(learn):
+    for level in (0.0, -7.0, 1e6):
+        label, gradient = graded(SoftmaxAttention(0.434, 0.1, learn), torch.full((2, 1, 4, 5), level))
+        torch.testing.assert_close(label, torch.full((2,), 10 * level))
+        torch.testing.assert_close(gradient, torch.full((2, 1, 4, 5), 10 / 20))
+
+
+def test_one_pixel_is_its_level():
+    label, gradient = graded(SoftmaxAttention(0.434, 0.1), torch.tensor([-2.0, 0, 1e6]).reshape(3, 1, 1, 1))
+    torch.testing.assert_close(label, torch.tensor([-20.0, 0, 1e7]))
+    torch.testing.assert_close(gradient, torch.full((3, 1, 1, 1), 10.0))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_twelve_decades_against_float64(sign):
+    image = sign * torch.logspace(-6, 6, 60).reshape(1, 1, 6, 10)
+    pooling = SoftmaxAttention(0.434, 0.1)
+    label, gradient = graded(pooling, image)
+    twin, twin_gradient = graded(SoftmaxAttention(0.434, 0.1).double(), image.double())
+    torch.testing.assert_close(label.double(), twin, rtol=1e-5, atol=0)
+    torch.testing.assert_close(gradient.double(), twin_gradient, rtol=1e-4, atol=1e-6)
+
+
+def test_one_deep_hole_does_not_blur_the_attention():
+    image = torch.tensor([0.0, 1.0, 2.0, -1e9]).reshape(1, 1, 2, 2)
+    label, _ = graded(SoftmaxAttention(0.434, 0), image)
+    torch.testing.assert_close(label, SoftmaxAttention(0.434, 0)(image[..., :3].flatten()[None, None, None, :3]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_averaged_in_float32(image, dtype):
+    pooling = SoftmaxAttention(0.434, 0.1)
+    image = (image - 10).to(dtype)
+    label, gradient = graded(pooling, image)
+    true, true_gradient = graded(pooling, image.float())
+    assert label.dtype == torch.float32
+    assert torch.equal(label, true)
+    torch.testing.assert_close(gradient, true_gradient.to(dtype))
+    hard = torch.tensor([6e4, -6e4, 6e-8, 0.0]).reshape(1, 1, 2, 2).to(dtype)
+    assert all(t.isfinite().all() for t in graded(pooling, hard))
+
+
+@pytest.mark.parametrize("target", [-100.0, 100.0])
+@pytest.mark.parametrize("rate", [0.01, 10.0])
+def test_training_moves_temperature_and_prior_within_their_ranges(target, rate):
+    pooling = SoftmaxAttention(0.434, 0.1, learn=True)
+    image = torch.tensor([0.0, 1.0, 2.0, 3.0]).reshape(1, 1, 2, 2)
+    before = pooling(image).item(), pooling.temperature.item(), pooling.prior.item()
+    optimizer = torch.optim.SGD(pooling.parameters(), lr=rate)
+    for _ in range(20):
+        optimizer.zero_grad()
+        (pooling(image) - target).abs().sum().backward()
+        optimizer.step()
+        assert 0 < pooling.temperature < torch.inf
+        assert 0 <= pooling.prior <= 1
+    label, temperature, prior = pooling(image).item(), pooling.temperature.item(), pooling.prior.item()
+    louder = target > before[0]
+    assert [label > before[0], temperature < before[1], prior < before[2]] == [louder] * 3
+
+
+def test_options_that_are_not_learnt_are_stored_as_well():
+    other = SoftmaxAttention(2.0, 0.5)
+    other.load_state_dict(SoftmaxAttention(0.434, 0.1).state_dict())
+    assert not list(other.parameters())
+    assert (other.temperature.item(), other.prior.item()) == pytest.approx((0.434, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"temperature": 0}, "temperature must lie between 1e-6 and 1e6 bels, got 0;"),
+        ({"temperature": -1}, "temperature must lie between 1e-6 and 1e6 bels, got -1;"),
+        ({"temperature": math.nan}, "temperature must lie between 1e-6 and 1e6 bels, got nan;"),
+        ({"temperature": math.inf}, "temperature must lie between 1e-6 and 1e6 bels, got inf;"),
+        ({"prior": -0.1}, "prior must lie between 0 and 1, got -0.1"),
+        ({"prior": 1.1}, "prior must lie between 0 and 1, got 1.1"),
+        ({"prior": math.nan}, "prior must lie between 0 and 1, got nan"),
+        ({"prior": 1.0, "learn": True}, "a prior that is learnt must start between 0 and 1, got 1.0; e.g. 0.1"),
+        ({"prior": 0, "learn": True}, "a prior that is learnt must start between 0 and 1, got 0; e.g. 0.1"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, message):
+    config = {"name": "softmax_attention", "temperature": 0.434, "prior": 0.1, **options}
+    with pytest.raises(ValueError, match=message):
+        registry("pooling").build(config)
