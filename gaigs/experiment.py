@@ -37,6 +37,9 @@ LOOK_UPS = ({"name": "mean"}, {"name": "knn", "k": 3, "power": 2})
 RSSI_LOOK_UPS = ({"name": "mean"}, {"name": "knn", "k": 20, "power": 1}, {"name": "path_loss"})
 """What every result on RSSI stands beside; readings are noisy, so more neighbours count, and more alike."""
 
+HARMLESS = ("task", "save_every", "tensorboard", "trainer.enable_progress_bar", "trainer.enable_model_summary")
+"""Keys that change nothing of what a run finds: one that goes on may have others."""
+
 log = logging.getLogger(__name__)
 
 
@@ -85,7 +88,7 @@ def claim(folder: Path, config: dict) -> None:
         OmegaConf.save(OmegaConf.create(config), file)
         return
     there, here = _flat(OmegaConf.to_container(OmegaConf.load(file))), _flat(config)
-    differing = sorted(key for key in there.keys() | here.keys() if there.get(key) != here.get(key))
+    differing = sorted(key for key in (there.keys() | here.keys()) - set(HARMLESS) if there.get(key) != here.get(key))
     if differing:
         told = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
         listed = "; ".join(f"{key} was {there.get(key)!r}, is {here.get(key)!r}" for key in told)

@@ -20,14 +20,15 @@ class Gaussians(nn.Module):
     """n anisotropic Gaussians, each a virtual transmitter; parameters are stored raw, properties give them activated.
 
     They start in the directions that the label shows: for every receiver on a Fibonacci lattice over the part of the
-    sphere that the label's grid covers, at random distances, each wide enough to meet its neighbours. So the count
-    follows from the angular detail wanted: ``count`` splats over the upper hemisphere lie sqrt(2 pi / count) rad apart.
+    sphere that the label's grid covers (the whole of it where the label is no spectrum), at random distances, each wide
+    enough to meet its neighbours. So the count follows from the angular detail wanted: ``count`` splats over the upper
+    hemisphere lie sqrt(2 pi / count) rad apart. Of several receivers each has an equal share, and sees the others' too.
 
     Args:
         scene: Receivers and grid, which say where to put the Gaussians.
         channels: Signal channels a Gaussian sends on; the pooling knows how many it needs.
-        count: Gaussians at the start.
-        near, far: Range of the distances to the receiver at the start [m].
+        count: Gaussians at the start, of all receivers together.
+        near, far: Range of the distances to their own receiver at the start [m].
         spread: Standard deviation at the start, as a fraction of the distance to the next Gaussian of the lattice.
         opacity: At the start, in (0, 1).
         signal: Standard deviation of the signal's random start.
@@ -36,7 +37,7 @@ class Gaussians(nn.Module):
         ValueError: An option is out of range.
 
     Source: parametrisation of Kerbl et al., 3D Gaussian Splatting, 2023, with SH degree 0: a direction-dependent signal
-    adds nothing where each Gaussian is seen from one receiver.
+    adds nothing where there is one receiver; where there are several, all hear the same from a Gaussian.
     """
 
     PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "signal")

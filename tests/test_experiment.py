@@ -271,6 +271,14 @@ def test_another_configuration_in_the_same_folder_is_refused(left, finished, tmp
     assert digest(folder) == before
 
 
+def test_what_changes_no_result_may_change(finished, tmp_path):
+    config, run, metrics = finished
+    folder = shutil.copytree(run, tmp_path / "run")
+    other = config | {"save_every": 99.0, "trainer": config["trainer"] | {"enable_progress_bar": True}}
+    assert other != config
+    assert experiment.run(other, folder) == metrics
+
+
 def test_a_folder_with_nothing_to_go_on_from_is_free(tmp_path):
     (tmp_path / "config.yaml").write_text("seed: 5\n")
     experiment.run(configure("trainer.max_steps=1"), tmp_path)

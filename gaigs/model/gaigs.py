@@ -27,7 +27,8 @@ class GaussianSplatting(Model):
         reference: Configuration of a model whose RSSI the pooled map is added to [dB]; None for spectra.
 
     Raises:
-        ValueError: ``grid`` or ``reference`` is given for spectra, or lacking for RSSI.
+        ValueError: ``grid`` or ``reference`` is given for spectra, or lacking for RSSI; the pooling does not give such
+            labels; the reference is a look-up.
 
     Source: GAI-GS, section "Framework"; the reference is ours (docs/methods.md).
     """
@@ -53,8 +54,23 @@ class GaussianSplatting(Model):
                     "+experiment=rssi or +experiment=spectrum, whichever suits the data"
                 )
         self.grid = scene.grid or Grid.sphere(*grid)
-        self.reference = reference and registry("model").build(reference, scene=scene)
+        self.reference = None
+        if reference is not None:
+            self.reference = registry("model").build(reference, scene=scene)
+            if not self.reference.state_dict():
+                raise ValueError(
+                    f"model.reference must be a model that a checkpoint can store, and {reference['name']} is a "
+                    "look-up that needs its data; take path_loss or mean"
+                )
+            self.register_buffer("level", torch.zeros(()))  # of the untrained map [dB]
         self.pooling = registry("pooling").build(pooling, grid=self.grid)
+        gives = self.pooling(torch.zeros(1, self.pooling.channels, *self.grid.shape)).ndim
+        if gives != (1 if scene.grid is None else 3):
+            labels, kind = ("RSSI", "numbers") if scene.grid is None else ("spectra", "maps")
+            raise ValueError(
+                f"the labels are {labels}, so the pooling must give {kind}, and {pooling['name']} does not; take "
+                "spectrum for spectra, softmax_attention or mean_power for RSSI"
+            )
         self.projection = registry("projection").build(projection, pixel=self.grid.pitch)
         self.rasterizer = registry("rasterizer").build(rasterizer)
         self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, channels=self.pooling.channels)
@@ -63,9 +79,14 @@ class GaussianSplatting(Model):
         context = {"tokenizer_widths": widths, "channels": self.pooling.channels}
         self.mapping = call("mapping", SceneMapping, mapping, **context)
 
+    @torch.no_grad()
     def fit(self, links: Links) -> None:
+        """For RSSI fits the reference, and has the training start from there: the map's mean level is taken off."""
         if self.reference is not None:
             self.reference.fit(links)
+            some = links.split.train[:: max(1, len(links.split.train) // 64)]
+            batch = Batch(links.transmitters[some], links.receiver_index[some], None).to(self.level.device)
+            self.level += (self(batch).label - self.reference(batch).label).mean()
 
     def forward(self, batch: Batch) -> Prediction:
         # What a transmitter excites is the same for all who hear it.
@@ -78,7 +99,7 @@ class GaussianSplatting(Model):
             labels.append(self.pooling(image))
         label = torch.cat(labels)[torch.cat(links).argsort()]
         if self.reference is not None:
-            label = self.reference(batch).label + label
+            label = self.reference(batch).label + label - self.level
         penalties = {}
         if residuals.delta_opacities is not None:
             penalties["opacity"] = residuals.delta_opacities.square().mean()

@@ -14,6 +14,11 @@ PERIOD = 16
 """The shortest period of the transmitter's features over the distance between neighbouring training transmitters;
 chosen on validation parts of rfid-s23-200 and the built-in room."""
 
+RSSI_OCTAVE = -4
+"""The highest octave of the transmitter's features where labels are RSSI: a reading scatters by decibels however close
+the next one is, and features of 16 m leave it to the network how sharp a wall's shadow is; chosen by leaving out one of
+the robot's training runs in ble-flat."""
+
 
 @register("tokenizer", "euclidean")
 class EuclideanTokenizer(nn.Module):
@@ -67,10 +72,13 @@ def learnable_octaves(scene: Scene) -> tuple[int, int]:
     """Lowest and highest octave of features of the transmitter, as far as the training transmitters bear them out.
 
     Periods go from twice the box's longest edge down to ``PERIOD`` distances between neighbouring transmitters: the
-    network multiplies frequencies, so what it is given must be well below what these sample.
+    network multiplies frequencies, so what it is given must be well below what these sample. RSSI is noisy, and bears
+    out no more than ``RSSI_OCTAVE``.
     """
     edge = (scene.upper - scene.lower).max().item()
     highest = round(-math.log2(PERIOD * scene.spacing))
+    if scene.grid is None:
+        highest = min(highest, RSSI_OCTAVE)
     return min(highest, math.floor(-math.log2(2 * edge))), highest
 
 

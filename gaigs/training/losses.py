@@ -1,5 +1,7 @@
 """Training losses."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -54,20 +56,28 @@ class RssiLoss:
     Args:
         kind: ``absolute``, ``squared`` or ``huber``, which is squared up to ``bend`` and absolute beyond.
         bend: Where Huber's loss turns [dB].
+        jitter: Standard deviation by which each place is moved along each axis, anew in every step [m]. Places are not
+            known to the centimetre and readings fade within a wavelength: what changes faster is not to be learnt.
 
     Raises:
         ValueError: An option is out of range.
     """
 
-    def __init__(self, kind: str, bend: float):
+    def __init__(self, kind: str, bend: float, jitter: float):
         if kind not in ("absolute", "squared", "huber"):
             raise ValueError(f"training.loss.kind must be absolute, squared or huber, got {kind!r}")
         if not bend > 0:
             raise ValueError(f"training.loss.bend must be more than 0 dB, got {bend}")
-        self.kind, self.bend = kind, bend
+        if not jitter >= 0:
+            raise ValueError(f"training.loss.jitter must be at least 0 m, got {jitter}")
+        self.kind, self.bend, self.jitter = kind, bend, jitter
 
     def __call__(self, model: nn.Module, batch: Batch, generator: torch.Generator) -> Terms:
-        """Of a model on a batch; nothing is drawn."""
+        """Of a model on a batch; the generator draws by how much each place is moved."""
+        if self.jitter:
+            places, which = batch.transmitters.unique(dim=0, return_inverse=True)
+            moves = self.jitter * torch.randn(places.shape, generator=generator).to(places)
+            batch = replace(batch, transmitters=(places + moves)[which])
         prediction, penalties = model(batch)
         errors = prediction - batch.labels
         match self.kind:

@@ -189,9 +189,23 @@ def test_rssi_is_the_pooled_map_on_top_of_the_reference(rssi, readings):
     assert image.shape == (3, 1, 4, 8)
     reference = registry("model").build({"name": "path_loss"}, scene=readings.scene)
     reference.fit(readings)
-    expected = reference(batch).label + rssi.pooling(image)
-    torch.testing.assert_close(rssi(batch).label, expected)
-    assert (rssi.pooling(image).abs() > 0.1).all()
+    pooled = rssi.pooling(image)
+    assert (pooled.abs() > 0.1).all()
+    torch.testing.assert_close(rssi(batch).label, reference(batch).label + pooled - rssi.level)
+
+
+@pytest.mark.parametrize("pooling", [{"temperature": 0.3, "prior": 0.2}, {"channels": 2, "floor_db": -60.0}])
+def test_the_training_starts_from_the_reference(rssi, readings, pooling):
+    name = "mean_power" if "channels" in pooling else "softmax_attention"
+    torch.manual_seed(3)
+    mapping = {"width": 16, "attenuation_layers": 1, "signal_layers": 1, "heads": ["signal"]}
+    options = PARTS | {"pooling": {"name": name, **pooling}, "grid": [4, 8], "reference": {"name": "mean"}}
+    model = GaussianSplatting(readings.scene, **options, mapping=mapping)
+    model.fit(readings)
+    everything = take(readings, torch.arange(13))
+    corrections = model(everything).label - model.reference(everything).label
+    assert corrections.mean().abs() < 1e-3
+    assert model.level.abs() > 0.01
 
 
 def test_links_of_several_receivers_come_out_in_their_order(rssi, readings):
@@ -206,6 +220,21 @@ def test_a_place_is_mapped_once_for_all_who_hear_it(rssi, readings):
     rssi.mapping.register_forward_pre_hook(lambda _, arguments: asked.append(len(arguments[0].transmitters)))
     rssi(take(readings, torch.arange(13)))
     assert asked == [6]
+
+
+def test_a_pooling_for_other_labels_is_refused(build, readings):
+    softmax = {"name": "softmax_attention", "temperature": 0.3, "prior": 0.2}
+    with pytest.raises(ValueError, match="labels are spectra, so the pooling must give maps, and softmax_att"):
+        build(pooling=softmax)
+    options = {"grid": [4, 8], "reference": {"name": "mean"}, "mapping": {}}
+    with pytest.raises(ValueError, match="labels are RSSI, so the pooling must give numbers, and spectrum does not"):
+        GaussianSplatting(readings.scene, **PARTS | options)
+
+
+def test_a_look_up_is_no_reference(readings):
+    options = {"grid": [4, 8], "reference": {"name": "knn", "k": 3}, "mapping": {}}
+    with pytest.raises(ValueError, match="a checkpoint can store, and knn is a look-up"):
+        GaussianSplatting(readings.scene, **PARTS | options)
 
 
 @pytest.mark.parametrize("options", [{"grid": [4, 8]}, {"reference": {"name": "mean"}}])

@@ -175,6 +175,16 @@ def test_a_folder_without_runs_is_refused(tmp_path):
         report(tmp_path)
 
 
+def test_overrides_of_a_refused_start_are_not_taken_for_the_runs(tmp_path):
+    write_run(tmp_path, "0", ["seed=2"], models=scores(0.9))
+    (tmp_path / "0" / "config.yaml").write_text("seed: 1\n")  # what the run's metrics are of
+    (tmp_path / "0" / ".hydra" / "config.yaml").write_text("seed: 2\n")
+    with pytest.raises(ValueError, match="holds a run of another configuration than the one last started there"):
+        report(tmp_path)
+    (tmp_path / "0" / ".hydra" / "config.yaml").write_text("seed: 1\n")
+    assert report(tmp_path).row_count == 3
+
+
 def test_command_line(tmp_path, monkeypatch, capsys):
     from gaigs.report.__main__ import main
 

@@ -80,6 +80,14 @@ def test_octaves_span_the_box_and_stop_well_above_the_spacing(scene, spacing, ed
     assert longest >= 2 * edge * (1 - 1e-6)
 
 
+@pytest.mark.parametrize(
+    ("spacing", "edge", "expected"), [(0.02, 9.0, (-5, -4)), (0.02, 4.0, (-4, -4)), (5.0, 90.0, (-8, -6))]
+)
+def test_rssi_bears_out_wide_features_alone(scene, spacing, edge, expected):
+    upper = scene.lower + torch.tensor([0.3, 1.0, 0.2]) * edge
+    assert learnable_octaves(replace(scene, upper=upper, spacing=spacing, grid=None)) == expected
+
+
 def test_octaves_not_given_are_those_that_can_be_learnt(scene):
     free = EuclideanTokenizer(scene, **(OPTIONS | {"transmitter_octaves": None}))
     given = octaves("transmitter_octaves", *learnable_octaves(scene))

@@ -3,8 +3,10 @@
 import pytest
 import torch
 from skimage.metrics import structural_similarity as skimage_ssim
+from torch import nn
 
-from gaigs.training.losses import spectrum_loss, structural_similarity
+from gaigs.model import Batch, Prediction
+from gaigs.training.losses import RssiLoss, spectrum_loss, structural_similarity
 
 
 @pytest.fixture
@@ -63,3 +65,41 @@ def test_constant_images_have_finite_gradients(prediction, label):
     assert predictions.grad.isfinite().all()
     if label != prediction < 2:
         assert (predictions.grad.sign() == (1 if prediction > label else -1)).all()
+
+
+class Echo(nn.Module):
+    """Predicts the first coordinate, and remembers where it was asked."""
+
+    def forward(self, batch):
+        self.asked = batch.transmitters
+        return Prediction(batch.transmitters[:, 0], {})
+
+
+def test_jitter_moves_a_place_alike_for_all_who_hear_it():
+    places = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
+    batch = Batch(places.repeat(2, 1), torch.arange(2).repeat_interleave(500), None, places[:, 0].repeat(2))
+    model, loss = Echo(), RssiLoss("absolute", 5.0, jitter=0.4)
+    value, terms, _ = loss(model, batch, torch.Generator().manual_seed(1))
+    moves = (model.asked - batch.transmitters).view(2, 500, 3)
+    assert torch.equal(moves[0], moves[1])
+    assert moves.std().item() == pytest.approx(0.4, rel=0.05)
+    assert value.item() == pytest.approx(moves[..., 0].abs().mean().item(), rel=1e-4)
+    assert terms["mae_db"].item() == pytest.approx(value.item())
+    again = model.asked
+    loss(model, batch, torch.Generator().manual_seed(1))
+    assert torch.equal(model.asked, again), "the generator decides"
+    RssiLoss("absolute", 5.0, jitter=0.0)(model, batch, torch.Generator())
+    assert torch.equal(model.asked, batch.transmitters)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("cubic", 5.0, 0.0), r"training\.loss\.kind must be absolute, squared or huber, got 'cubic'"),
+        (("huber", 0.0, 0.0), r"training\.loss\.bend must be more than 0 dB, got 0"),
+        (("huber", 5.0, -1.0), r"training\.loss\.jitter must be at least 0 m, got -1"),
+    ],
+)
+def test_an_rssi_loss_refuses(options, message):
+    with pytest.raises(ValueError, match=message):
+        RssiLoss(*options)
