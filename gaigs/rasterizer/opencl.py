@@ -19,8 +19,9 @@ from gaigs.registry import register
 ROWS, COLUMNS = 16, 8
 """Edges of a tile in pixels; the kernels say the same."""
 
-WORD, CHUNK, GEOMETRY, MOMENTS = 32, 32, 8, 5
-"""Splats a word of bits, entries a checkpoint, and lengths of rows in buffers; the kernels say the same."""
+WORD, BLOCK, CHUNK, GEOMETRY, MOMENTS = 32, 16, 32, 8, 5
+"""Splats a word of bits, words a block, entries a checkpoint, and lengths of rows in buffers; the kernels say the
+same."""
 
 GROUP = 8
 """Transmitters that one work-item composites at most, where they share footprints; more would leave the nearest
@@ -270,24 +271,24 @@ class _Render:
         self.kernels = _kernels(queue, **macros)
 
         order = self._share(_front_to_back(splats.depths))
-        geometry, boxes = self._empty(sets * words * WORD * GEOMETRY), self._empty(sets * words * WORD * 4)
-        appearance = self._empty(words * WORD * b * looks)
+        u, v, spans, edges = _tiling(queue, *map(_freeze, (plane.u, plane.v)), plane.period)
+        geometry, appearance = self._empty(sets * words * WORD * GEOMETRY), self._empty(words * WORD * b * looks)
+        hits = self._empty(sets * words * (across + down if separable else 2 * self.tiles))
         inputs = splats.means2d, splats.covariances2d, splats.visible, signal, opacities, attenuations
         inputs = [self._share(tensor) for tensor in inputs]  # named, so that they live until the kernels are through
-        self._run("prepare", sets * words, order, *inputs, geometry, boxes, appearance)
+        self._run("prepare", sets * words, order, *inputs, spans, geometry, appearance, hits)
 
-        u, v = (self._share(coordinate) for coordinate in _whole_tiles(plane, down, across, separable))
-        marks = self._empty(self.lists * words * 2)
         counts = np.empty(self.lists, np.int32)
         shared_counts = self._share(counts)
-        self._run("mark", self.lists, u, v, boxes, marks, shared_counts)
+        self._run("count", self.lists, hits, shared_counts)
         self._finish(shared_counts)
         offsets = self._share(np.cumsum(counts, dtype=np.int32) - counts)
         self.sizes.entries = counts.sum()
-        entries = self._empty(self.sizes.entries)
-        self._run("list", self.lists, u, v, geometry, offsets, marks, entries, shared_counts)
+        self.blocks = -(-words // BLOCK)
+        blocks, entries = self._empty(self.lists * (self.blocks + 1)), self._empty(self.sizes.entries)
+        self._run("list", self.lists, hits, spans, edges, geometry, offsets, blocks, entries, shared_counts)
         self.scene = u, v, offsets, shared_counts, entries, geometry, appearance
-        self.inverse = order, marks, geometry, appearance
+        self.order, self.bounds = order, blocks
         self.loudest = self._share(np.abs(signal.detach().numpy()).max((1, 2), initial=0))
 
     def forward(self, differentiate):
@@ -296,12 +297,13 @@ class _Render:
         image = torch.empty(sizes.transmitters, self.channels, sizes.height, sizes.width)
         left = torch.empty(sizes.transmitters, sizes.height, sizes.width)
         outputs = self._share(image), self._share(left)
-        ends, checkpoints = self._empty(sizes.groups * self.tiles), None
+        ends, checkpoints, bounds = self._empty(sizes.groups * self.tiles), None, None
         if differentiate:
             size = self.walks * (sizes.entries // CHUNK + self.lists)
             checkpoints = self._empty(size * self.together * ROWS * COLUMNS)
-        self._run("forward", sizes.groups * self.tiles, *self.scene, self.loudest, *outputs, ends, checkpoints)
-        self.path = ends, checkpoints
+            bounds = self._empty(size * 2)
+        self._run("forward", sizes.groups * self.tiles, *self.scene, self.loudest, *outputs, ends, checkpoints, bounds)
+        self.path = ends, checkpoints, bounds
         self._finish(*outputs)
         return image, left
 
@@ -314,7 +316,9 @@ class _Render:
         shapes = (n, 2), (sizes.sets, n, 2, 2), (b, n, self.channels), (b, n), (b, n) if self.attenuates else None
         gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
         outputs = [self._share(gradient) for gradient in gradients]
-        self._run("gather", sizes.words, *self.inverse, partials, *outputs)
+        *_, entries, geometry, appearance = self.scene
+        inverse = self.order, self.bounds, self.path[0], entries, geometry, appearance
+        self._run("gather", self.blocks, *inverse, partials, *outputs)
         self._finish(*outputs)
         return gradients
 
@@ -355,14 +359,35 @@ def _front_to_back(depths: Tensor) -> np.ndarray:
     return (keys & 0xFFFFFFFF).astype(np.int32)
 
 
-def _whole_tiles(plane: Plane, down: int, across: int, separable: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The plane's coordinates, filled up to whole tiles by repetition.
+def _freeze(coordinate: Tensor) -> tuple[bytes, tuple[int, int]]:
+    return coordinate.detach().numpy().tobytes(), tuple(coordinate.shape)
 
-    They are one u a column and one v a row where the plane is separable, else two full grids.
+
+@functools.lru_cache(maxsize=64)  # a training that thins has a plane for each row and column it may start from
+def _tiling(queue: cl.CommandQueue, u: tuple, v: tuple, period: float | None) -> list[cl.Buffer]:
+    """A plane in whole tiles, as the kernels read it; it is the same from step to step, and known by its bytes.
+
+    Returns:
+        u and v, filled up to whole tiles by repetition: one u a column and one v a row where the plane is separable,
+        else two full grids; spans (centre, half size) of u and then of v; and edges, the least v of the rows of each
+        span of v and then their largest.
     """
-    height, width = plane.shape
+    u, v = (np.frombuffer(data, np.float32).reshape(shape) for data, shape in (u, v))
+    height, width = len(v), u.shape[1]
+    down, across = -(-height // ROWS), -(-width // COLUMNS)
     y, x = np.minimum(np.arange(down * ROWS), height - 1), np.minimum(np.arange(across * COLUMNS), width - 1)
-    u, v = plane.u.detach().numpy(), plane.v.detach().numpy()
-    if separable:
-        return u[0, x], v[y, 0]
-    return np.broadcast_to(u, plane.shape)[np.ix_(y, x)], np.broadcast_to(v, plane.shape)[np.ix_(y, x)]
+    if len(u) == v.shape[1] == 1:
+        u, v = u[:, x], v[y]
+        u_tiles, v_tiles = u.reshape(1, 1, across, COLUMNS), v.reshape(down, ROWS, 1, 1)
+    else:
+        u, v = (np.broadcast_to(coordinate, (height, width))[np.ix_(y, x)] for coordinate in (u, v))
+        u_tiles, v_tiles = (coordinate.reshape(down, ROWS, across, COLUMNS) for coordinate in (u, v))
+    slack = 1e-6 * (np.abs(u).max(initial=0) + np.abs(v).max(initial=0) + (period or 0))  # for rounding
+    columns = u_tiles.min((1, 3)).ravel(), u_tiles.max((1, 3)).ravel()
+    rows = v_tiles.min(3), v_tiles.max(3)  # (down, ROWS, spans in a row of tiles)
+    edges = np.stack((rows[0] - slack, rows[1] + slack), 1).transpose(0, 3, 1, 2)
+    low, high = map(np.concatenate, zip(columns, (rows[0].min(1).ravel(), rows[1].max(1).ravel()), strict=True))
+    spans = np.stack((0.5 * (low + high), 0.5 * (high - low) + slack), -1)
+    flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+    arrays = (np.ascontiguousarray(array, np.float32) for array in (u, v, spans, edges))
+    return [cl.Buffer(queue.context, flags, hostbuf=array) if array.size else None for array in arrays]

@@ -113,6 +113,14 @@ def loud_behind_walls() -> Scene:
     return replace(scene, signal=scene.signal * (4.0 ** torch.arange(24))[:, None])
 
 
+def dark_in_half() -> Scene:
+    """Light is used up at low v long before it is at high v: rows of one tile end at different depths."""
+    scene = random_scene(n=300, b=1, spread=(0.2, 0.6), opacities=(0.3, 0.9))
+    low = scene.plane.v.min()
+    scene.splats.means2d[:, 1] = low + 0.4 * (scene.splats.means2d[:, 1] - low)
+    return scene
+
+
 def unsorted_plane() -> Scene:
     plane = grid(Mercator(0.1))
     shuffle = torch.Generator().manual_seed(0)
@@ -154,6 +162,7 @@ SCENES = {
     "opaque": lambda: random_scene(n=120, spread=(0.3, 2.0), opacities=(1.0, 1.0)),
     "nearly opaque": lambda: random_scene(n=120, spread=(0.3, 2.0), opacities=(0.8, 0.99), attenuations=(0.1, 1.0)),
     "loud behind walls": loud_behind_walls,
+    "dark in half": dark_in_half,
     "at the seam": at_the_seam,
     "at the pole": at_the_pole,
     "unsorted plane": unsorted_plane,
@@ -256,6 +265,17 @@ def test_reads_tensors_of_any_layout():
     assert torch.equal(image, same_image)
     assert torch.equal(left, same_left)
     assert all(torch.equal(gradients[name], same_gradients[name]) for name in gradients)
+
+
+@pytest.mark.parametrize("name", ["u", "v"])
+def test_a_plane_changed_in_place_is_another_plane(name):
+    scene = random_scene()
+    pixels = torch.ones(3, *scene.plane.shape)
+    render(opencl.OpenCLRasterizer(), scene, pixels)
+    getattr(scene.plane, name).mul_(0.5)
+    image, *_ = render(opencl.OpenCLRasterizer(), scene, pixels)
+    true_image, *_ = render(rasterize, scene, pixels)
+    torch.testing.assert_close(image, true_image.float(), rtol=0, atol=1e-2 * largest(true_image))
 
 
 def test_lists_a_device_and_takes_it_by_any_part_of_its_name(monkeypatch):

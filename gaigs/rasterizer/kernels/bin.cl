@@ -1,28 +1,59 @@
 /* Which splats reach which tile.
  *
- * Lists come in sets: one a transmitter, or one for all where covariances are shared. In each, a tile owns a row of
- * marks, words of one bit a splat, and a run of entries: the splats that reach the tile, front to back, with the rows
- * each reaches. Beside a word stands the place of its first entry: so the gradient finds from splats to entries without
- * atomics.
+ * Lists come in sets: one a transmitter, or one for all where covariances are shared. In each, a tile owns a run of
+ * entries: the splats that reach the tile, front to back, with the rows each reaches. Splats come in blocks: where each
+ * block's entries begin in each run is kept, so the gradient finds from splats to entries without atomics.
+ *
+ * A box meets a tile where it meets the tile's span of u and its span of v. Where the plane is separable, one span of u
+ * is that of all tiles in a column, and one of v that of all in a row; else every tile has its own.
  */
+
+#define BLOCK 16 /* words of 32 splats */
+#define BLOCKS(sizes) (((sizes).words + BLOCK - 1) / BLOCK)
+
+#if SEPARABLE
+#define SPANS_U(sizes) (sizes).across
+#define SPANS_V(sizes) (sizes).down
+#define SPAN_U(sizes, tile) ((tile) % (sizes).across)
+#define SPAN_V(sizes, tile) ((tile) / (sizes).across)
+#else
+#define SPANS_U(sizes) ((sizes).down * (sizes).across)
+#define SPANS_V(sizes) SPANS_U(sizes)
+#define SPAN_U(sizes, tile) (tile)
+#define SPAN_V(sizes, tile) (tile)
+#endif
+
+/* Centre and half size, with slack for rounding. */
+typedef struct {
+    float centre, half_size;
+} span_t;
+
+static inline uint all_bits(masks bits) {
+    int4 a = bits.lo | bits.hi;
+    int2 b = a.lo | a.hi;
+    return b.lo | b.hi;
+}
 
 /* Packs 32 splats of one set at their places in depth order:
  *   geometry    (sets, words 32, GEOMETRY)
- *   boxes       (sets, 4, words 32): centre and half size of the box outside of which a splat does nothing
- *   appearance  (words 32, transmitters, APPEARANCE) */
+ *   appearance  (words 32, transmitters, APPEARANCE)
+ * and says which spans meet the box outside of which a splat does nothing:
+ *   hits        (sets, spans of u and of v, words), a bit a splat */
 kernel void prepare(sizes_t sizes, global const int *order, global const float *means, global const float *covariances,
                     global const uchar *visible, global const float *signal, global const float *opacities,
-                    global const float *attenuations, global float *geometry, global float *boxes,
-                    global float *appearance) {
+                    global const float *attenuations, global const span_t *spans, global float *geometry,
+                    global float *appearance, global uint *hits) {
     int word = get_global_id(0) % sizes.words, set = get_global_id(0) / sizes.words, padded = sizes.words * 32;
     int first = sizes.sets == 1 ? 0 : set, last = sizes.sets == 1 ? sizes.transmitters : set + 1;
+    lanes boxes[4][4]; /* centre and half size */
     for (int i = word * 32; i < word * 32 + 32; i++) {
-        global float *row = geometry + (set * padded + i) * GEOMETRY, *box = boxes + set * 4 * padded + i;
+        global float *row = geometry + (set * padded + i) * GEOMETRY;
+        float *box = (float *)boxes + (i - word * 32);
         int from = i < sizes.splats ? order[i] : -1;
         if (from < 0 || !visible[from]) {
             for (int j = 0; j < GEOMETRY; j++) row[j] = 0;
-            box[0] = box[padded] = 0;
-            box[2 * padded] = box[3 * padded] = -INFINITY; /* which meets nothing */
+            box[0] = box[32] = 0;
+            box[64] = box[96] = -INFINITY; /* which meets nothing */
             continue;
         }
         float opacity = 0;
@@ -45,120 +76,167 @@ kernel void prepare(sizes_t sizes, global const int *order, global const float *
         float reach = opacity < ALPHA_MIN ? -INFINITY : sqrt(log2(opacity / ALPHA_MIN));
         float half_v = reach * sqrt(vv) / h;
         row[0] = box[0] = means[2 * from];
-        row[1] = box[padded] = means[2 * from + 1];
+        row[1] = box[32] = means[2 * from + 1];
         row[2] = across;
         row[3] = along;
         row[4] = shear;
         row[5] = reach;
         row[6] = half_v * uv / vv;
-        box[2 * padded] = reach / across * 1.0001f; /* slack: in doubt a splat is listed, and each pixel decides */
-        box[3 * padded] = half_v * 1.0001f;
+        row[7] = 1 / along;
+        box[64] = reach / across * 1.0001f; /* slack: in doubt a splat is listed, and each pixel decides */
+        box[96] = half_v * 1.0001f;
+    }
+    hits += set * (SPANS_U(sizes) + SPANS_V(sizes)) * sizes.words + word;
+    for (int s = 0; s < SPANS_U(sizes) + SPANS_V(sizes); s++) {
+        span_t span = spans[s];
+        masks found = 0;
+        for (int j = 0; j < 4; j++) {
+            lanes offset = s < SPANS_U(sizes) ? offset_lanes(boxes[0][j], span.centre) : boxes[1][j] - span.centre;
+            lanes limit = (s < SPANS_U(sizes) ? boxes[2][j] : boxes[3][j]) + span.half_size;
+            found |= ~(MOST(offset, -offset) > limit) & (int8)(1, 2, 4, 8, 16, 32, 64, 128) << 8 * j;
+        }
+        hits[s * sizes.words] = all_bits(found);
     }
 }
 
-/* What a tile spans, with slack for rounding: centre and half size in u and v, least and largest v of each row. */
+/* The words of two spans: a splat whose box meets a tile has its bit in both. */
 typedef struct {
-    float u, half_u, v, half_v;
-    float16 low, high;
-} span_t;
+    global const uint *u, *v;
+} words_t;
 
-static inline span_t span_tile(global const float *u, global const float *v, sizes_t sizes, int tile) {
-    float left = INFINITY, right = -INFINITY, bottom = INFINITY, top = -INFINITY, low[ROWS], high[ROWS];
-    for (int r = 0; r < ROWS; r++) {
-        low[r] = INFINITY;
-        high[r] = -INFINITY;
-        for (int x = 0; x < COLUMNS; x++) {
-            int row = tile / sizes.across * ROWS + r, column = tile % sizes.across * COLUMNS + x;
-            float a = u[SEPARABLE ? column : row * sizes.across * COLUMNS + column];
-            float b = v[SEPARABLE ? row : row * sizes.across * COLUMNS + column];
-            left = LEAST(left, a);
-            right = MOST(right, a);
-            low[r] = LEAST(low[r], b);
-            high[r] = MOST(high[r], b);
-        }
-        bottom = LEAST(bottom, low[r]);
-        top = MOST(top, high[r]);
-    }
-    float slack = 1e-6f * (MOST(-left, right) + MOST(-bottom, top));
-#ifdef PERIOD
-    slack += 1e-6f * PERIOD;
-#endif
-    float16 lows, highs;
-    for (int r = 0; r < ROWS; r++) {
-        ((float *)&lows)[r] = low[r] - slack;
-        ((float *)&highs)[r] = high[r] + slack;
-    }
-    return (span_t){.5f * (left + right), .5f * (right - left) + slack,
-                    .5f * (bottom + top), .5f * (top - bottom) + slack, lows, highs};
+static inline words_t find_words(sizes_t sizes, global const uint *hits, int list) {
+    int tiles = sizes.down * sizes.across, tile = list % tiles;
+    hits += list / tiles * (SPANS_U(sizes) + SPANS_V(sizes)) * sizes.words;
+    return (words_t){hits + SPAN_U(sizes, tile) * sizes.words,
+                     hits + (SPANS_U(sizes) + SPAN_V(sizes, tile)) * sizes.words};
 }
 
-/* Marks the splats whose box meets one tile of one set. */
-kernel void mark(sizes_t sizes, global const float *u, global const float *v, global const float *boxes,
-                 global uint2 *marks, global int *counts) {
-    int tiles = sizes.down * sizes.across, padded = sizes.words * 32, count = 0;
-    global const float *box = boxes + get_global_id(0) / tiles * 4 * padded;
-    span_t span = span_tile(u, v, sizes, get_global_id(0) % tiles);
-    for (int word = 0; word < sizes.words; word++, box += 32) {
-        uint hits = 0;
-        for (int j = 0; j < 32; j++) {
-            float du = offset_float(box[j], span.u), dv = box[j + padded] - span.v;
-            float half_u = box[j + 2 * padded] + span.half_u, half_v = box[j + 3 * padded] + span.half_v;
-            uint hit = !(MOST(du, -du) > half_u | MOST(dv, -dv) > half_v);
-            hits |= hit << j;
-            count += hit;
-        }
-        marks[get_global_id(0) * sizes.words + word].x = hits;
+/* Counts the splats whose box meets one tile of one set. */
+kernel void count(sizes_t sizes, global const uint *hits, global int *counts) {
+    words_t words = find_words(sizes, hits, get_global_id(0));
+    uint count = 0;
+    for (int word = 0; word < sizes.words; word++) {
+        uint bits = words.u[word] & words.v[word]; /* its ones are counted in pairs, fours, eights, and summed */
+        bits -= bits >> 1 & 0x55555555;
+        bits = (bits & 0x33333333) + (bits >> 2 & 0x33333333);
+        bits = (bits + (bits >> 4)) & 0x0f0f0f0f;
+        count += bits * 0x01010101 >> 24;
     }
     counts[get_global_id(0)] = count;
 }
 
-/* The rows of a tile that a splat's ellipse touches within the tile's columns, a bit each. */
-static inline uint rows_touched(splat_t splat, span_t span) {
-    float reach = splat.reach * 1.0001f; /* slack, as for the boxes */
-    float du = offset_float(span.u, splat.u), left = du - span.half_u, right = du + span.half_u;
-#ifdef PERIOD
-    if (left < -.5f * PERIOD || right > .5f * PERIOD) { /* reached from both sides */
-        left = -INFINITY;
-        right = INFINITY;
-    }
-#endif
-    if (MOST(left, -right) * splat.across > reach) return 0;
-    /* The ellipse is highest, and lowest, where du is nearest to its crest, and opposite of it. */
-    float2 at = (float2)(splat.crest, -splat.crest);
-    at = LEAST(MOST(at, left), right);
-    float2 s = at * splat.across, rest = reach * reach - s * s;
-    float2 y = sqrt(MOST(rest, 0.f)) * (float2)(1, -1), v = splat.v + (at * splat.shear + y) / splat.along;
-    int16 hits = ~((span.low > v.x) | (span.high < v.y));
-    hits &= (int16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768);
-    int8 a = hits.lo | hits.hi;
-    int4 b = a.lo | a.hi;
-    int2 c = b.lo | b.hi;
-    return c.x | c.y;
-}
-
 /* A splat in a tile's list, with the rows it reaches; packed as splat | first << 24 | last << 28. */
 typedef struct {
-    uint splat, first, last;
+    uint splat;
+    int first, last;
 } entry_t;
+
+#define NO_ENTRY -1
+#define AT_ONCE 64 /* words */
 
 static inline entry_t unpack(uint entry) { return (entry_t){entry & 0xffffff, entry >> 24 & 15, entry >> 28}; }
 
-/* Lists one tile of one set. Bits of ellipses that miss are cleared. */
-kernel void list(sizes_t sizes, global const float *u, global const float *v, global const float *geometry,
-                 global const int *offsets, global uint2 *marks, global uint *entries, global int *counts) {
-    int tiles = sizes.down * sizes.across, entry = offsets[get_global_id(0)];
-    geometry += get_global_id(0) / tiles * sizes.words * 32 * GEOMETRY;
-    span_t span = span_tile(u, v, sizes, get_global_id(0) % tiles);
-    marks += get_global_id(0) * sizes.words;
-    for (int word = 0; word < sizes.words; word++) {
-        uint kept = 0, rank = entry;
-        for (uint left = marks[word].x; left; left &= left - 1) {
-            uint i = word * 32 + LOWEST(left), rows = rows_touched(load_splat(geometry + i * GEOMETRY), span);
-            if (!rows) continue;
-            entries[entry++] = i | LOWEST(rows) << 24 | HIGHEST(rows) << 28;
-            kept |= left & -left;
-        }
-        marks[word] = (uint2)(kept, rank);
+/* sqrt(x), or up to 0.2 % of it more. */
+static inline lanes root_above(lanes x) {
+    x = LEAST(x, 1e30f);
+    lanes y = as_float8(0x5f375a86 - (as_int8(x) >> 1)); /* about 1 / sqrt(x); Newton's step ends below it */
+    y *= 1.5f - .5f * x * y * y;
+    return x * y * 1.002f;
+}
+
+/* The geometry of eight splats, turned from a row each into a vector for each value. */
+static inline void load_columns(const int *splats, global const float *geometry, lanes *columns) {
+    lanes rows[8], pairs[8], fours[8];
+#pragma unroll
+    for (int j = 0; j < 8; j++) rows[j] = *(global const loose_lanes *)(geometry + splats[j] * GEOMETRY);
+#pragma unroll
+    for (int j = 0; j < 8; j += 2) {
+        lanes a = rows[j], b = rows[j + 1];
+        pairs[j] = (lanes)(a.s0, b.s0, a.s1, b.s1, a.s4, b.s4, a.s5, b.s5);
+        pairs[j + 1] = (lanes)(a.s2, b.s2, a.s3, b.s3, a.s6, b.s6, a.s7, b.s7);
     }
-    counts[get_global_id(0)] = entry - offsets[get_global_id(0)];
+#pragma unroll
+    for (int j = 0; j < 8; j += 4)
+#pragma unroll
+        for (int k = j; k < j + 2; k++) {
+            lanes a = pairs[k], b = pairs[k + 2];
+            fours[2 * k - j] = (lanes)(a.s01, b.s01, a.s45, b.s45);
+            fours[2 * k - j + 1] = (lanes)(a.s23, b.s23, a.s67, b.s67);
+        }
+#pragma unroll
+    for (int j = 0; j < 4; j++) {
+        columns[j] = (lanes)(fours[j].lo, fours[j + 4].lo);
+        columns[j + 4] = (lanes)(fours[j].hi, fours[j + 4].hi);
+    }
+}
+
+/* Entries of eight splats in the list of a tile: the first and the last row that the ellipse touches within the tile's
+ * columns, or NO_ENTRY. `low` holds the least v of each row, `high` the largest. */
+static inline masks find_entries(const int *splats, global const float *geometry, span_t span, global const float *low,
+                                 global const float *high) {
+    lanes columns[8];
+    load_columns(splats, geometry, columns);
+    lanes centre = columns[1], across = columns[2], shear = columns[4], crest = columns[6], height = columns[7];
+    lanes reach = columns[5] * 1.0001f; /* slack, as for the boxes */
+    lanes du = -offset_lanes(columns[0], span.centre), left = du - span.half_size, right = du + span.half_size;
+#ifdef PERIOD
+    masks both = left < -.5f * PERIOD | right > .5f * PERIOD; /* reached from both sides */
+    left = both ? -INFINITY : left;
+    right = both ? INFINITY : right;
+#endif
+    masks misses = MOST(left, -right) * across > reach;
+    /* The ellipse is highest, and lowest, where du is nearest to its crest, and opposite of it. */
+    lanes at_top = LEAST(MOST(crest, left), right), at_bottom = LEAST(MOST(-crest, left), right);
+    lanes s_top = at_top * across, s_bottom = at_bottom * across;
+    lanes rest_top = reach * reach - s_top * s_top, rest_bottom = reach * reach - s_bottom * s_bottom;
+    lanes top = centre + (at_top * shear + root_above(MOST(rest_top, 0.f))) * height;
+    lanes bottom = centre + (at_bottom * shear - root_above(MOST(rest_bottom, 0.f))) * height;
+    masks first = 0, last = NO_ENTRY;
+#pragma unroll
+    for (int r = 0; r < ROWS; r++) {
+        last = low[r] > top | high[r] < bottom ? last : r;
+        int back = ROWS - 1 - r;
+        first = low[back] > top | high[back] < bottom ? first : back;
+    }
+    return misses | last < 0 ? NO_ENTRY : *(const loose_masks *)splats | first << 24 | last << 28;
+}
+
+/* Lists one tile of one set: finds the splats whose boxes meet it, some words at a time, then takes eight ellipses at
+ * once. */
+kernel void list(sizes_t sizes, global const uint *hits, global const span_t *spans, global const float *edges,
+                 global const float *geometry, global const int *offsets, global int *blocks, global int *entries,
+                 global int *counts) {
+    int list = get_global_id(0), tiles = sizes.down * sizes.across, tile = list % tiles, entry = offsets[list];
+    words_t words = find_words(sizes, hits, list);
+    span_t span = spans[SPAN_U(sizes, tile)];
+    global const float *low = edges + SPAN_V(sizes, tile) * 2 * ROWS;
+    geometry += list / tiles * sizes.words * 32 * GEOMETRY;
+    for (int word = 0; word < sizes.words;) {
+        int splats[AT_ONCE * 32 + 8], size = 0;
+        for (int pause = LEAST(word + AT_ONCE, sizes.words); word < pause; word += 2) {
+            ulong left = words.u[word] & words.v[word];
+            if (word + 1 < pause) left |= (ulong)(words.u[word + 1] & words.v[word + 1]) << 32;
+            while (left) /* mostly once: a branch that is hard to predict would cost more than idle steps */
+#pragma unroll
+                for (int j = 0; j < 4; j++, left &= left - 1) {
+                    splats[size] = word * 32 + LOWEST(left);
+                    size += left != 0;
+                }
+        }
+        for (int j = size; j < size + 7; j++) splats[j] = 0; /* whose entries are not kept */
+        for (int k = 0; k < size; k += 8) {
+            masks found = find_entries(splats + k, geometry, span, low, low + ROWS);
+            const int *kept = (const int *)&found;
+            for (int j = 0; j < LEAST(size - k, 8); j++) {
+                entries[entry] = kept[j];
+                entry += kept[j] != NO_ENTRY;
+            }
+        }
+    }
+    counts[list] = entry - offsets[list];
+    blocks += list * (BLOCKS(sizes) + 1);
+    int block = 0;
+    for (int k = offsets[list]; k < entry; k++)
+        for (int last = unpack(entries[k]).splat / (BLOCK * 32); block <= last; block++) blocks[block] = k;
+    for (; block <= BLOCKS(sizes); block++) blocks[block] = entry;
 }

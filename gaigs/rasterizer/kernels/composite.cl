@@ -4,11 +4,11 @@
  * Images are (transmitters, CHANNELS, height, width); `left` is the transmittance behind the last splat.
  */
 
-/* Entries from one checkpoint to the next. There the transmittance is kept for the way back, and a tile ends where what
- * remains behind, at most its largest transmittance times the loudest signal, can change none of its pixels by more
- * than NEGLIGIBLE of its largest value. In doubt (NaN) it goes on. */
+/* Entries from one checkpoint to the next. There the transmittance is kept for the way back, and a tile's upper and
+ * lower rows end where what remains behind, at most the row's largest transmittance times the loudest signal, changes
+ * no pixel of theirs by more than NEGLIGIBLE of the tile's largest value. In doubt (NaN) they go on. */
 #define CHUNK 32
-#define NEGLIGIBLE 1e-7f
+#define NEGLIGIBLE 5e-7f
 
 typedef struct {
     int tile, x, y;   /* the tile and its first pixel */
@@ -83,11 +83,36 @@ static inline void blend(map_t *map, int r, lanes g, global const float *look) {
     for (int c = 0; c < CHANNELS; c++) map->colour[c][r] += weight * look[1 + ATTENUATION + c];
 }
 
-/* `checkpoints` may be null: no gradient is wanted. */
+/* The rows of a tile that have not ended. */
+typedef struct {
+    int first, last;
+} rows_t;
+
+static inline entry_t clip(entry_t entry, rows_t rows) {
+    return (entry_t){entry.splat, MOST(entry.first, rows.first), LEAST(entry.last, rows.last)};
+}
+
+static inline int has_ended(const map_t *maps, int row, job_t job, global const float *loudest, const float *bright) {
+    for (int t = 0; t < job.count; t++) {
+        float dark = largest(maps[t].transmittance + row, 1);
+        if (!(dark <= NEGLIGIBLE && dark * loudest[job.first + t] <= NEGLIGIBLE * bright[t])) return 0;
+    }
+    return 1;
+}
+
+static inline rows_t end_rows(rows_t rows, const map_t *maps, job_t job, global const float *loudest) {
+    float bright[TRANSMITTERS];
+    for (int t = 0; t < job.count; t++) bright[t] = largest(maps[t].colour[0], CHANNELS * ROWS);
+    while (rows.first <= rows.last && has_ended(maps, rows.first, job, loudest, bright)) rows.first++;
+    while (rows.first <= rows.last && has_ended(maps, rows.last, job, loudest, bright)) rows.last--;
+    return rows;
+}
+
+/* `checkpoints`, and the rows that had not ended at each, may be null: no gradient is wanted. */
 kernel void forward(sizes_t sizes, global const float *u, global const float *v, global const int *offsets,
                     global const int *counts, global const uint *entries, global const float *geometry,
                     global const float *appearance, global const float *loudest, global float *image,
-                    global float *left, global int *ends, global float *checkpoints) {
+                    global float *left, global int *ends, global float *checkpoints, global rows_t *bounds) {
     job_t job = find_job(sizes, get_global_id(0), offsets, counts);
     int area = sizes.height * sizes.width;
     if (sizes.sets > 1) geometry += job.first * sizes.words * 32 * GEOMETRY;
@@ -98,30 +123,27 @@ kernel void forward(sizes_t sizes, global const float *u, global const float *v,
             maps[t].transmittance[r] = 1;
             for (int c = 0; c < CHANNELS; c++) maps[t].colour[c][r] = 0;
         }
-    int done = 0, k = job.begin;
-    while (k < job.end && done < job.count) {
+    rows_t rows = {0, ROWS - 1};
+    int k = job.begin;
+    while (k < job.end && rows.first <= rows.last) {
         if (checkpoints) {
             for (int t = 0; t < job.count; t++)
                 for (int r = 0; r < ROWS; r++)
                     *(global loose_lanes *)(checkpoints + find_row(job.checkpoint, t, r)) = maps[t].transmittance[r];
-            job.checkpoint++;
+            bounds[job.checkpoint++] = rows;
         }
         for (int pause = LEAST(k + CHUNK, job.end); k < pause; k++) {
-            entry_t entry = unpack(entries[k]);
+            entry_t entry = clip(unpack(entries[k]), rows);
+            if (entry.first > entry.last) continue;
             view_t view = view_splat(load_splat(geometry + entry.splat * GEOMETRY), u, v, sizes, job.tile);
             global const float *looks = appearance + entry.splat * sizes.transmitters * APPEARANCE;
             lanes footprints[ROWS];
-            for (uint r = entry.first; r <= entry.last; r++) footprints[r] = footprint(offsets_of(&view, r));
+            for (int r = entry.first; r <= entry.last; r++) footprints[r] = footprint(offsets_of(&view, r));
             for (int t = 0; t < job.count; t++)
-                for (uint r = entry.first; r <= entry.last; r++)
+                for (int r = entry.first; r <= entry.last; r++)
                     blend(maps + t, r, footprints[r], looks + t * APPEARANCE);
         }
-        for (done = 0; done < job.count; done++) {
-            float dark = largest(maps[done].transmittance, ROWS);
-            if (!(dark <= NEGLIGIBLE)) break;
-            float bright = largest(maps[done].colour[0], CHANNELS * ROWS);
-            if (!(dark * loudest[job.first + done] <= NEGLIGIBLE * bright)) break;
-        }
+        rows = end_rows(rows, maps, job, loudest);
     }
     ends[get_global_id(0)] = k;
     for (int t = 0; t < job.count; t++)

@@ -22,15 +22,15 @@
 
 typedef float8 lanes;
 typedef int8 masks;
-typedef float8 __attribute__((aligned(4))) loose_lanes; /* in buffers, where nothing aligns them */
+typedef float8 __attribute__((aligned(4))) loose_lanes; /* in memory where nothing aligns them */
+typedef int8 __attribute__((aligned(4))) loose_masks;
 
 #define MASKED(mask, value) as_float8((mask) & as_int8(value))
 /* NaN in `a` stays. So it does in all comparisons of these kernels: what is broken must show. */
 #define LEAST(a, b) ((b) < (a) ? (b) : (a))
 #define MOST(a, b) ((b) > (a) ? (b) : (a))
-/* Places of the highest of up to 24 bits, and of the lowest of 32: a float's exponent. */
-#define HIGHEST(bits) ((as_uint((float)(bits)) >> 23) - 127)
-#define LOWEST(bits) HIGHEST((bits) & -(bits))
+/* The place of the lowest of 64 bits: a float's exponent, beside its sign. */
+#define LOWEST(bits) ((as_int((float)(long)((bits) & -(bits))) >> 23 & 255) - 127)
 
 typedef struct {
     int transmitters, sets, groups, group; /* sets of lists; groups of `group` transmitters, which share a work-item */

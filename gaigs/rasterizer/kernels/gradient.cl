@@ -101,7 +101,8 @@ static inline float sum(lanes v) {
 kernel void backward(sizes_t sizes, global const float *u, global const float *v, global const int *offsets,
                      global const int *counts, global const uint *entries, global const float *geometry,
                      global const float *appearance, global const int *ends, global const float *checkpoints,
-                     global const float *image_gradient, global const float *left_gradient, global float *partials) {
+                     global const rows_t *bounds, global const float *image_gradient,
+                     global const float *left_gradient, global float *partials) {
     job_t job = find_job(sizes, get_global_id(0), offsets, counts);
     int area = sizes.height * sizes.width, end = ends[get_global_id(0)];
     if (sizes.sets > 1)
@@ -116,17 +117,18 @@ kernel void backward(sizes_t sizes, global const float *u, global const float *v
             for (int c = 0; c < CHANNELS; c++)
                 gradient[t][c][r] = load_row(image_gradient + ((job.first + t) * CHANNELS + c) * area, sizes, job, r);
         }
-    for (size_t p = (size_t)end * PARTIALS; p < (size_t)job.end * PARTIALS; p++) partials[p] = 0;
 
     chunk_t chunk;
     view_t views[CHUNK];
+    entry_t clipped[CHUNK];
     for (int number = (end - job.begin + CHUNK - 1) / CHUNK - 1; number >= 0; number--) {
         int begin = job.begin + number * CHUNK, count = LEAST(end - begin, CHUNK);
         global float *partial = partials + (size_t)begin * PARTIALS;
+        rows_t rows = bounds[job.checkpoint + number];
         for (int k = 0; k < count; k++) {
-            entry_t entry = unpack(entries[begin + k]);
+            entry_t entry = clipped[k] = clip(unpack(entries[begin + k]), rows);
             views[k] = view_splat(load_splat(geometry + entry.splat * GEOMETRY), u, v, sizes, job.tile);
-            for (uint r = entry.first; r <= entry.last; r++) {
+            for (int r = entry.first; r <= entry.last; r++) {
                 chunk.footprint[k][r] = footprint(offsets_of(views + k, r));
                 chunk.flow[k][r] = 0;
             }
@@ -136,15 +138,15 @@ kernel void backward(sizes_t sizes, global const float *u, global const float *v
             for (int r = 0; r < ROWS; r++)
                 transmittance[r] = *(global const loose_lanes *)(checkpoints + find_row(job.checkpoint + number, t, r));
             for (int k = 0; k < count; k++) {
-                entry_t entry = unpack(entries[begin + k]);
+                entry_t entry = clipped[k];
                 global const float *look = appearance + (entry.splat * sizes.transmitters + t) * APPEARANCE;
-                for (uint r = entry.first; r <= entry.last; r++) pass_forward(&chunk, k, r, transmittance + r, look);
+                for (int r = entry.first; r <= entry.last; r++) pass_forward(&chunk, k, r, transmittance + r, look);
             }
             for (int k = count - 1; k >= 0; k--) {
-                entry_t entry = unpack(entries[begin + k]);
+                entry_t entry = clipped[k];
                 global const float *look = appearance + (entry.splat * sizes.transmitters + t) * APPEARANCE;
                 found_t found = {0};
-                for (uint r = entry.first; r <= entry.last; r++)
+                for (int r = entry.first; r <= entry.last; r++)
                     pass_back(&chunk, k, r, behind[t] + r, gradient[t][0] + r, look, &found);
                 global float *sums = partial + k * PARTIALS + MOMENTS + t * APPEARANCE;
                 sums[0] = sum(found.opacity);
@@ -153,9 +155,9 @@ kernel void backward(sizes_t sizes, global const float *u, global const float *v
             }
         }
         for (int k = 0; k < count; k++, partial += PARTIALS) {
-            entry_t entry = unpack(entries[begin + k]);
+            entry_t entry = clipped[k];
             moments_t moments = {0};
-            for (uint r = entry.first; r <= entry.last; r++)
+            for (int r = entry.first; r <= entry.last; r++)
                 add_moments(&moments, chunk.flow[k][r], offsets_of(views + k, r));
 #if SEPARABLE
             moments.s *= views[k].s;
@@ -171,35 +173,37 @@ kernel void backward(sizes_t sizes, global const float *u, global const float *v
     }
 }
 
-/* Adds up the partial sums of 32 splats over tiles, in the tiles' order, and turns them into gradients of what the host
- * handed over.
+/* Adds up the partial sums of one block of splats over tiles, in the tiles' order and as far as they were composited,
+ * and turns them into gradients of what the host handed over.
  *
  * With z = (s, y) = h L^-1 x and h^2 = log2(e) / 2,
  *
  *   d(log G)/d(mean) = L^-T z / h        d(log G)/dC = L^-T z z' L^-1 / (2 h^2)
  *
  * and L^-T / h = [across, -shear; 0, along] / h^2. */
-kernel void gather(sizes_t sizes, global const int *order, global const uint2 *marks, global const float *geometry,
-                   global const float *appearance, global const float *partials, global float *means,
-                   global float *covariances, global float *signal, global float *opacities,
-                   global float *attenuations) {
-    int word = get_global_id(0), rest = sizes.splats - word * 32, size = LEAST(rest, 32);
+kernel void gather(sizes_t sizes, global const int *order, global const int *blocks, global const int *ends,
+                   global const uint *entries, global const float *geometry, global const float *appearance,
+                   global const float *partials, global float *means, global float *covariances, global float *signal,
+                   global float *opacities, global float *attenuations) {
+    int block = get_global_id(0), base = block * BLOCK * 32, rest = sizes.splats - base, size = LEAST(rest, BLOCK * 32);
     int tiles = sizes.down * sizes.across, together = sizes.sets == 1; /* one set of lists, walked by every group */
-    float sums[32][PARTIALS], centres[32][2];
-    for (int j = 0; j < 32; j++) centres[j][0] = centres[j][1] = 0;
+    float sums[BLOCK * 32][PARTIALS], centres[BLOCK * 32][2];
+    for (int j = 0; j < size; j++) centres[j][0] = centres[j][1] = 0;
     for (int group = 0; group < sizes.groups; group++) {
         int set = together ? 0 : group, first = group * sizes.group;
         for (int j = 0; j < size; j++)
             for (int p = together && group ? MOMENTS : 0; p < PARTIALS; p++) sums[j][p] = 0;
         for (int tile = 0; tile < tiles; tile++) {
-            uint2 mark = marks[(set * tiles + tile) * sizes.words + word];
-            global const float *partial = partials + (size_t)mark.y * PARTIALS;
-            for (uint left = mark.x; left; left &= left - 1, partial += PARTIALS)
-                for (int p = 0; p < PARTIALS; p++) sums[LOWEST(left)][p] += partial[p];
+            global const int *bounds = blocks + (set * tiles + tile) * (BLOCKS(sizes) + 1) + block;
+            int end = LEAST(bounds[1], ends[group * tiles + tile]);
+            for (int k = bounds[0]; k < end; k++) {
+                float *sum = sums[unpack(entries[k]).splat - base];
+                for (int p = 0; p < PARTIALS; p++) sum[p] += partials[(size_t)k * PARTIALS + p];
+            }
         }
         if (together) partials += (size_t)sizes.entries * PARTIALS;
         for (int j = 0; j < size; j++) {
-            int i = word * 32 + j, to = order[i];
+            int i = base + j, to = order[i];
             for (int t = first; t < LEAST(first + sizes.group, sizes.transmitters); t++) {
                 float *found = sums[j] + MOMENTS + (t - first) * APPEARANCE;
                 global const float *look = appearance + (i * sizes.transmitters + t) * APPEARANCE;
@@ -225,5 +229,5 @@ kernel void gather(sizes_t sizes, global const int *order, global const uint2 *m
         }
     }
     for (int j = 0; j < size; j++)
-        for (int x = 0; x < 2; x++) means[2 * order[word * 32 + j] + x] = centres[j][x];
+        for (int x = 0; x < 2; x++) means[2 * order[base + j] + x] = centres[j][x];
 }
