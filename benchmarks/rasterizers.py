@@ -7,7 +7,7 @@
 
 A pair is a splat, a pixel and a transmitter where the splat's opacity reaches ALPHA_MIN. It is live if the
 transmittance in front of it is at least STOP. Customary rasterizers leave out the others; torch composites them, opencl
-as far as they change a tile by more than a float's last digit. A floor is the number of pairs times what the OpenCL
+as far as they change a tile by 5e-7 or more. A floor is the number of pairs times what the OpenCL
 kernels' arithmetic takes for one with every lane live and every operand at hand: no lists, no rows that miss, no tiles
 to load. Times are medians; judge them by their ratios within one run, as other work on the machine slows all of them.
 """

@@ -1,5 +1,6 @@
 """One experiment from its configuration to its run folder."""
 
+import hashlib
 import json
 import logging
 import platform
@@ -49,7 +50,8 @@ def run(config: dict, folder: Path) -> dict:
     Args:
         config: The resolved configuration.
         folder: Gets ``config.yaml``, ``best.ckpt``, ``last.ckpt``, ``log/``, ``predictions.npz``, ``gaussians.ply``,
-            ``figures/`` and, last of all, ``metrics.json``. Where that is already, nothing is done anew.
+            for RSSI ``radio_map.npz``, ``figures/`` and, last of all, ``metrics.json``. Where that is already, nothing
+            is done anew.
 
     Returns:
         The contents of ``metrics.json``.
@@ -150,7 +152,7 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
     """Fits the model by gradient descent.
 
     Returns:
-        The model at the step with the best validation SSIM, or at the last step where nothing is held out for
+        The model at the step with the best validation score, or at the last step where nothing is held out for
         validation; and the seconds it took, over all parts of a run that was interrupted.
 
     Raises:
@@ -158,6 +160,7 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
     """
     split = {"name": links.split.name, **links.split.parts()}
     identity = {"model": config["model"], "scene": links.scene.state(), "split": split, "config": config}
+    identity["links"] = fingerprint(links)
     module = call("training", Training, config["training"], model=model, identity=identity, seed=config["seed"])
     last, best = folder / "last.ckpt", folder / "best.ckpt"
     timer, keep_last = Timer(), KeepLast(last, config["save_every"])
@@ -202,15 +205,27 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
     """Sees to it that a training goes on with the links it began with, so that none of the test has been trained on.
 
     Raises:
-        ValueError: The split or the transmitters are others.
+        ValueError: The split or the links are others.
     """
     parts = ("train", "validation", "test")
     same = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
-    if not same or any(not torch.equal(there["scene"][corner], here["scene"][corner]) for corner in ("lower", "upper")):
+    if not same or there["links"] != here["links"]:
         raise ValueError(
-            f"{path} must be of these very data to go on, but they have another split or other transmitters now; "
-            "choose another folder with hydra.run.dir=DIR"
+            f"{path} must be of these very data to go on, but they have another split, or other transmitters, "
+            "receivers or labels now; choose another folder with hydra.run.dir=DIR"
         )
+
+
+def fingerprint(links: Links) -> str:
+    """A digest of who sent and who heard, and of labels that are in memory; images would have to be decoded for it."""
+    poses = [part for receiver in links.receivers for part in (receiver.pose.position, receiver.pose.rotation)]
+    parts = [links.transmitters, links.receiver_index, *poses]
+    if isinstance(links.labels, Tensor):
+        parts.append(links.labels)
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part.contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def test(model: Model, name: str, links: Links, folder: Path) -> tuple[dict[str, dict[str, Tensor]], Tensor]:

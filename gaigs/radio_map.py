@@ -15,6 +15,9 @@ if TYPE_CHECKING:  # torch is heavy, and not needed to read a map
 PITCH = 0.1
 """Distance between the points of a map [m], unless the room is large."""
 
+BATCH = 128
+"""Points predicted at a time."""
+
 POINTS = 128
 """About how many points the longer side of a map has at most, unless a pitch is asked for."""
 
@@ -61,7 +64,7 @@ def radio_map(
     pitch: float | None = None,
     height: float | None = None,
     margin: float = 0.5,
-    receivers: Sequence[str] | None = None,
+    receivers: Sequence[str] | str | None = None,
 ) -> RadioMap:
     """Predicts RSSI on a plane over the box that holds the training transmitters and all receivers, widened.
 
@@ -71,7 +74,7 @@ def radio_map(
             None takes ``PITCH``, or as much more as keeps the longer side at about ``POINTS`` points.
         height: Of the transmitters, world frame [m]; None is half-way between the lowest and the highest of training.
         margin: By which the box is widened on each side [m].
-        receivers: Names; None is all of them.
+        receivers: Names, or one name; None is all of them.
 
     Raises:
         ValueError: The model predicts spectra, an option is out of range, or there is no such receiver.
@@ -79,7 +82,10 @@ def radio_map(
     scene = model.scene
     if scene.grid is not None:
         raise ValueError("a radio map takes a model of RSSI, got one of spectra; use model.predict for its spectra")
-    names = tuple(receiver.name for receiver in scene.receivers) if receivers is None else tuple(receivers)
+    known = [receiver.name for receiver in scene.receivers]
+    names = tuple(known if receivers is None else [receivers] if isinstance(receivers, str) else receivers)
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"receivers must be among {', '.join(known)}, got {', '.join(map(repr, unknown))}")
     lower, upper = scene.lower.double().numpy(), scene.upper.double().numpy()
     height = float(lower[2] + upper[2]) / 2 if height is None else float(height)
     if not names or not np.isfinite(height) or not 0 <= margin < np.inf or not (pitch is None or 0 < pitch < np.inf):
@@ -92,6 +98,9 @@ def radio_map(
     if pitch is None:
         pitch = max(PITCH, float((upper - lower).max()) / POINTS)
     x, y = (pitch * np.arange(np.floor(a / pitch), np.floor(b / pitch) + 2) for a, b in zip(lower, upper, strict=True))
-    points = np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1)
-    values = np.stack([model.predict(points, name).cpu().numpy() for name in names])
-    return RadioMap(values, x, y, height, names)
+    points = np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1)[..., None, :]
+    points = np.broadcast_to(points, (len(y), len(x), len(names), 3)).astype(np.float32)
+    # All receivers of a point in one batch, so that what a transmitter there excites is computed once.
+    index = np.broadcast_to([known.index(name) for name in names], points.shape[:-1]).copy()
+    values = model.predict(points, index, batch_size=BATCH * len(names)).cpu().numpy()
+    return RadioMap(np.ascontiguousarray(np.moveaxis(values, -1, 0)), x, y, height, names)

@@ -3,6 +3,7 @@ import json
 import os
 import shutil
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,11 @@ import gaigs
 from gaigs import experiment
 from gaigs.configuration import conf_dir
 from gaigs.data.nerf2_spectrum import write
+from gaigs.geometry import Pose
+from gaigs.radio_map import RadioMap
 from gaigs.registry import registry
 from gaigs.report.curves import read_curves
+from gaigs.testing import example_links
 from gaigs.training.module import Training
 
 SMALL = (
@@ -393,10 +397,63 @@ def test_data_that_are_not_there_are_refused(tmp_path):
 
 def test_another_split_in_the_same_folder_is_refused():
     links = {"split": {"train": torch.tensor([0, 1]), "validation": torch.tensor([2]), "test": torch.tensor([3])}}
-    links["scene"] = {"lower": torch.zeros(3), "upper": torch.ones(3)}
+    links["links"] = "digest"
     experiment.check_same_links(links, links, Path("last.ckpt"))
     exchanged = links | {"split": links["split"] | {"train": torch.tensor([0, 3]), "test": torch.tensor([1])}}
-    moved = links | {"scene": {"lower": torch.zeros(3), "upper": 2 * torch.ones(3)}}
-    for others in (exchanged, moved):
+    for others in (exchanged, links | {"links": "another"}):
         with pytest.raises(ValueError, match=r"last\.ckpt must be of these very data"):
             experiment.check_same_links(links, others, Path("last.ckpt"))
+
+
+def test_a_fingerprint_sees_every_change_of_the_links():
+    links = example_links()
+    turned = replace(links.receivers[0], pose=Pose(links.receivers[0].pose.position, torch.eye(3)))
+    changes = {
+        "transmitters": links.transmitters + 1e-6,
+        "receiver_index": links.receiver_index.flip(0),
+        "receivers": (turned, *links.receivers[1:]),
+        "labels": links.labels * 0.999,
+    }
+    others = {experiment.fingerprint(replace(links, **{name: value})) for name, value in changes.items()}
+    assert len(others | {experiment.fingerprint(links)}) == 5
+    assert experiment.fingerprint(example_links()) == experiment.fingerprint(links)
+
+
+RSSI = (
+    *("+experiment=rssi", "data.transmitters=40", "data.order=0", "tokenizer=euclidean", "rasterizer=torch"),
+    *("gaussians.count=12", "mapping.width=8", "trainer.max_steps=6", "trainer.val_check_interval=3"),
+    *("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=1"),
+)
+
+
+def rssi_run(folder, *overrides):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config = OmegaConf.to_container(compose("config", [*RSSI, *overrides]), resolve=True)
+    return config, experiment.run(config, folder)
+
+
+def test_rssi_from_end_to_end(tmp_path):
+    _, metrics = rssi_run(tmp_path)
+    assert list(metrics) == METRICS
+    assert list(metrics["models"]) == ["gaigs", "mean", "knn", "path_loss"]
+    assert list(metrics["receivers"]) == ["west", "south", "east", "north"]
+    assert metrics["data"].startswith("157 readings of 40 places at 4 gateways; 3 below -95 dBm")
+    with np.load(tmp_path / "predictions.npz") as stored:
+        for name, scores in metrics["models"].items():
+            errors = np.abs(stored[f"error_{name}"].astype(float))
+            assert scores["mae_db"] == pytest.approx(errors.mean(), abs=1e-4)
+            assert scores["median_ae_db"] == pytest.approx(np.median(errors), abs=1e-4)
+            west = errors[stored["receiver"] == 0]
+            assert metrics["receivers"]["west"][name]["mae_db"] == pytest.approx(west.mean(), abs=1e-4)
+        np.testing.assert_allclose(stored["prediction"] - stored["labels"], stored["error_gaigs"], atol=1e-4)
+    model = gaigs.load(tmp_path / "best.ckpt")
+    floor = RadioMap.load(tmp_path / "radio_map.npz")
+    point = torch.tensor([floor.x[3], floor.y[2], floor.height])
+    assert floor.values[1, 2, 3] == pytest.approx(model.predict(point, "south").item(), abs=1e-3)
+
+
+def test_rssi_that_learns_nothing_keeps_its_reference(tmp_path):
+    """Rates so high that every step makes it worse: the best is what the training started from."""
+    rssi_run(tmp_path, *(f"training.learning_rates.{name}=100" for name in ("signal", "network")))
+    best, last = (torch.load(tmp_path / f"{name}.ckpt", weights_only=True) for name in ("best", "last"))
+    assert (best["global_step"], last["global_step"]) == (0, 6)

@@ -7,6 +7,11 @@ from pathlib import Path
 SHOWN = 10
 """Defects that an error lists one by one."""
 
+FAR = 1e5
+"""No coordinate reaches it [m]: float32 tells places apart by 8 mm there, and by half a metre at UTM's northings."""
+
+NEAR = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
+
 
 def find_folder(root: str | Path) -> Path:
     """The folder of a data set.
@@ -53,7 +58,7 @@ def read_points(file: Path, names: Sequence[str], expected: str, defects: list[s
         place = f"{file.name}, line {number}"
         cells = to_cells(line)
         if has_columns(place, line, names, defects):
-            points.append(to_numbers(place, names, cells, math.isfinite, "a finite number", defects))
+            points.append(to_coordinates(place, names, cells, defects))
         else:
             points.append([])
     return points
@@ -87,6 +92,13 @@ def to_numbers(
         columns = f"column{'s' if len(wrong) > 1 else ''} {', '.join(names[k] for k in wrong)}"
         defects.append(f"{place}, {columns}: expected {expected}, got {', '.join(repr(cells[k]) for k in wrong)}")
     return values
+
+
+def to_coordinates(place: str, names: Sequence[str], cells: Sequence[str], defects: list[str]) -> list[float]:
+    """Cells of a line as coordinates [m], finite and near enough for float32."""
+    if all(math.isfinite(to_number(cell)) for cell in cells):
+        return to_numbers(place, names, cells, lambda value: abs(value) < FAR, NEAR, defects)
+    return to_numbers(place, names, cells, math.isfinite, "a finite number", defects)
 
 
 def to_number(cell: str) -> float:

@@ -12,7 +12,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.data import Links, Receiver
-from gaigs.data._files import find_folder, has_columns, read_lines, read_points, refuse, to_cells, to_number, to_numbers
+from gaigs.data._files import (
+    FAR,
+    NEAR,
+    find_folder,
+    has_columns,
+    read_lines,
+    read_points,
+    refuse,
+    to_cells,
+    to_number,
+    to_numbers,
+)
 from gaigs.data.splits import split as split_links
 from gaigs.geometry import Pose
 from gaigs.registry import register
@@ -108,11 +119,14 @@ def read_walls(file: Path, defects: list[str]) -> Float[Tensor, "k 2 3"]:
     return torch.stack((corners[:-1], corners[1:]), 1)
 
 
-def to_dbm(place: str, names: Sequence[str], cells: Sequence[str], lowest: float, defects: list[str]) -> list[float]:
-    """Cells of a line as readings [dBm], from the lowest that may stand there to below 0."""
-    bounds = f"below {LOUDEST:g}" if lowest == -math.inf else f"from {lowest:g} to below {LOUDEST:g}"
-    expected = f"an RSSI {bounds} dBm ({NOT_HEARD:g} where nothing was heard)"
-    return to_numbers(place, names, cells, lambda value: lowest <= value < LOUDEST, expected, defects)
+def to_dbm(
+    place: str, names: Sequence[str], cells: Sequence[str], lowest: float, not_heard: float, defects: list[str]
+) -> list[float]:
+    """Cells of a line as readings [dBm], from the lowest that may stand there to below 0, or what was not heard."""
+    expected = f"an RSSI from {lowest:g} to below {LOUDEST:g} dBm ({not_heard:g} where nothing was heard)"
+    return to_numbers(
+        place, names, cells, lambda value: value == not_heard or lowest <= value < LOUDEST, expected, defects
+    )
 
 
 def _read_gateways(root: Path, defects: list[str]) -> dict[str, tuple[int, list[float]]]:
@@ -133,9 +147,11 @@ def _read_gateways(root: Path, defects: list[str]) -> dict[str, tuple[int, list[
         place = f"{POSITIONS}, line {line}: {name}"
         items = value.value if isinstance(value, yaml.SequenceNode) else []
         position = [to_number(item.value) for item in items if isinstance(item, yaml.ScalarNode)]
+        written = " ".join(text[value.start_mark.index : value.end_mark.index].split())
         if len(items) != 3 or len(position) != 3 or not np.isfinite(position).all():
-            written = " ".join(text[value.start_mark.index : value.end_mark.index].split())
             defects.append(f"{place}: position must be 3 finite numbers x, y, z, got {written!r}")
+        elif max(map(abs, position)) >= FAR:
+            defects.append(f"{place}: expected {NEAR}, got {written!r}")
         if name in gateways:
             defects.append(f"{place} has a position in line {gateways[name][0]} already")
         gateways[name] = line, position
@@ -167,7 +183,7 @@ def _read_readings(root: Path, gateways: Mapping, defects: list[str]) -> tuple[l
     for number, line in [*enumerate(lines, 1)][header:]:
         place = f"{READINGS}, line {number}"
         fits = has_columns(place, line, names, defects)
-        readings.append(to_dbm(place, names, to_cells(line), NOT_HEARD, defects) if fits else [])
+        readings.append(to_dbm(place, names, to_cells(line), NOT_HEARD, NOT_HEARD, defects) if fits else [])
     if readings and all(value == NOT_HEARD for row in readings for value in row):
         defects.append(f"{READINGS}: expected readings above {NOT_HEARD:g} dBm, got none; no gateway heard anything")
     return names, readings

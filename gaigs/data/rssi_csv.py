@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.data._files import has_columns, read_lines, refuse, to_cells, to_numbers
-from gaigs.data.nerf2_rssi import NORMALISATION, NOT_HEARD, gateway, read_walls, to_dbm
+from gaigs.data._files import has_columns, read_lines, refuse, to_cells, to_coordinates
+from gaigs.data.nerf2_rssi import LOUDEST, NORMALISATION, NOT_HEARD, gateway, read_walls, to_dbm
 from gaigs.data.splits import split as split_links
 from gaigs.registry import register
 
@@ -20,59 +20,79 @@ COLUMNS = (*(f"{end}_{axis}" for end in ENDS for axis in "xyz"), "rss_dbm")
 FIXED = 64
 """Places that the end which stands still may have, each a receiver of its own."""
 
+QUIETEST = -200.0
+"""No level lies below it [dBm]: thermal noise alone is -174 dBm in 1 Hz."""
+
 
 @register("data", "rssi_csv")
-def read(file: str | Path, split: Mapping, layout: str | Path | None = None) -> Links:
+def read(
+    file: str | Path,
+    split: Mapping,
+    layout: str | Path | None = None,
+    fixed: str | None = None,
+    not_heard: float = NOT_HEARD,
+) -> Links:
     """A data set from a table with a heading, one reading a line: one link for each reading that was heard.
 
-    The end with fewer places is the fixed one, the receiver's in a tie. Its places become the receivers, ``rx1`` ... or
-    ``tx1`` ... in the order in which they appear, and look along the world's axes; the other end moves and gives the
-    transmitters. A fixed transmitter with a moving receiver is thus read as the reverse, which reciprocity allows: a
-    channel attenuates alike either way, so where an antenna's gain is the same for sending and hearing, the reading is
-    what the fixed end would hear if the moving one sent with the fixed one's power.
+    Unless told, the end with fewer places is the fixed one, the receiver's in a tie. Its places become the receivers,
+    ``rx1`` ... or ``tx1`` ... in the order in which they appear, and look along the world's axes; the other end moves
+    and gives the transmitters. A fixed transmitter with a moving receiver is thus read as the reverse, which
+    reciprocity allows: a channel attenuates alike either way, so where an antenna's gain is the same for sending and
+    hearing, the reading is what the fixed end would hear if the moving one sent with the fixed one's power.
 
-    Readings of -100 dBm or below were not heard; they, and fixed places that nothing was heard at, are left out and
-    counted in the remarks. There is no official split.
+    Readings of ``not_heard`` were not heard; they, and fixed places that nothing was heard at, are left out and counted
+    in the remarks, which also count levels below it. There is no official split.
 
     Args:
         file: Has the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m] and ``rss_dbm`` in any
-            order; others are ignored, and named in the remarks.
+            order and in any case; others are ignored, and named in the remarks.
         split: Options of ``gaigs.data.splits.split``; the readings of one place of the moving end stay together.
         layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; none unless given.
+        fixed: The end that stands still, ``tx`` or ``rx``.
+        not_heard: What stands for a reading that was not heard [dBm]; all others lie in [-200, 0).
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: Both ends move, or something is wrong with the files; the message lists the defects by file, line
-            and value.
+        ValueError: ``fixed`` or ``not_heard`` is none of these, the fixed end has more than 64 places, or something is
+            wrong with the files; the message lists the defects by file, line and value.
     """
+    if fixed not in (None, *ENDS):
+        raise ValueError(f"fixed must be tx or rx, or null for the end with fewer places, got {fixed!r}")
+    if not isinstance(not_heard, int | float) or not math.isfinite(not_heard):
+        raise ValueError(f"not_heard must be a finite number [dBm], got {not_heard!r}; write such a number in the file")
     file = Path(file).expanduser()
     if not file.is_file():
         raise FileNotFoundError(f"{file} must be a table of readings, and is no file; set the data's file")
     defects: list[str] = []
-    points, dbm, ignored = _read_table(file, defects)
+    points, dbm, ignored = _read_table(file, not_heard, defects)
     walls = torch.zeros(0, 2, 3) if layout is None else read_walls(Path(layout).expanduser(), defects)
     refuse(file, defects)
 
     numbered = {end: _number(points[end]) for end in ENDS}
-    fixed, moving = sorted(ENDS, key=lambda end: (len(numbered[end][0]), end != "rx"))
+    tx, rx = (len(numbered[end][0]) for end in ENDS)
+    counts = f"{FIXED} places at most, got {tx} of the transmitter and {rx} of the receiver"
+    if min(tx, rx) > FIXED:
+        raise ValueError(
+            f"{file}: one end must stand at {counts}: both ends move; keep the readings of a few places of one end"
+        )
+    fixed = fixed or ("rx" if rx <= tx else "tx")
+    moving = "tx" if fixed == "rx" else "rx"
     places, at = numbered[fixed]
     if len(places) > FIXED:
-        tx, rx = (len(numbered[end][0]) for end in ENDS)
-        raise ValueError(
-            f"{file}: one end must stand at {FIXED} places at most, got {tx} of the transmitter and {rx} of the "
-            "receiver: both ends move; keep the readings of a few places of one end"
-        )
-    heard = torch.tensor([value > NOT_HEARD for value in dbm])
+        raise ValueError(f"{file}: with fixed={fixed} this end must stand at {counts}; set fixed={moving} or null")
+    heard = torch.tensor([value != not_heard for value in dbm])
     present, receiver_index = at[heard].unique(return_inverse=True)
     transmitters = torch.tensor(points[moving])[heard]
     words = {"tx": "transmitter", "rx": "receiver"}
     remarks = (
         f"{len(transmitters)} readings of a moving {words[moving]} at {len(present)} places of a fixed {words[fixed]}; "
-        f"{int((~heard).sum())} of {NOT_HEARD:g} dBm or below were not heard and are left out"
+        f"{int((~heard).sum())} of {not_heard:g} dBm were not heard and are left out"
     )
     deaf = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
     if deaf:
         remarks += f", and so are the places that nothing was heard at: {', '.join(deaf)}"
+    if below := sum(value < not_heard < LOUDEST for value in dbm):
+        remarks += f"; {below} readings below {not_heard:g} dBm are taken for levels"
     if ignored:
         remarks += f"; columns ignored: {', '.join(ignored)}"
     return Links(
@@ -88,13 +108,17 @@ def read(file: str | Path, split: Mapping, layout: str | Path | None = None) -> 
     )
 
 
-def _read_table(file: Path, defects: list[str]) -> tuple[dict[str, list], list[float], list[str]]:
+def _read_table(file: Path, not_heard: float, defects: list[str]) -> tuple[dict[str, list], list[float], list[str]]:
     """Positions of either end [m], readings [dBm], and the columns that are none of ours."""
     lines = read_lines(file, f"a heading with {','.join(COLUMNS)}", defects)
-    names = to_cells(lines[0]) if lines else []
+    written = to_cells(lines[0]) if lines else []
+    names = [name.lower() for name in written]
     points, dbm = {end: [] for end in ENDS}, []
+    has_semicolons = bool(lines) and ";" in lines[0]
+    if has_semicolons:
+        defects.append(f"{file.name}, line 1: columns are separated by commas, got semicolons in {lines[0]!r}")
     for name in COLUMNS:
-        if lines and names.count(name) != 1:
+        if lines and not has_semicolons and names.count(name) != 1:
             defects.append(f"{file.name}, line 1: expected one column {name}, got {names.count(name)} in {lines[0]!r}")
     if len(lines) == 1:
         defects.append(f"{file.name}: no readings below the heading")
@@ -107,13 +131,13 @@ def _read_table(file: Path, defects: list[str]) -> tuple[dict[str, list], list[f
             continue
         cells = to_cells(line)
         cells = [cells[k] for k in at]
-        coordinates = to_numbers(place, COLUMNS, cells[:6], math.isfinite, "a finite number", defects)
+        coordinates = to_coordinates(place, COLUMNS, cells[:6], defects)
         points["tx"].append(coordinates[:3])
         points["rx"].append(coordinates[3:])
-        dbm += to_dbm(place, COLUMNS[6:], cells[6:], -math.inf, defects)
-    if not defects and max(dbm) <= NOT_HEARD:
-        defects.append(f"{file.name}: expected readings above {NOT_HEARD:g} dBm, got none; nothing was heard")
-    return points, dbm, [name for name in names if name not in COLUMNS]
+        dbm += to_dbm(place, COLUMNS[6:], cells[6:], QUIETEST, not_heard, defects)
+    if not defects and all(value == not_heard for value in dbm):
+        defects.append(f"{file.name}: expected a reading that was heard, got none but {not_heard:g} dBm")
+    return points, dbm, [name for name in written if name.lower() not in COLUMNS]
 
 
 def _number(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:

@@ -110,12 +110,12 @@ class Model(nn.Module):
     def _index(self, receiver: int | str | Tensor, transmitters: Float[Tensor, "*points 3"]) -> Int[Tensor, "n"]:
         """The index of each position's receiver."""
         names = [receiver.name for receiver in self.scene.receivers]
-        if isinstance(receiver, str):
-            index = torch.tensor(names.index(receiver) if receiver in names else -1)
-        else:
-            index = torch.as_tensor(receiver)
         listed = ", ".join(f"{i} = {name}" for i, name in enumerate(names))
-        if index.is_floating_point() or ((index < 0) | (index >= len(names))).any():
+        try:
+            index = torch.as_tensor(names.index(receiver) if isinstance(receiver, str) else receiver)
+        except (ValueError, TypeError):  # no such name, or names where numbers must be
+            index = torch.tensor(-1)
+        if index.dtype not in (torch.int64, torch.int32) or ((index < 0) | (index >= len(names))).any():
             raise ValueError(f"receiver must be one of {listed}, got {receiver!r}")
         if index.ndim and index.shape != transmitters.shape[:-1]:
             raise ValueError(

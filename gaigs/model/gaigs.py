@@ -53,6 +53,8 @@ class GaussianSplatting(Model):
                     f"model.{option} must be given for RSSI and null for spectra, and for {kind} it is {there}; take "
                     "+experiment=rssi or +experiment=spectrum, whichever suits the data"
                 )
+        if grid is not None and (len(grid) != 2 or not all(type(size) is int for size in grid)):
+            raise ValueError(f"model.grid must be [rows, columns], two whole numbers, got {grid}")
         self.grid = scene.grid or Grid.sphere(*grid)
         self.reference = None
         if reference is not None:

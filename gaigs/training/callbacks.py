@@ -112,8 +112,12 @@ class KeepBest(Checkpoint):
     def load_state_dict(self, state: dict) -> None:
         self.best, self.waited = state["best"], state["waited"]
 
+    @torch.no_grad()
     def on_train_start(self, trainer, module) -> None:
+        """RSSI starts from its reference, which few readings may not better: so that start counts too."""
         self._stop_in_time(trainer)  # a run that was killed once it had stopped
+        if trainer.enable_validation and self.best == -math.inf and module.model.scene.grid is None:
+            self._validate(trainer, module)
 
     def on_validation_end(self, trainer, module) -> None:
         if trainer.sanity_checking:
@@ -125,8 +129,10 @@ class KeepBest(Checkpoint):
     @torch.no_grad()
     def on_train_end(self, trainer, module) -> None:
         """The last step counts too, where no validation was due at it."""
-        if not trainer.enable_validation or trainer.global_step % trainer.val_check_batch == 0:
-            return
+        if trainer.enable_validation and trainer.global_step % trainer.val_check_batch:
+            self._validate(trainer, module)
+
+    def _validate(self, trainer, module) -> None:
         module.eval()
         batches = (batch.to(module.device) for batch in trainer.val_dataloaders)
         scores = [module.scoring.scores(batch.labels, module.model(batch).label) for batch in batches]

@@ -265,6 +265,16 @@ DEFECTS = {
         lambda f: replace(f, "gateway_position.yml", "- 1", "- high"),
         "gateway_position.yml, line 2: west: position must be 3 finite numbers x, y, z, got '- 0.5 - high - 2'",
     ),
+    "gateway far": (
+        lambda f: replace(f, "gateway_position.yml", "5.0, 1, 2", "5.0, -100000, 2"),
+        "gateway_position.yml, line 1: east: expected positions within 1e5 m of the origin on "
+        "each axis (subtract a common origin from all), got '[5.0, -100000, 2]'",
+    ),
+    "row far": (
+        lambda f: replace(f, "tx_pos.csv", "2.5,-2", "1e5,-2"),
+        "tx_pos.csv, line 4, column x: expected positions within 1e5 m of the origin on "
+        "each axis (subtract a common origin from all), got '1e5'",
+    ),
     "gateway infinite": (
         lambda f: replace(f, "gateway_position.yml", "5.0", ".inf"),
         "gateway_position.yml, line 1: east: position must be 3 finite numbers x, y, z, got '[.inf, 1, 2]'",

@@ -21,7 +21,7 @@ tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm
 2.5,1,1,0,0,2.5,-100
 3.5,1,1,5,0,2,-42
 2.5,1,1,5,0,2,-43
-3.5,1,1,0,0,2.5,-120.5
+3.5,1,1,0,0,2.5,-100.0
 4.5,1,1,0,0,2.5,-53
 """
 """A transmitter at four places, heard at two: six readings that were heard, two of them repeated, and two not."""
@@ -57,8 +57,7 @@ def test_the_end_with_fewer_places_is_the_fixed_one(file, text, end, moving):
     assert (links.grid, links.normalisation) == (None, "dBm")
     fixed = {"rx": "receiver", "tx": "transmitter"}[end]
     assert links.remarks == (
-        f"6 readings of a moving {moving} at 2 places of a fixed {fixed}; "
-        "2 of -100 dBm or below were not heard and are left out"
+        f"6 readings of a moving {moving} at 2 places of a fixed {fixed}; 2 of -100 dBm were not heard and are left out"
     )
     check_data(links)
 
@@ -68,15 +67,59 @@ def test_in_a_tie_the_receiver_is_the_fixed_one(file):
     assert [receiver.name for receiver in read(file, {**RANDOM, "test": 0.5}).receivers] == ["rx1", "rx2"]
 
 
+def test_the_fixed_end_can_be_told(file):
+    links = read(file, RANDOM, fixed="tx")
+    assert [r.name for r in links.receivers] == ["tx1", "tx2", "tx3", "tx4"]
+    assert [r.pose.position.tolist() for r in links.receivers] == [[x, 1, 1] for x in (1.5, 2.5, 3.5, 4.5)]
+    assert links.transmitters[:2].tolist() == [[5, 0, 2], [0, 0, 2.5]]
+    assert links.remarks.startswith("6 readings of a moving receiver at 4 places of a fixed transmitter;")
+    assert read(file, RANDOM, fixed="rx").remarks == read(file, RANDOM).remarks
+    with pytest.raises(ValueError, match="fixed must be tx or rx, or null for the end with fewer places, got 'both'"):
+        read(file, RANDOM, fixed="both")
+
+
+def test_the_end_that_was_told_may_not_move(file):
+    file.write_text(FORTH.splitlines()[0] + "\n" + "".join(f"{k},1,1,5,0,2,-40\n" for k in range(65)))
+    assert len(read(file, RANDOM).receivers) == 1
+    with pytest.raises(ValueError, match=r"fixed=tx this end must stand at 64 places at most, got 65 .* set fixed=rx"):
+        read(file, RANDOM, fixed="tx")
+
+
+def test_only_the_mark_is_not_heard(file):
+    file.write_text(FORTH.replace("-53", "-120.5").replace("-43", "-200"))
+    links = read(file, RANDOM)
+    assert links.labels.tolist() == [-40, -50.25, -41, -42, -200, -120.5]
+    assert links.remarks.endswith(
+        "2 of -100 dBm were not heard and are left out; 2 readings below -100 dBm are taken for levels"
+    )
+    links = read(file, RANDOM, not_heard=-200)
+    assert links.labels.tolist() == [-40, -50.25, -41, -100, -42, -100, -120.5]
+    assert links.remarks.endswith("; 1 of -200 dBm were not heard and are left out")
+
+
+@pytest.mark.parametrize("mark", [127, 0, -999])
+def test_the_mark_need_not_be_a_level(file, mark):
+    file.write_text(FORTH.replace("-100.0", str(mark)).replace("-100", str(mark)))
+    links = read(file, RANDOM, not_heard=mark)
+    assert named(links) == [(x, f"rx{k}", dbm) for x, k, dbm in HEARD]
+    assert links.remarks.endswith(f"; 2 of {mark} dBm were not heard and are left out")
+
+
+@pytest.mark.parametrize("mark", [float("nan"), None, "none"])
+def test_the_mark_is_a_number(file, mark):
+    with pytest.raises(ValueError, match="not_heard must be a finite number"):
+        read(file, RANDOM, not_heard=mark)
+
+
 def test_columns_are_found_by_name_and_others_named(file):
     rows = [line.split(",") for line in FORTH.splitlines()]
     heading, *rows = [["time", row[6], *row[3:6][::-1], "note", *row[:3]] for row in rows]
-    heading[5], heading[0] = '"remark"', "\ufefftime"
+    heading[5], heading[0], heading[1] = '"Remark"', "\ufefftime", "RSS_dBm"
     file.write_text("\r\n".join(" , ".join(row) for row in [heading, *rows]) + "\r\n\r\n")
     links = read(file, RANDOM)
     assert named(links) == [(x, f"rx{k}", dbm) for x, k, dbm in HEARD]
     assert links.receivers[0].pose.position.tolist() == [5, 0, 2]
-    assert links.remarks.endswith("left out; columns ignored: time, remark")
+    assert links.remarks.endswith("left out; columns ignored: time, Remark")
 
 
 def test_a_fixed_place_that_nothing_was_heard_at_is_left_out(file):
@@ -136,19 +179,29 @@ DEFECTS = {
         ("2.5,1,1,5,0,2,-41", "nan,nan,nan,5,0,2,-41"),
         "room.csv, line 4, columns tx_x, tx_y, tx_z: expected a finite number, got 'nan', 'nan', 'nan'",
     ),
+    "far": (
+        ("2.5,1,1,5,0,2,-41", "2.5,-1e5,1,5,5400000,2,-41"),
+        "room.csv, line 4, columns tx_y, rx_y: expected positions within 1e5 m of the origin on "
+        "each axis (subtract a common origin from all), got '-1e5', '5400000'",
+    ),
     "reading nan": (
         (",-41", ",nan"),
-        "room.csv, line 4, column rss_dbm: expected an RSSI below 0 dBm "
+        "room.csv, line 4, column rss_dbm: expected an RSSI from -200 to below 0 dBm "
         "(-100 where nothing was heard), got 'nan'",
     ),
-    "loud": ((",-41", ",20"), "room.csv, line 4, column rss_dbm: expected an RSSI below 0 dBm"),
+    "loud": ((",-41", ",20"), "room.csv, line 4, column rss_dbm: expected an RSSI from -200 to below 0 dBm"),
+    "quiet": ((",-41", ",-200.5"), "room.csv, line 4, column rss_dbm: expected an RSSI from -200"),
     "zero": ((",-41", ",0"), "room.csv, line 4, column rss_dbm: expected an RSSI"),
     "word": (("1.5,1,1,0", "1.5,one,1,0"), "room.csv, line 3, column tx_y: expected a finite number, got 'one'"),
     "row too long": ((",-41", ",-41,9"), "line 4: expected 7 columns tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm, got 8"),
     "blank line between": (("2.5,", "\n2.5,"), "room.csv, line 4: expected 7 columns"),
     "no column": (("rss_dbm", "rssi"), "room.csv, line 1: expected one column rss_dbm, got 0 in 'tx_x,tx_y,tx_z,rx_x"),
     "column twice": (("tx_y", "tx_x"), "room.csv, line 1: expected one column tx_x, got 2 in 'tx_x,tx_x,"),
-    "other delimiter": ((",tx_y", ";tx_y"), "room.csv, line 1: expected one column tx_x, got 0"),
+    "other case twice": (("tx_y", "TX_X"), "room.csv, line 1: expected one column tx_x, got 2 in 'tx_x,TX_X,"),
+    "other delimiter": (
+        (FORTH, FORTH.replace(",", ";")),
+        "has 1 defect:\n  room.csv, line 1: columns are separated by commas, got semicolons in 'tx_x;tx_y;",
+    ),
     "no heading": (
         (FORTH.splitlines()[0] + "\n", ""),
         "room.csv, line 1: expected one column tx_x, got 0 in '1.5,1,1,5,0,2,-40'",
@@ -156,8 +209,8 @@ DEFECTS = {
     "only a heading": ((FORTH, FORTH.splitlines()[0]), "room.csv: no readings below the heading"),
     "empty": ((FORTH, "\n"), "room.csv: empty; expected a heading with tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm"),
     "nothing heard": (
-        (FORTH, FORTH.splitlines()[0] + "\n1,2,3,4,5,6,-100\n2,2,3,4,5,6,-101\n"),
-        "room.csv: expected readings above -100 dBm, got none; nothing was heard",
+        (FORTH, FORTH.splitlines()[0] + "\n1,2,3,4,5,6,-100\n2,2,3,4,5,6,-100.0\n"),
+        "room.csv: expected a reading that was heard, got none but -100 dBm",
     ),
 }  # fmt: skip
 
