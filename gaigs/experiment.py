@@ -110,8 +110,8 @@ def train_and_test(config: dict, folder: Path) -> dict:
     links = registry("data").build(config["data"])
     sizes = ", ".join(f"{len(part)} {name}" for name, part in links.split.parts().items())
     log.info("data: %s; split %s: %s", config["data"]["name"], links.split.name, sizes)
-    if links.remarks:
-        log.info("data: %s", links.remarks)
+    box = " x ".join(f"{edge:.2f}" for edge in links.scene.upper - links.scene.lower)
+    log.info("data: training transmitters within %s m%s", box, links.remarks and f"; {links.remarks}")
     model = registry("model").build(config["model"], scene=links.scene)
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
     log.info("model: %s", ", ".join([config["model"]["name"], *(f"{key} {name}" for key, name in parts.items())]))

@@ -74,6 +74,11 @@ class GaussianSplatting(Model):
                 "spectrum for spectra, softmax_attention or mean_power for RSSI"
             )
         self.projection = registry("projection").build(projection, pixel=self.grid.pitch)
+        if self.grid.elevations.min() < 0 and not self.projection.sees_below:
+            raise ValueError(
+                f"the map's grid reaches below the array's plane, which {projection['name']} folds onto what is above; "
+                "take mercator or equirectangular"
+            )
         self.rasterizer = registry("rasterizer").build(rasterizer)
         self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, channels=self.pooling.channels)
         self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)

@@ -32,8 +32,9 @@ class MeanPower(nn.Module):
             raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
         self.channels = channels
         self.floor = 10 ** (floor_db / 20)
-        solid_angles = grid.solid_angles if len(grid.elevations) > 1 else torch.ones(grid.shape)
-        self.register_buffer("weights", solid_angles / solid_angles.sum(), persistent=False)
+        rows, columns = grid.shape
+        weights = grid.solid_angles if rows > 1 else torch.full((1, columns), 1 / columns)
+        self.register_buffer("weights", weights, persistent=False)
 
     def forward(self, image: Float[Tensor, "b c rows columns"]) -> Float[Tensor, "b"]:
         """Level relative to the model's reference [dB]; float32 where the map is of half precision.

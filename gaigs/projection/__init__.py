@@ -63,6 +63,9 @@ class Projection(ABC):
     Source: GAI-GS, "Projection and Render Module"; Zwicker et al., EWA Splatting, 2002.
     """
 
+    sees_below = True
+    """Whether a direction below the array's plane has a place of its own."""
+
     def __init__(self, pixel: float):
         if not pixel > 0:
             raise ValueError(f"a projection's pixel must be wider than 0 rad, got {pixel}")

@@ -22,6 +22,8 @@ class DirectionCosine(Projection):
     Source: any text on planar arrays, e.g. Van Trees, Optimum Array Processing, chapter 4.
     """
 
+    sees_below = False
+
     def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
         return (points / points.norm(dim=-1, keepdim=True))[..., :2]
 

@@ -231,6 +231,19 @@ def test_a_pooling_for_other_labels_is_refused(build, readings):
         GaussianSplatting(readings.scene, **PARTS | options)
 
 
+def test_a_projection_that_folds_the_sphere_is_refused(readings):
+    softmax = {"name": "softmax_attention", "temperature": 0.3, "prior": 0.2}
+    options = {"pooling": softmax, "grid": [4, 8], "reference": {"name": "mean"}, "mapping": {}}
+    with pytest.raises(ValueError, match="below the array's plane, which direction_cosine folds"):
+        GaussianSplatting(readings.scene, **PARTS | options | {"projection": {"name": "direction_cosine"}})
+
+
+@pytest.mark.parametrize("grid", [[2.5, 3], [6, 12, 3], [True, 4]])
+def test_a_map_takes_two_whole_numbers(readings, grid):
+    with pytest.raises(ValueError, match=r"model\.grid must be \[rows, columns\], two whole numbers, got"):
+        GaussianSplatting(readings.scene, **PARTS | {"grid": grid, "reference": {"name": "mean"}, "mapping": {}})
+
+
 def test_a_look_up_is_no_reference(readings):
     options = {"grid": [4, 8], "reference": {"name": "knn", "k": 3}, "mapping": {}}
     with pytest.raises(ValueError, match="a checkpoint can store, and knn is a look-up"):
@@ -253,6 +266,8 @@ def test_spectra_have_a_grid_of_their_own_and_no_reference(build, options):
         ([[1.0, 2, 3]], 2, "must be one of 0 = gateway0, 1 = gateway1, got 2"),
         ([[1.0, 2, 3]], -1, "got -1"),
         ([[1.0, 2, 3]], "gateway2", "must be one of 0 = gateway0, 1 = gateway1, got 'gateway2'"),
+        ([[1.0, 2, 3]], True, "must be one of 0 = gateway0, 1 = gateway1, got True"),
+        ([[1.0, 2, 3]], ["gateway0"], r"must be one of 0 = gateway0, 1 = gateway1, got \['gateway0'\]"),
         ([[1.0, 2, 3]], torch.tensor([0, 1]), r"one for each of the \(1,\) positions, got \(2,\)"),
     ],
 )
