@@ -227,7 +227,7 @@ class ProgressLine(ProgressBar):
     def on_train_batch_end(self, trainer, module, *_) -> None:
         step, values = trainer.global_step, trainer.progress_bar_metrics
         rate = (step - self.first) / (time.monotonic() - self.start)
-        words = {"train/loss": "loss", "validation/ssim": "SSIM", "validation/mae_db": "MAE [dB]"}
+        words = {"train/loss": "loss", "validation/ssim": "SSIM", "validation/mae_db": "MAE/dB"}
         scores = " ".join(f"{word} {values[name]:.3f}" for name, word in words.items() if name in values)
         self.line.update(self.task, completed=step, rate=rate, scores=scores)
 
