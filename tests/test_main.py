@@ -86,14 +86,15 @@ def test_a_run_says_what_it_does_and_nothing_else(whole):
     folder, out, err = whole
     assert err == ""
     lines = out.splitlines()
-    assert (folder / "gaigs.log").read_text().splitlines() == [lines[0], lines[1], lines[3]]
+    assert (folder / "gaigs.log").read_text().splitlines() == [*lines[:3], lines[4]]
     assert lines[0] == "data: synthetic; split official, validation 0.1, seed 0: 22 train, 2 validation, 6 test"
-    assert lines[1].startswith("model: gaigs, tokenizer euclidean, projection mercator, rasterizer torch, pooling")
-    assert re.match(r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} SSIM \d\.\d{3}$", lines[2])
-    assert re.match(r"trained 40 steps of 7 transmitters in \d+ s: [\d.]+ steps/s$", lines[3])
-    assert "Test scores" in lines[4]
+    assert re.match(r"data: training transmitters within \d\.\d\d x \d\.\d\d x \d\.\d\d m$", lines[1])
+    assert lines[2].startswith("model: gaigs, tokenizer euclidean, projection mercator, rasterizer torch, pooling")
+    assert re.match(r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} SSIM \d\.\d{3}$", lines[3])
+    assert re.match(r"trained 40 steps of 7 transmitters in \d+ s: [\d.]+ steps/s$", lines[4])
+    assert "Test scores" in lines[5]
     assert lines[-1].endswith(str(folder))
-    assert all(len(line) <= 80 for line in lines[2:-1])
+    assert all(len(line) <= 80 for line in lines[3:-1])
 
 
 def test_a_run_folder(whole):
