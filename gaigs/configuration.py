@@ -1,4 +1,4 @@
-"""Where Hydra finds gaigs's configuration files and those of plug-ins."""
+"""Where Hydra finds gaigs's configuration files and those of plug-ins, and how two configurations differ."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -8,6 +8,9 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
 from gaigs.registry import KINDS, find_holders
+
+HARMLESS = ("task", "save_every", "tensorboard", "trainer.enable_progress_bar", "trainer.enable_model_summary")
+"""Keys that change nothing of what a run finds: one that goes on may have others."""
 
 
 def conf_dir() -> Path:
@@ -39,6 +42,21 @@ class PluginConfigurations(SearchPathPlugin):
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in plugin_conf_dirs():
             search_path.append(provider="gaigs plug-in", path=f"file://{folder}")
+
+
+def differences(there: dict, here: dict) -> dict[str, tuple]:
+    """What two resolved configurations have at the keys, joined by dots, in which their runs may differ; sorted."""
+    there, here = _flat(there), _flat(here)
+    keys = sorted((there.keys() | here.keys()) - set(HARMLESS))
+    return {key: (there.get(key), here.get(key)) for key in keys if there.get(key) != here.get(key)}
+
+
+def _flat(config: dict, prefix: str = "") -> dict:
+    """Nested keys joined by dots."""
+    flat = {}
+    for key, value in config.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
 
 
 def install() -> None:

@@ -21,6 +21,7 @@ from rich.console import Console
 from torch import Tensor
 
 from gaigs import checkpoint
+from gaigs.configuration import differences
 from gaigs.data import Links
 from gaigs.model import Model
 from gaigs.radio_map import radio_map
@@ -37,9 +38,6 @@ LOOK_UPS = ({"name": "mean"}, {"name": "knn", "k": 3, "power": 2})
 
 RSSI_LOOK_UPS = ({"name": "mean"}, {"name": "knn", "k": 20, "power": 1}, {"name": "path_loss"})
 """What every result on RSSI stands beside; readings are noisy, so more neighbours count, and more alike."""
-
-HARMLESS = ("task", "save_every", "tensorboard", "trainer.enable_progress_bar", "trainer.enable_model_summary")
-"""Keys that change nothing of what a run finds: one that goes on may have others."""
 
 log = logging.getLogger(__name__)
 
@@ -89,11 +87,10 @@ def claim(folder: Path, config: dict) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(OmegaConf.create(config), file)
         return
-    there, here = _flat(OmegaConf.to_container(OmegaConf.load(file))), _flat(config)
-    differing = sorted(key for key in (there.keys() | here.keys()) - set(HARMLESS) if there.get(key) != here.get(key))
+    differing = differences(OmegaConf.to_container(OmegaConf.load(file)), config)
     if differing:
         told = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
-        listed = "; ".join(f"{key} was {there.get(key)!r}, is {here.get(key)!r}" for key in told)
+        listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in told)
         raise ValueError(
             f"{folder} must be free or hold a run of the same configuration, but {listed}; choose another folder with "
             "hydra.run.dir=DIR (nothing was written into this one but Hydra's own .hydra/)"
@@ -343,11 +340,3 @@ def tensorboard_logger(folder: Path) -> Logger:
 def _cpuinfo() -> list[str]:
     path = Path("/proc/cpuinfo")
     return path.read_text().splitlines() if path.is_file() else []
-
-
-def _flat(config: dict, prefix: str = "") -> dict:
-    """Nested keys joined by dots."""
-    flat = {}
-    for key, value in config.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat

@@ -454,6 +454,6 @@ def test_rssi_from_end_to_end(tmp_path):
 
 def test_rssi_that_learns_nothing_keeps_its_reference(tmp_path):
     """Rates so high that every step makes it worse: the best is what the training started from."""
-    rssi_run(tmp_path, *(f"training.learning_rates.{name}=100" for name in ("signal", "network")))
+    rssi_run(tmp_path, *(f"training.learning_rates.{name}=1e4" for name in ("signal", "network")))
     best, last = (torch.load(tmp_path / f"{name}.ckpt", weights_only=True) for name in ("best", "last"))
     assert (best["global_step"], last["global_step"]) == (0, 6)

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 
 import torch
 
-from gaigs.data import Links, Receiver
+from gaigs.data import Links
+from gaigs.data.nerf2_rssi import NORMALISATION, gateway
 from gaigs.data.splits import split as split_links
 from gaigs.data.synthetic import ROOM, edges, last_fifth, place
 from gaigs.data.synthetic.image_source import frequency_offsets, respond_isotropic, rss_dbm
-from gaigs.geometry import Pose
 from gaigs.registry import register
 
 FREQUENCY, BANDWIDTH = 2.441e9, 78e6
@@ -74,7 +74,7 @@ def furnished_room_rssi(
     rows, receiver_index = heard.nonzero(as_tuple=True)
     return Links(
         transmitters=places[rows],
-        receivers=tuple(Receiver(name, Pose(torch.tensor(p), torch.eye(3))) for name, p in GATEWAYS.items()),
+        receivers=tuple(gateway(name, position) for name, position in GATEWAYS.items()),
         receiver_index=receiver_index,
         labels=readings[heard].float(),
         split=split_links(
@@ -84,7 +84,7 @@ def furnished_room_rssi(
             **split,
         ),
         grid=None,
-        normalisation="dBm",
+        normalisation=NORMALISATION,
         edges=edges(ROOM),
         remarks=(
             f"{len(rows)} readings of {transmitters} places at {len(GATEWAYS)} gateways; "

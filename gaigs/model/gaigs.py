@@ -91,7 +91,9 @@ class GaussianSplatting(Model):
         """For RSSI fits the reference, and has the training start from there: the map's mean level is taken off."""
         if self.reference is not None:
             self.reference.fit(links)
-            some = links.split.train[:: max(1, len(links.split.train) // 64)]
+            count = len(links.split.train)
+            # Evenly spread, though not at whole steps, which might meet the same receiver time and again.
+            some = links.split.train[torch.linspace(0, count - 1, min(64, count)).long()]
             batch = Batch(links.transmitters[some], links.receiver_index[some], None).to(self.level.device)
             self.level += (self(batch).label - self.reference(batch).label).mean()
 

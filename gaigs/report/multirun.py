@@ -13,6 +13,7 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
+from gaigs.configuration import differences
 from gaigs.report.curves import speed_against_error
 from gaigs.report.style import DPI
 from gaigs.report.table import METRICS, written
@@ -52,7 +53,7 @@ def read_runs(folder: Path) -> list[Run]:
     runs = []
     for path in folder.glob("*/.hydra/overrides.yaml"):
         run_config, started = path.parents[1] / "config.yaml", path.parent / "config.yaml"
-        if run_config.is_file() and started.is_file() and _resolved(run_config) != _resolved(started):
+        if run_config.is_file() and started.is_file() and differences(_resolved(run_config), _resolved(started)):
             raise ValueError(
                 f"{run_config.parent} holds a run of another configuration than the one last started there, which was "
                 "refused, and Hydra has rewritten its overrides; start the multirun once more as it was at first"
