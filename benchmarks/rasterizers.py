@@ -9,7 +9,8 @@ A pair is a splat, a pixel and a transmitter where the splat's opacity reaches A
 transmittance in front of it is at least STOP. Customary rasterizers leave out the others; torch composites them, opencl
 as far as they change a tile by 5e-7 or more. A floor is the number of pairs times what the OpenCL
 kernels' arithmetic takes for one with every lane live and every operand at hand: no lists, no rows that miss, no tiles
-to load. Times are medians; judge them by their ratios within one run, as other work on the machine slows all of them.
+to load; without opencl there is none. Times are medians; judge them by their ratios within one run, as other work on
+the machine slows all of them.
 """
 
 import argparse
@@ -195,7 +196,7 @@ def time_compositing(rasterizer: Rasterizer, scene: Scene) -> float | None:
     if not isinstance(rasterizer, opencl.OpenCLRasterizer):
         return None
     splats, signal, opacities, attenuations, plane = scene
-    render = opencl._Render(opencl._queue(rasterizer.device), splats, signal, opacities, attenuations, plane)
+    render = opencl._Render(opencl.open_queue(rasterizer.device), splats, signal, opacities, attenuations, plane)
     start = time.perf_counter()
     render.forward(differentiate=True)
     return time.perf_counter() - start
@@ -205,7 +206,7 @@ class Ceiling:
     """The OpenCL kernels' arithmetic alone, on all cores."""
 
     def __init__(self, channels: int, attenuation: bool):
-        self.queue = opencl._queue(None)
+        self.queue = opencl.open_queue(None)
         macros = {"CHANNELS": channels, "ATTENUATION": int(attenuation), "TRANSMITTERS": 1, "SEPARABLE": 1}
         macros |= {"ALPHA_MIN": opencl._literal(ALPHA_MIN), "ALPHA_MAX": opencl._literal(ALPHA_MAX)}
         options = ["-w", *(f"-D{macro}={value}" for macro, value in macros.items())]
@@ -260,7 +261,7 @@ def main() -> None:
 
     console = Console()
     console.print(f"{options.scene}: {make_scene.__doc__}")
-    console.print(f"{torch.get_num_threads()} threads; tensors on {options.device}; OpenCL on {opencl.devices()[0]}")
+    console.print(f"{torch.get_num_threads()} threads; tensors on {options.device}")
     rasterizers = {}
     small = make_scene(32, options.device)
     for name in options.rasterizers:
@@ -268,9 +269,12 @@ def main() -> None:
             rasterizer = registry("rasterizer").get(name)()
             run(rasterizer, small, torch.ones(len(small[1]), *small[-1].shape, device=options.device))
             rasterizers[name] = rasterizer
+            console.print(f"{name}: {rasterizer.used}")
         except (RuntimeError, TypeError) as error:
             console.print(f"{name} is left out: {error}")
-    ceiling = Ceiling(small[1].shape[-1], small[3] is not None)
+    ceiling = None
+    if isinstance(rasterizers.get("opencl"), opencl.OpenCLRasterizer):
+        ceiling = Ceiling(small[1].shape[-1], small[3] is not None)
 
     speed = Table("", *map(escape, SPEED), box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     accuracy = Table("", *map(escape, ACCURACY), box=SIMPLE_HEAD, pad_edge=False)
@@ -290,11 +294,11 @@ def main() -> None:
                 for part, seconds in found.items():
                     if repeat and seconds is not None:  # the first repeat warms up
                         times[name, part].append(1e3 * seconds)
-            for way in WAYS:
+            for way in WAYS if ceiling else ():
                 times["ceiling", way].append(1e3 * ceiling.time_pair(way))
         medians = {key: statistics.median(milliseconds) for key, milliseconds in times.items()}
         speed.add_row(f"{n:,} splats")
-        for count, kind in ((pairs, "pairs"), (live, "live")):
+        for count, kind in ((pairs, "pairs"), (live, "live")) if ceiling else ():
             forward, backward = (count * medians["ceiling", way] for way in WAYS)
             speed.add_row(f"  floor, {count:,} {kind}", "", f"{forward:.2f}", f"{backward:.2f}")
         double = make_scene(n, options.device, torch.float64)

@@ -28,12 +28,16 @@ from rich.table import Table
 from torch.autograd.graph import register_multi_grad_hook
 
 from gaigs import configuration
-from gaigs.experiment import count_gaussians, device_name, device_of
+from gaigs.data import load
+from gaigs.evaluation import device_name, device_of
+from gaigs.experiment import count_gaussians
 from gaigs.rasterizer import Rasterizer, opencl
 from gaigs.rasterizer import torch as eager
 from gaigs.registry import call, registry
 from gaigs.training.batches import Batches
-from gaigs.training.module import Training
+
+EXCITATION = "placement to deformation"
+"""Where the Gaussians stand, the tokens, and what a query changes."""
 
 REST = "backward: loss to projection"
 
@@ -49,7 +53,7 @@ class Watch(Callback):
 
     def __init__(self, rasterizers: dict[str, Rasterizer]):
         self.turns = [(name, divided) for divided in (True, False) for name in rasterizers]
-        self.rasterizers = rasterizers
+        self.rasterizers, self.divided = rasterizers, False
         self.parts, self.wholes = defaultdict(lambda: defaultdict(list)), defaultdict(list)
 
     def lap(self, part: str) -> None:
@@ -62,7 +66,8 @@ class Watch(Callback):
     def lap_back(self, part: str, *tensors: torch.Tensor | None) -> None:
         """Laps once the way back has come to any of these tensors; ``part`` is what it went through before."""
         tensors = [tensor for tensor in tensors if tensor is not None and tensor.requires_grad]
-        register_multi_grad_hook(tensors, lambda _: self.lap(part), mode="any")
+        if tensors:
+            register_multi_grad_hook(tensors, lambda _: self.lap(part), mode="any")
 
     def rasterize(self, splats, *arguments):
         """The rasterizer whose turn it is."""
@@ -73,9 +78,10 @@ class Watch(Callback):
         self.lap_back("backward: rasterizer", splats.means2d, splats.covariances2d, *arguments[:-1])
         return outputs
 
-    def map(self, mapping, tokens, residuals) -> None:
-        """The hook behind the scene mapping network."""
-        self.lap("tokenizer and mapping")
+    def deform(self, deformation, inputs, residuals) -> None:
+        """The hook behind the deformation."""
+        self.lap(EXCITATION)
+        self.deforms = any(part is not None and part.requires_grad for part in residuals)
         self.lap_back(REST, *residuals)
 
     def start_step(self, number: int) -> None:
@@ -85,8 +91,8 @@ class Watch(Callback):
 
     def on_train_start(self, trainer, module) -> None:
         module.model.rasterizer = self.rasterize
-        module.model.tokenizer.register_forward_pre_hook(lambda *_: self.lap("batch and Lightning"))
-        module.model.mapping.register_forward_hook(self.map)
+        module.model.register_forward_pre_hook(lambda *_: self.lap("batch and Lightning"))
+        module.model.deformation.register_forward_hook(self.deform)
         module.model.pooling.register_forward_hook(lambda *_: self.lap("pooling and loss"))
         trainer.optimizers[0].register_step_post_hook(lambda *_: self.lap("optimizer step"))
         self.start_step(0)
@@ -98,7 +104,7 @@ class Watch(Callback):
         self.lap("batch and Lightning")
 
     def on_after_backward(self, trainer, module) -> None:
-        self.lap("backward: tokenizer and mapping" if module.model.mapping.heads else REST)
+        self.lap(f"backward: {EXCITATION}" if self.deforms else REST)
 
     def on_before_optimizer_step(self, *_) -> None:
         self.lap("batch and Lightning")
@@ -151,10 +157,11 @@ def train(config: dict, watch: Watch, steps: int) -> str:
         What was trained on what.
     """
     lightning.seed_everything(config["seed"], verbose=False)
-    links = registry("data").build(config["data"])
+    links = load(config["data"], config["split"])
     model = registry("model").build(config["model"], scene=links.scene)
     model.fit(links)
-    module = call("training", Training, config["training"], model=model, identity={}, seed=config["seed"])
+    context = {"model": model, "loss": registry("loss").build(config["loss"], task=links.task)}
+    module = registry("training").build(config["training"], **context, identity={}, seed=config["seed"])
     options = config["trainer"] | {"max_steps": steps, "enable_progress_bar": False}
     context = {"callbacks": [watch], "logger": False, "enable_checkpointing": False}
     trainer = call("trainer", lightning.Trainer, options, **context)
@@ -163,7 +170,7 @@ def train(config: dict, watch: Watch, steps: int) -> str:
         for message in (".*LeafSpec", "You defined a `validation_step` but have no `val_dataloader`"):
             warnings.filterwarnings("ignore", message)
         trainer.fit(module, batches)
-    return f"{module.batch_size} links a step, {count_gaussians(model)} Gaussians; {device_name(device_of(model))}"
+    return f"{module.batch_size} places a step, {count_gaussians(model)} Gaussians; {device_name(device_of(model))}"
 
 
 def main() -> None:

@@ -1,6 +1,8 @@
 """The command line: ``python -m gaigs +experiment=spectrum``."""
 
 import logging
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -11,39 +13,56 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gaigs import configuration
+from gaigs import configuration, processes
+from gaigs.processes import Stopped, forward_to_children, limit_threads, stopping
 from gaigs.registry import check_type
 
+BASIC_LAUNCHER = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+"""Hydra's default, which runs the jobs of a multirun one after the other in this process."""
 
-def run(config: DictConfig) -> None:
-    """Does the task of a configuration.
+
+def run(config: DictConfig) -> float | None:
+    """Does the command of a configuration.
+
+    Returns:
+        Of a training the validation score that sweepers look at; see ``train``.
 
     Raises:
-        CompactHydraException: There is no such task, or it fails for a reason that a user can mend.
+        CompactHydraException: There is no such command, or it fails for a reason that a user can mend.
     """
-    match config.get("task"):  # None where it is missing
+    match config.get("command"):  # None where it is missing
         case "train":
-            train(config)
+            return train(config)
         case "devices":
-            list_devices()
+            return list_devices()
         case unknown:
-            raise CompactHydraException(f"gaigs: task must be train or devices, got {unknown!r}")
+            raise CompactHydraException(f"gaigs: command must be train or devices, got {unknown!r}")
 
 
-def train(config: DictConfig) -> None:
+def train(config: DictConfig) -> float | None:
     """Runs one configuration in Hydra's run folder.
+
+    Returns:
+        The mean of the task's watched score over the validation links, for sweepers; None where nothing validates.
 
     Raises:
         CompactHydraException: What a user can mend, as one message; Hydra prints it without the traceback and exits
-            with 1, after the other jobs of a multirun.
+            with 1, after the other jobs of a multirun. With ``hydra.verbose=true`` the error itself.
+        SystemExit: A signal has stopped the run: 128 and the signal's number, as shells report it.
     """
+    settings = HydraConfig.get()
+    if processes.received:
+        raise CompactHydraException("gaigs: not started, as the multirun has been stopped")
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        for key, annotation in {"seed": int, "save_every": float, "tensorboard": bool}.items():
+        types = {"seed": int, "save_every": float, "tensorboard": bool, "threads": int | None, "baselines": list}
+        for key, annotation in types.items():
             check_type(key, plain.get(key), annotation)
+        is_sweep = settings.mode is RunMode.MULTIRUN
+        limit_threads(plain["threads"], settings.launcher.get("n_jobs", 1) if is_sweep else 1)
     except OmegaConfBaseException as error:  # whose message Hydra adds
         raise CompactHydraException("gaigs: the configuration is not complete") from error
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise CompactHydraException(f"gaigs: {error}") from error
     # Slow to import: here, once the configuration has proved good.
     from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -52,16 +71,27 @@ def train(config: DictConfig) -> None:
 
     for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
         logging.getLogger(name).setLevel(logging.WARNING)
-    settings = HydraConfig.get()
     try:
-        experiment.run(plain, Path(settings.runtime.output_dir))
+        with stopping():
+            metrics = experiment.run(plain, Path(settings.runtime.output_dir))
     except KeyboardInterrupt as stop:
-        mode = "sweep" if settings.mode is RunMode.MULTIRUN else "run"
-        folder = f"hydra.{mode}.dir={settings[mode].dir}"
-        print(f"gaigs: {str(stop) or 'stopped'}; the same command with {folder} goes on", file=sys.stderr)
-        raise SystemExit(130) from None  # as shells report Ctrl-C
+        mode = "sweep" if is_sweep else "run"
+        told = f"gaigs: {str(stop) or 'stopped'}; the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
+        number = getattr(stop, "number", signal.SIGINT)
+        if is_sweep and settings.launcher["_target_"] != BASIC_LAUNCHER:
+            # Only this job ends: a launcher that sees a process exit kills its other jobs before they have saved.
+            processes.received.append(number)
+            raise CompactHydraException(told) from None
+        if not processes.is_first():  # it ends well: at a code of failure Lightning would kill the first one
+            raise SystemExit(0) from None
+        print(told, file=sys.stderr)
+        raise SystemExit(128 + number) from None
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MisconfigurationException) as error:
+        if settings.verbose:
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra leaves most of the traceback out
+            raise
         raise CompactHydraException(f"gaigs: {error}") from error
+    return None if metrics is None else metrics["validation_score"]
 
 
 def list_devices() -> None:
@@ -83,7 +113,25 @@ def list_devices() -> None:
 def main() -> None:
     """The console script ``gaigs``."""
     configuration.install()
-    hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
+    signals = []
+
+    def stop(number: int, _) -> None:
+        """Jobs in other processes save and end; this one waits for them."""
+        signals.append(number)
+        forward_to_children(number)
+        if not any(arg in ("-m", "--multirun") for arg in sys.argv):
+            raise Stopped("stopped", number)
+
+    handler = signal.signal(signal.SIGTERM, stop)
+    try:
+        hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
+    except Stopped:
+        print("gaigs: stopped", file=sys.stderr)
+        raise SystemExit(128 + signal.SIGTERM) from None
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+        if signals:
+            sys.exit(128 + signals[0])
 
 
 if __name__ == "__main__":

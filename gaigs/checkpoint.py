@@ -5,12 +5,15 @@ from pathlib import Path
 import torch
 from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 
-from gaigs.data import Scene
 from gaigs.model import Model
 from gaigs.registry import registry
+from gaigs.scene import Scene
 
 KEY = "gaigs"
 """Where our part stands in a Lightning checkpoint."""
+
+VERSION = 1
+"""Of our part. Version 0, which had no number, is read too: see ``_from_version_0``."""
 
 
 def read(path: str | Path) -> dict:
@@ -18,7 +21,7 @@ def read(path: str | Path) -> dict:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no checkpoint of gaigs, or not a whole one.
+        ValueError: It is no checkpoint of gaigs, not a whole one, or of a later version.
     """
     path = Path(path)
     if not path.is_file():
@@ -28,9 +31,12 @@ def read(path: str | Path) -> dict:
     except Exception as error:  # torch raises whatever its unpickler or archive reader meets
         cause = f"{type(error).__name__}: {error}".splitlines()[0]
         raise ValueError(f"{path} must be a checkpoint of gaigs, and is damaged or another file ({cause})") from error
-    if not isinstance(content, dict) or KEY not in content:
+    if not isinstance(content, dict) or not isinstance(content.get(KEY), dict):
         raise ValueError(f"{path} must be a checkpoint of gaigs, and lacks the entry {KEY!r}")
-    return content
+    version = content[KEY].get("version", 0)
+    if version > VERSION:
+        raise ValueError(f"{path} must be of version {VERSION} or earlier, got {version}; update gaigs")
+    return content if version else _from_version_0(content)
 
 
 def load(path: str | Path) -> Model:
@@ -56,3 +62,23 @@ def load(path: str | Path) -> Model:
         defects = " ".join(str(error).split())
         raise ValueError(f"{path} must hold the weights of its configuration, and does not: {defects}") from error
     return model.eval()
+
+
+def _from_version_0(content: dict) -> dict:
+    """The splatting pipeline's parts had other names: mapping, the map's grid in the model, reference."""
+    part = content[KEY]
+    model = dict(part["model"])
+    if "mapping" in model:
+        model["deformation"] = {"name": "two_branch", **model.pop("mapping")}
+        model["placement"] = {"name": "free"}
+        model["trend"] = model.pop("reference")
+        grid = model.pop("grid")
+        if grid is not None:
+            model["pooling"] = {**model["pooling"], "grid": grid}
+    names = {"model.mapping.": "model.deformation.", "model.reference.": "model.trend."}
+    weights = {}
+    for key, value in content["state_dict"].items():
+        for old, new in names.items():
+            key = new + key.removeprefix(old) if key.startswith(old) else key
+        weights[key] = value
+    return content | {KEY: part | {"model": model}, "state_dict": weights}

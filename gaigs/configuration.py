@@ -1,16 +1,30 @@
 """Where Hydra finds gaigs's configuration files and those of plug-ins, and how two configurations differ."""
 
+import difflib
+import hashlib
 from importlib.util import find_spec
 from pathlib import Path
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import OmegaConf
 
 from gaigs.registry import KINDS, find_holders
 
-HARMLESS = ("task", "save_every", "tensorboard", "trainer.enable_progress_bar", "trainer.enable_model_summary")
+HARMLESS = (
+    "command", "save_every", "tensorboard", "threads", "trainer.enable_progress_bar", "trainer.enable_model_summary"
+)  # fmt: skip
 """Keys that change nothing of what a run finds: one that goes on may have others."""
+
+KEYS = {
+    *KINDS, "gaussians", "density", "baselines", "trainer", "command", "seed", "save_every", "tensorboard", "threads"
+}  # fmt: skip
+"""What stands at the top of a configuration."""
+
+
+LONGEST = 200
+"""Bytes in the name of a job's folder; most file systems end at 255."""
 
 
 def conf_dir() -> Path:
@@ -51,12 +65,38 @@ def differences(there: dict, here: dict) -> dict[str, tuple]:
     return {key: (there.get(key), here.get(key)) for key in keys if there.get(key) != here.get(key)}
 
 
+def check_keys(config: dict) -> None:
+    """Sees to it that a configuration has the keys that there are, and no others.
+
+    Raises:
+        ValueError: One is unknown or missing.
+    """
+    if unknown := sorted(set(config) - KEYS):
+        near = difflib.get_close_matches(unknown[0], KEYS, n=1)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        raise ValueError(f"the configuration has no key {unknown[0]!r}{hint}; there are: {', '.join(sorted(KEYS))}")
+    if missing := sorted(KEYS - {"density"} - set(config)):  # which is null unless asked for
+        raise ValueError(f"the configuration needs the key {missing[0]!r}; conf/config.yaml has them all")
+
+
 def _flat(config: dict, prefix: str = "") -> dict:
     """Nested keys joined by dots."""
     flat = {}
     for key, value in config.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat
+
+
+def run_folder(overrides: str) -> str:
+    """The name of a job's folder from its overrides: one folder, whatever is in them, and no longer than allowed."""
+    name = overrides.replace("/", "_") or "defaults"
+    if len(name.encode()) <= LONGEST:
+        return name
+    digest = hashlib.sha256(name.encode()).hexdigest()[:12]
+    return name.encode()[: LONGEST - len(digest) - 1].decode(errors="ignore") + "-" + digest
+
+
+OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)  # at import: a launcher's workers need it too
 
 
 def install() -> None:

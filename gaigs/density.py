@@ -79,7 +79,8 @@ def _rearrange(
         for group in optimizer.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
         if state := optimizer.state.pop(old, None):
+            # What an optimizer remembers is of the Gaussians, though not of all their axes in Adafactor, or one number.
             optimizer.state[new] = {
-                key: pick_state(value) if torch.is_tensor(value) and value.shape == old.shape else value
+                key: pick_state(value) if torch.is_tensor(value) and value.shape[:1] == old.shape[:1] else value
                 for key, value in state.items()
             }

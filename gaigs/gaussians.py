@@ -9,8 +9,8 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor, nn
 
-from gaigs.data import Scene
 from gaigs.geometry import covariances, from_spherical
+from gaigs.scene import Scene
 
 SH_DC = 0.5 / math.sqrt(math.pi)
 """The constant spherical harmonic, by which .ply viewers multiply the first signal coefficient."""
@@ -19,13 +19,14 @@ SH_DC = 0.5 / math.sqrt(math.pi)
 class Gaussians(nn.Module):
     """n anisotropic Gaussians, each a virtual transmitter; parameters are stored raw, properties give them activated.
 
-    They start in the directions that the label shows: for every receiver on a Fibonacci lattice over the part of the
-    sphere that the label's grid covers (the whole of it where the label is no spectrum), at random distances, each wide
-    enough to meet its neighbours. So the count follows from the angular detail wanted: ``count`` splats over the upper
-    hemisphere lie sqrt(2 pi / count) rad apart. Of several receivers each has an equal share, and sees the others' too.
+    They start in the directions that the map shows: for every receiver on a Fibonacci lattice over a zone of the
+    sphere, at random distances, each wide enough to meet its neighbours. So the count follows from the angular detail
+    wanted: ``count`` splats over the upper hemisphere lie sqrt(2 pi / count) rad apart. Of several receivers each has
+    an equal share, and sees the others' too.
 
     Args:
-        scene: Receivers and grid, which say where to put the Gaussians.
+        scene: Its receivers say where to put the Gaussians.
+        zone: Lowest and highest elevation that anything is heard from, in the receivers' frames [rad].
         channels: Signal channels a Gaussian sends on; the pooling knows how many it needs.
         count: Gaussians at the start, of all receivers together.
         near, far: Range of the distances to their own receiver at the start [m].
@@ -45,6 +46,7 @@ class Gaussians(nn.Module):
     def __init__(
         self,
         scene: Scene,
+        zone: tuple[float, float],
         channels: int,
         count: int,
         near: float,
@@ -57,15 +59,17 @@ class Gaussians(nn.Module):
         receivers = len(scene.receivers)
         if count < receivers:
             raise ValueError(f"gaussians.count must be at least one a receiver ({receivers}), got {count}")
-        if not 0 < near <= far:
-            raise ValueError(f"gaussians.near and far must satisfy 0 < near <= far, got {near} and {far} m")
+        if not 0 < near <= far < math.inf:
+            raise ValueError(f"gaussians.near and far must satisfy 0 < near <= far < inf, got {near} and {far} m")
+        if not 0 < spread < math.inf:
+            raise ValueError(f"gaussians.spread must be positive, got {spread}")
         if not 0 < opacity < 1:
             raise ValueError(f"gaussians.opacity must lie between 0 and 1, got {opacity}")
+        if not 0 <= signal < math.inf:
+            raise ValueError(f"gaussians.signal must be at least 0, got {signal}")
         shares = [count // receivers + (i < count % receivers) for i in range(receivers)]
         means, scales = [], []
-        low, high = (-math.pi / 2, math.pi / 2)
-        if scene.grid is not None:
-            low, high = scene.grid.elevations.min().item(), scene.grid.elevations.max().item()
+        low, high = zone
         for receiver, share in zip(scene.receivers, shares, strict=True):
             directions = fibonacci_lattice(share, low, high)
             distances = near + (far - near) * torch.rand(share)

@@ -1,16 +1,12 @@
-"""What a receiver would hear from everywhere on a floor."""
+"""What a receiver would report of a transmitter anywhere on a floor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-
-if TYPE_CHECKING:  # torch is heavy, and not needed to read a map
-    from gaigs.model import Model
 
 PITCH = 0.1
 """Distance between the points of a map [m], unless the room is large."""
@@ -24,14 +20,17 @@ POINTS = 128
 
 @dataclass(frozen=True)
 class RadioMap:
-    """Predicted RSSI of transmitters on a horizontal plane.
+    """What is predicted of transmitters on a horizontal plane: one real number, e.g. their RSSI.
 
     Attributes:
-        values: One map a receiver (receivers, rows, columns) [dBm]; rows along y, columns along x.
+        values: One map a receiver (receivers, rows, columns) [unit]; rows along y, columns along x.
         x: One a column, world frame [m].
         y: One a row, world frame [m].
         height: Of the transmitters, world frame [m].
         receivers: Names.
+        quantity: What a value is.
+        unit: Of a value; empty for a ratio.
+        frequency: Of the carrier [Hz]; None where it is unknown.
     """
 
     values: Float[ndarray, "receivers rows columns"]
@@ -39,49 +38,70 @@ class RadioMap:
     y: Float[ndarray, "rows"]
     height: float
     receivers: tuple[str, ...]
+    quantity: str = "RSSI"
+    unit: str = "dBm"
+    frequency: float | None = None
 
     def save(self, path: str | Path) -> None:
-        """Writes ``.npz`` with the arrays ``values_dbm``, ``x``, ``y``, ``height`` and ``receivers``."""
+        """Writes ``.npz`` with ``values_<unit>``, ``x``, ``y``, ``height``, ``receivers``, ``quantity`` and ``unit``.
+
+        ``values_<unit>`` has the unit in lower case, e.g. ``values_dbm``; it is ``values`` where the unit is not of
+        plain letters alone. ``frequency`` [Hz] is there where it is known.
+        """
+        arrays = {_key(self.unit): self.values, "x": self.x, "y": self.y, "height": self.height}
+        arrays |= {"receivers": self.receivers, "quantity": self.quantity, "unit": self.unit}
+        if self.frequency is not None:
+            arrays["frequency"] = self.frequency
         with open(path, "wb") as file:  # given a name, numpy would append .npz where it is missing
-            np.savez_compressed(
-                file, values_dbm=self.values, x=self.x, y=self.y, height=self.height, receivers=self.receivers
-            )
+            np.savez_compressed(file, **arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> "RadioMap":
-        """The inverse of ``save``.
+        """The inverse of ``save``; takes files of RSSI that say neither quantity nor unit too.
 
         Raises:
             FileNotFoundError: There is no such file.
         """
         with np.load(path) as file:
-            receivers = tuple(file["receivers"].tolist())
-            return cls(file["values_dbm"], file["x"], file["y"], float(file["height"]), receivers)
+            words = {name: str(file[name]) for name in ("quantity", "unit") if name in file.files}
+            values = file[_key(words.get("unit", cls.unit))]
+            frequency = float(file["frequency"]) if "frequency" in file.files else None
+            place = file["x"], file["y"], float(file["height"])
+            return cls(values, *place, tuple(file["receivers"].tolist()), **words, frequency=frequency)
+
+
+def _key(unit: str) -> str:
+    return f"values_{unit.lower()}" if unit.isascii() and unit.isalpha() else "values"
 
 
 def radio_map(
-    model: "Model",
+    model,
     pitch: float | None = None,
     height: float | None = None,
     margin: float = 0.5,
     receivers: Sequence[str] | str | None = None,
+    frequency: float | None = None,
 ) -> RadioMap:
-    """Predicts RSSI on a plane over the box that holds the training transmitters and all receivers, widened.
+    """Predicts on a plane over the box that holds the training transmitters and all receivers, widened.
 
     Args:
-        model: Of a scene whose labels are RSSI, fitted or loaded.
+        model: A ``gaigs.model.Model`` of a task whose label is one real number, e.g. RSSI; fitted or loaded.
         pitch: Distance between neighbouring points [m]; the points are its multiples, so maps of one pitch share them.
             None takes ``PITCH``, or as much more as keeps the longer side at about ``POINTS`` points.
         height: Of the transmitters, world frame [m]; None is half-way between the lowest and the highest of training.
         margin: By which the box is widened on each side [m].
         receivers: Names, or one name; None is all of them.
+        frequency: Of the carrier [Hz]; None is that of the training links, of several the middle one.
 
     Raises:
-        ValueError: The model predicts spectra, an option is out of range, or there is no such receiver.
+        ValueError: The model predicts something else, an option is out of range, or there is no such receiver.
     """
     scene = model.scene
-    if scene.grid is not None:
-        raise ValueError("a radio map takes a model of RSSI, got one of spectra; use model.predict for its spectra")
+    if scene.task.shape != () or scene.task.dtype.is_complex:
+        raise ValueError(
+            f"a radio map takes a model of one real number a link, got one of task {scene.task.name!r}, whose labels "
+            f"are {tuple(scene.task.shape)} of {scene.task.dtype}; use model.predict"
+        )
     known = [receiver.name for receiver in scene.receivers]
     names = tuple(known if receivers is None else [receivers] if isinstance(receivers, str) else receivers)
     if unknown := [name for name in names if name not in known]:
@@ -102,5 +122,8 @@ def radio_map(
     points = np.broadcast_to(points, (len(y), len(x), len(names), 3)).astype(np.float32)
     # All receivers of a point in one batch, so that what a transmitter there excites is computed once.
     index = np.broadcast_to([known.index(name) for name in names], points.shape[:-1]).copy()
-    values = model.predict(points, index, batch_size=BATCH * len(names)).cpu().numpy()
-    return RadioMap(np.ascontiguousarray(np.moveaxis(values, -1, 0)), x, y, height, names)
+    if frequency is None and len(scene.frequencies):
+        frequency = float(scene.frequencies[len(scene.frequencies) // 2])
+    values = model.predict(points, index, frequency=frequency, batch_size=BATCH * len(names)).cpu().numpy()
+    values = np.ascontiguousarray(np.moveaxis(values, -1, 0))
+    return RadioMap(values, x, y, height, names, scene.task.quantity, scene.task.unit, frequency)

@@ -21,7 +21,11 @@ from types import MappingProxyType, NoneType, UnionType
 
 from omegaconf import OmegaConf
 
-KINDS = ("tokenizer", "projection", "rasterizer", "pooling", "model", "data")
+KINDS = (
+    "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
+    "model", "training",
+)  # fmt: skip
+"""In the order of a prediction's parts; each is a folder of gaigs and of conf."""
 
 PLAIN = {
     int: (numbers.Integral, "a whole number"),
@@ -204,7 +208,9 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
         raise TypeError(f"{what} must be a mapping of options, got {options!r}")
     parameters = _signature(function).parameters.values()
     named = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-    takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    # (*args, **kwargs) is what a torch module without a constructor of its own seems to take: it takes nothing.
+    variable = {p.kind for p in parameters} & {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
+    takes_all = variable == {inspect.Parameter.VAR_KEYWORD}
     has = [key for key in named if key not in context]
     unknown = [key for key in options if key in context or not (takes_all or key in named)]
     if unknown:

@@ -15,15 +15,15 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 import gaigs
-from gaigs import experiment
+from gaigs import evaluation, experiment
 from gaigs.configuration import conf_dir
+from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.geometry import Pose
 from gaigs.radio_map import RadioMap
-from gaigs.registry import registry
 from gaigs.report.curves import read_curves
 from gaigs.testing import example_links
-from gaigs.training.module import Training
+from gaigs.training.descent import Descent
 
 SMALL = (
     "data.transmitters=30",
@@ -31,19 +31,21 @@ SMALL = (
     "rasterizer=torch",
     "gaussians.count=30",
     "training.batch_size=7",  # 22 links train: batches of 7, 7, 7 and 1
-    "training.loss.stride=8",
+    "training.thinning.stride=8",
     "trainer.accelerator=cpu",
     "trainer.max_steps=14",
     "trainer.val_check_interval=5",
     "trainer.log_every_n_steps=1",
     "trainer.enable_progress_bar=false",
+    "baselines=[{name: mean}, {name: knn, k: 3, power: 2.0}]",
 )
 CASES = {
     "validation": (),
-    "no validation": ("data.split.validation=0",),
+    "no validation": ("split.validation=0",),
     "no validation in time": ("trainer.val_check_interval=100",),
     "density control": (
-        "training.density={every: 3, start: 3, stop: 9, gradient: 1.0e-4, wide: 0.3, opacity: 0.005, most: 50}",
+        "training.density={every: 3, start: 3, stop: 9, gradient: 1.0e-4, split_angle: 0.3, opacity: 0.005, "
+        "max_count: 50}",
     ),
     "early stop": (  # the first step drives all opacities to 0 or 1, so the second validation is as good as the first
         "trainer.val_check_interval=3",
@@ -52,6 +54,7 @@ CASES = {
     ),
 }
 METRICS = [
+    "task",
     "data",
     "split",
     "seed",
@@ -65,6 +68,8 @@ METRICS = [
     "num_parameters",
     "checkpoint_bytes",
     "models",
+    "validation",
+    "validation_score",
     "receivers",
 ]
 
@@ -78,7 +83,7 @@ def configure(*overrides):
 def no_figures():
     """Figures take longer than all else; the tests of gaigs.report and of the command line draw them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "write_figures", lambda *_: None)
+        patch.setattr(evaluation, "write_figures", lambda *_: None)
         yield
 
 
@@ -92,7 +97,7 @@ def case(request, tmp_path_factory):
 
 def interrupt(monkeypatch, at, times=1):
     """Presses Ctrl-C within a step."""
-    training_step = Training.training_step
+    training_step = Descent.training_step
 
     def interrupted(self, batch, index):
         if self.global_step + 1 == at:
@@ -100,7 +105,7 @@ def interrupt(monkeypatch, at, times=1):
                 os.kill(os.getpid(), signal.SIGINT)
         return training_step(self, batch, index)
 
-    monkeypatch.setattr(Training, "training_step", interrupted)
+    monkeypatch.setattr(Descent, "training_step", interrupted)
 
 
 def assert_same(a, b, where):
@@ -168,7 +173,7 @@ def test_the_cases_are_what_they_are_called(case):
     patience = config["training"]["patience"]
     assert last["global_step"] == (14 if patience is None else 6)
     assert best["global_step"] <= last["global_step"]
-    if not config["data"]["split"]["validation"] or config["trainer"]["val_check_interval"] == 100:
+    if not config["split"]["validation"] or config["trainer"]["val_check_interval"] == 100:
         assert best["global_step"] == 14
     else:
         assert best["global_step"] == 14 or best["global_step"] % config["trainer"]["val_check_interval"] == 0
@@ -209,7 +214,10 @@ def test_metrics(finished):
     assert metrics["checkpoint_bytes"] == (folder / "best.ckpt").stat().st_size
     assert metrics["num_parameters"] == sum(p.numel() for p in gaigs.load(folder / "best.ckpt").parameters())
     assert min(metrics[time] for time in ("train_seconds", "inference_ms", "render_ms")) > 0
-    assert list(metrics["models"]) == ["gaigs", "mean", "knn"]
+    assert list(metrics["models"]) == ["gaigs", "mean", "knn"] == list(metrics["validation"])
+    best = torch.load(folder / "best.ckpt", weights_only=True)["callbacks"]
+    (kept,) = (state["best"] for name, state in best.items() if name.startswith("KeepBest"))
+    assert metrics["validation_score"] == metrics["validation"]["gaigs"]["ssim_mean"] == pytest.approx(kept, abs=1e-6)
     for scores in metrics["models"].values():
         assert list(scores) == ["ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae"]
 
@@ -231,11 +239,11 @@ def test_the_stored_configuration_gives_the_same_run(finished, tmp_path):
 
 def test_predictions_belong_to_the_test_links(finished):
     config, folder, metrics = finished
-    links = registry("data").build(config["data"])
+    links = load(config["data"], config["split"])
     with np.load(folder / "predictions.npz") as file:
         stored = dict(file)
     assert stored["link"].tolist() == links.split.test.tolist()
-    np.testing.assert_array_equal(stored["transmitters"], links.transmitters[links.split.test])
+    np.testing.assert_array_equal(stored["transmitters"], links.query.transmitters[links.split.test])
     np.testing.assert_allclose(stored["labels"], links.labels[links.split.test], atol=5e-4)
     assert np.median(stored["ssim_gaigs"]) == pytest.approx(metrics["models"]["gaigs"]["ssim_median"])
 
@@ -251,10 +259,10 @@ def test_a_finished_run_started_again_ends_at_once(finished, monkeypatch):
 def test_a_run_killed_behind_its_training_only_tests_anew(finished, tmp_path, monkeypatch):
     config, folder, metrics = finished
     with monkeypatch.context() as patch:
-        patch.setattr(experiment, "test", lambda *_: 1 / 0)
+        patch.setattr(evaluation, "test", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             experiment.run(config, tmp_path)
-    monkeypatch.setattr(Training, "training_step", lambda *_: 1 / 0)
+    monkeypatch.setattr(Descent, "training_step", lambda *_: 1 / 0)
     trained = torch.load(tmp_path / "last.ckpt", weights_only=True)["callbacks"]["Timer"]["time_elapsed"]["train"]
     others = experiment.run(config, tmp_path)
     assert_same_run(metrics, folder, others, tmp_path)
@@ -297,7 +305,9 @@ def test_a_damaged_checkpoint_is_refused(finished, tmp_path):
         experiment.run(config, tmp_path)
 
 
-@pytest.mark.parametrize(("model", "others"), [("knn", ["mean"]), ("mean", ["knn"])])
+@pytest.mark.parametrize(
+    ("model", "others"), [("knn", ["mean"]), ("mean", ["knn"])]
+)
 def test_look_ups_run_without_training(model, others, finished, tmp_path):
     metrics = experiment.run(configure(f"model={model}"), tmp_path)
     assert list(metrics) == METRICS
@@ -324,17 +334,33 @@ def test_tensorboard_logs_beside_the_csv(tmp_path):
     [
         (["+tokenizer.widht=3"], r"tokenizer 'euclidean' has no option 'widht' \(did you mean 'width'\?\); it has: "),
         (["+gaussians.conut=3"], r"gaussians has no option 'conut' \(did you mean 'count'\?\); it has: count, near"),
-        (["+mapping.header=[]"], r"mapping has no option 'header' \(did you mean 'heads'\?\); it has: width"),
-        (["+training.batchsize=3"], r"training has no option 'batchsize' \(did you mean 'batch_size'\?\)"),
-        (["~training.loss.stride"], r"training.loss needs option stride; it has: stride, ssim"),
+        (
+            ["+deformation.header=[]"],
+            r"deformation 'two_branch' has no option 'header' \(did you mean 'heads'\?\); it has: width",
+        ),
+        (["+training.batchsize=3"], r"training 'descent' has no option 'batchsize' \(did you mean 'batch_size'\?\)"),
+        (["~loss.ssim"], r"loss 'l1_ssim' needs option ssim; it has: ssim"),
+        (
+            ["+training.thinning.strid=2"],
+            r"training.thinning has no option 'strid' \(did you mean 'stride'\?\); it has: stride, rays",
+        ),
+        (["+training.learning_rates.netwrk=1"], r"training.learning_rates has netwrk, and the model's groups are"),
+        (["+training.schedule.warm=1"], r"training.schedule has no option 'warm' \(did you mean 'warmup'\?\)"),
+        (["+foo=3"], r"the configuration has no key 'foo'"),
+        (["baselines=[{name: mean}, {name: mean}]"], r"baselines must have different names, got 'mean' twice"),
+        (["baselines=[{name: gaigs2}]"], r"unknown model 'gaigs2'"),
+        (
+            ["task.name=rssi"],
+            r"the labels of data 'synthetic' are of task 'spectrum', and the configuration is for 'rssi'",
+        ),
         (["training.density={evry: 3}"], r"density has no option 'evry' \(did you mean 'every'\?\)"),
         (["training.density=3"], r"density must be a mapping of options, got 3"),
         (["+trainer.max_step=3"], r"trainer has no option 'max_step' \(did you mean 'max_steps'\?\)"),
         (["+trainer.callbacks=[]"], r"trainer has no option 'callbacks'"),
-        (["+trainer.accumulate_grad_batches=2"], r"trainer.devices and accumulate_grad_batches must be 1;"),
-        (["trainer.devices=2"], r"trainer.devices and accumulate_grad_batches must be 1;"),
+        (["+trainer.accumulate_grad_batches=2"], r"trainer.accumulate_grad_batches must be 1; set training.batch_size"),
+        (["trainer.devices=2", "trainer.strategy=ddp_spawn"], r"trainer.strategy must be auto for one process or ddp"),
         (["trainer.max_steps=-1"], r"trainer.max_steps must be at least 1, got -1"),
-        (["data.split.protocol=blcks"], r"unknown split protocol 'blcks'"),
+        (["split.name=blcks"], r"unknown split 'blcks' \(did you mean 'blocks'\?\)"),
     ],
 )
 def test_a_wrong_option_is_named(overrides, message, tmp_path):
@@ -347,7 +373,8 @@ def test_a_wrong_option_is_named(overrides, message, tmp_path):
 def rfid(tmp_path_factory):
     """A small data set in the folder layout of NeRF²."""
     folder = tmp_path_factory.mktemp("rfid") / "data"
-    write(folder, registry("data").build(configure("data.transmitters=12")["data"]))
+    config = configure("data.transmitters=12")
+    write(folder, load(config["data"], config["split"]))
     return folder
 
 
@@ -371,7 +398,7 @@ def missing_image(folder):
 def measured(folder):
     """A configuration of measured spectra."""
     config = configure("trainer.max_steps=2")
-    return config | {"data": {"name": "nerf2_spectrum", "root": str(folder), "split": config["data"]["split"]}}
+    return config | {"data": {"name": "nerf2_spectrum", "root": str(folder)}}
 
 
 @pytest.mark.parametrize("damage", [nan_position, wide_image, missing_image])
@@ -409,19 +436,24 @@ def test_a_fingerprint_sees_every_change_of_the_links():
     links = example_links()
     turned = replace(links.receivers[0], pose=Pose(links.receivers[0].pose.position, torch.eye(3)))
     changes = {
-        "transmitters": links.transmitters + 1e-6,
-        "receiver_index": links.receiver_index.flip(0),
+        "query": replace(links.query, transmitters=links.query.transmitters + 1e-6),
         "receivers": (turned, *links.receivers[1:]),
         "labels": links.labels * 0.999,
     }
+    queries = {
+        "receivers": links.query.receivers.flip(0),
+        "frequencies": torch.full((len(links),), 1e9),
+    }
     others = {experiment.fingerprint(replace(links, **{name: value})) for name, value in changes.items()}
-    assert len(others | {experiment.fingerprint(links)}) == 5
+    for name, value in queries.items():
+        others.add(experiment.fingerprint(replace(links, query=replace(links.query, **{name: value}))))
+    assert len(others | {experiment.fingerprint(links)}) == 6
     assert experiment.fingerprint(example_links()) == experiment.fingerprint(links)
 
 
 RSSI = (
     *("+experiment=rssi", "data.transmitters=40", "data.order=0", "tokenizer=euclidean", "rasterizer=torch"),
-    *("gaussians.count=12", "mapping.width=8", "trainer.max_steps=6", "trainer.val_check_interval=3"),
+    *("gaussians.count=12", "deformation.width=8", "trainer.max_steps=6", "trainer.val_check_interval=3"),
     *("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=1"),
 )
 
@@ -435,7 +467,7 @@ def rssi_run(folder, *overrides):
 def test_rssi_from_end_to_end(tmp_path):
     _, metrics = rssi_run(tmp_path)
     assert list(metrics) == METRICS
-    assert list(metrics["models"]) == ["gaigs", "mean", "knn", "path_loss"]
+    assert list(metrics["models"]) == ["gaigs", "mean", "knn", "path_loss", "gaussian_process"]
     assert list(metrics["receivers"]) == ["west", "south", "east", "north"]
     assert metrics["data"].startswith("157 readings of 40 places at 4 gateways; 3 below -95 dBm")
     with np.load(tmp_path / "predictions.npz") as stored:
@@ -452,7 +484,7 @@ def test_rssi_from_end_to_end(tmp_path):
     assert floor.values[1, 2, 3] == pytest.approx(model.predict(point, "south").item(), abs=1e-3)
 
 
-def test_rssi_that_learns_nothing_keeps_its_reference(tmp_path):
+def test_rssi_that_learns_nothing_keeps_its_trend(tmp_path):
     """A rate so high that every step throws signals about by many bels: the best is what the training started from."""
     rssi_run(tmp_path, "training.learning_rates.signal=1e3", "training.learning_rates.network=0")
     best, last = (torch.load(tmp_path / f"{name}.ckpt", weights_only=True) for name in ("best", "last"))

@@ -13,7 +13,17 @@ from gaigs.gaussians import Gaussians, fibonacci_lattice
 from gaigs.geometry import to_spherical
 from gaigs.testing import example_links
 
-OPTIONS = {"channels": 2, "count": 41, "near": 2.0, "far": 5.0, "spread": 0.5, "opacity": 0.1, "signal": 1.0}
+ZONE = (0.07, 1.55)
+OPTIONS = {
+    "zone": ZONE,
+    "channels": 2,
+    "count": 41,
+    "near": 2.0,
+    "far": 5.0,
+    "spread": 0.5,
+    "opacity": 0.1,
+    "signal": 1.0,
+}
 
 
 @pytest.fixture
@@ -52,14 +62,14 @@ def test_the_lattice_is_even(low, high):
     assert nearest.max() < 1.3 * pitch
 
 
-def test_every_receiver_gets_its_share_in_the_directions_that_its_label_shows(scene):
+def test_every_receiver_gets_its_share_in_the_directions_that_its_map_shows(scene):
     gaussians = gaussians_of(scene)
     assert len(gaussians) == 41
     shares = gaussians.means.split((21, 20))
     for receiver, means in zip(scene.receivers, shares, strict=True):
         azimuths, elevations, distances = to_spherical(receiver.pose.local(means))
-        assert elevations.min() >= scene.grid.elevations.min() - 1e-5
-        assert elevations.max() <= scene.grid.elevations.max() + 1e-5
+        assert elevations.min() >= ZONE[0] - 1e-5
+        assert elevations.max() <= ZONE[1] + 1e-5
         assert distances.min() >= 2 - 1e-5
         assert distances.max() <= 5 + 1e-5
         assert azimuths.max() - azimuths.min() > 5
@@ -76,8 +86,9 @@ def test_they_start_as_wide_as_to_meet_their_neighbours(scene):
     assert (gaussians.scales[:, 0] / distances).mean().item() == pytest.approx(0.5 * angles, rel=0.1)
 
 
-def test_without_a_grid_they_surround_the_receiver(scene):
-    gaussians = gaussians_of(replace(scene, grid=None, receivers=scene.receivers[:1]), count=200)
+def test_in_a_zone_that_is_the_sphere_they_surround_the_receiver(scene):
+    whole = -math.pi / 2, math.pi / 2
+    gaussians = gaussians_of(replace(scene, receivers=scene.receivers[:1]), zone=whole, count=200)
     _, elevations, _ = to_spherical(scene.receivers[0].pose.local(gaussians.means))
     assert elevations.min() < -1
     assert elevations.max() > 1
@@ -97,8 +108,12 @@ def test_activations(scene):
     ("options", "message"),
     [
         ({"count": 1}, r"at least one a receiver \(2\), got 1"),
-        ({"near": 0.0}, "0 < near <= far, got 0.0 and 5.0 m"),
+        ({"near": 0.0}, "0 < near <= far < inf, got 0.0 and 5.0 m"),
         ({"near": 6.0}, "0 < near <= far"),
+        ({"far": math.inf}, "0 < near <= far < inf, got 2.0 and inf m"),
+        ({"spread": 0.0}, "spread must be positive, got 0.0"),
+        ({"spread": math.nan}, "spread must be positive, got nan"),
+        ({"signal": -1.0}, "signal must be at least 0, got -1.0"),
         ({"opacity": 1.0}, "between 0 and 1, got 1.0"),
         ({"opacity": 0.0}, "between 0 and 1"),
     ],

@@ -19,7 +19,7 @@ import yaml
 
 import gaigs
 from gaigs import __main__ as command_line
-from gaigs import experiment
+from gaigs import evaluation, experiment
 from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
 
@@ -29,12 +29,13 @@ SMALL = (
     "rasterizer=torch",
     "gaussians.count=30",
     "training.batch_size=7",
-    "training.loss.stride=8",
+    "training.thinning.stride=8",
     "trainer.accelerator=cpu",
     "trainer.max_steps=40",
     "trainer.val_check_interval=15",
     "trainer.log_every_n_steps=2",
     "save_every=0",
+    "baselines=[{name: mean}, {name: knn, k: 3, power: 2.0}]",
 )
 
 
@@ -89,9 +90,11 @@ def test_a_run_says_what_it_does_and_nothing_else(whole):
     assert (folder / "gaigs.log").read_text().splitlines() == [*lines[:3], lines[4]]
     assert lines[0] == "data: synthetic; split official, validation 0.1, seed 0: 22 train, 2 validation, 6 test"
     assert re.match(r"data: training transmitters within \d\.\d\d x \d\.\d\d x \d\.\d\d m$", lines[1])
-    assert lines[2].startswith("model: gaigs, tokenizer euclidean, projection mercator, rasterizer torch, pooling")
-    assert re.match(r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} SSIM \d\.\d{3}$", lines[3])
-    assert re.match(r"trained 40 steps of 7 transmitters in \d+ s: [\d.]+ steps/s$", lines[4])
+    assert lines[2].startswith(
+        "model: gaigs, placement free, tokenizer euclidean, deformation two_branch, projection mercator"
+    )
+    assert re.match(r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} ssim \d\.\d{3}$", lines[3])
+    assert re.match(r"trained 40 steps of 7 places in \d+ s: [\d.]+ steps/s$", lines[4])
     assert "Test scores" in lines[5]
     assert lines[-1].endswith(str(folder))
     assert all(len(line) <= 80 for line in lines[3:-1])
@@ -136,7 +139,7 @@ def test_a_killed_run_ends_as_if_it_had_not_been(whole, interrupted):
 def run(capsys, monkeypatch, tmp_path):
     """Runs the command line; gives its exit code and what it says on stderr; ``run.out`` is the rest."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(experiment, "write_figures", lambda *_: None)
+    monkeypatch.setattr(evaluation, "write_figures", lambda *_: None)
     root = logging.getLogger()
     handlers = list(root.handlers)
 
@@ -164,7 +167,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
     [
         (["tokenizer.anchor=3"], "Key 'anchor' is not in struct"),  # Hydra's own
         (["tokenizer=foo"], "Could not find 'tokenizer/foo'"),
-        (["+experiment=foo"], "Available options in 'experiment':\n\trssi\n\tspectrum"),
+        (["+experiment=foo"], "Available options in 'experiment':\n\tcsi\n\trssi\n\tspectrum"),
         (["+tokenizer.widht=3"], "gaigs: tokenizer 'euclidean' has no option 'widht' (did you mean 'width'?)"),
         (["+trainer.max_step=3"], "gaigs: trainer has no option 'max_step' (did you mean 'max_steps'?)"),
         (["trainer.accelerator=abacus"], "invalid accelerator name: `accelerator='abacus'`"),
@@ -172,11 +175,14 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         (["seed=${sed}"], "gaigs: the configuration is not complete\nInterpolation key 'sed' not found"),
         (["data.transmitters=4e1"], "gaigs: data 'synthetic' option 'transmitters' must be a whole number, got 40.0"),
         (["trainer.max_steps=1e1"], "gaigs: trainer option 'max_steps' must be a whole number, got 10.0; write 10"),
-        (["training.batch_size=8.0"], "gaigs: training option 'batch_size' must be a whole number, got 8.0; write 8"),
+        (
+            ["training.batch_size=8.0"],
+            "gaigs: training 'descent' option 'batch_size' must be a whole number, got 8.0; write 8",
+        ),
         (["save_every=null"], "gaigs: save_every must be a number, got None"),
         (["seed=1.5"], "gaigs: seed must be a whole number, got 1.5"),
-        (["task=trian"], "gaigs: task must be train or devices, got 'trian'"),
-        (["~task"], "gaigs: task must be train or devices, got None"),
+        (["command=trian"], "gaigs: command must be train or devices, got 'trian'"),
+        (["~command"], "gaigs: command must be train or devices, got None"),
     ],
 )
 def test_what_a_user_can_mend_is_told_without_a_traceback(overrides, message, run):
@@ -201,21 +207,21 @@ def devices(monkeypatch):
 def test_devices_are_listed_whatever_the_rest_of_the_configuration(run, tmp_path, monkeypatch):
     mark = "  <- rasterizer=opencl takes this one"
     monkeypatch.setattr(experiment, "run", None)
-    assert run("task=devices", "data=nerf2_spectrum", "seed=${sed}", *HERE) == (0, "")
+    assert run("command=devices", "data=nerf2_spectrum", "seed=${sed}", *HERE) == (0, "")
     assert run.out == f"Maker: GPU (GPU)\nMaker: CPU (CPU){mark}\n"
     assert {path.name for path in (tmp_path / "run").iterdir()} == {".hydra", "gaigs.log"}
     monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "gpu")
-    assert run("task=devices", *HERE) == (0, "")
+    assert run("command=devices", *HERE) == (0, "")
     assert run.out == f"Maker: GPU (GPU){mark}\nMaker: CPU (CPU)\n"
 
 
 def test_devices_that_are_not_there(run, devices, monkeypatch):
     monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "abacus")
-    code, err = run("task=devices", *HERE)
+    code, err = run("command=devices", *HERE)
     assert code == 1
     assert "no OpenCL device is called 'abacus'; there are: Maker: GPU (GPU); Maker: CPU (CPU)" in err
     devices.clear()
-    code, err = run("task=devices", *HERE)
+    code, err = run("command=devices", *HERE)
     assert code == 1
     assert "gaigs: rasterizer 'opencl' needs an OpenCL driver: pip install 'pyopencl[pocl]'" in err
     assert "Traceback" not in err
@@ -223,7 +229,7 @@ def test_devices_that_are_not_there(run, devices, monkeypatch):
 
 def test_of_devices_of_the_same_name_the_first_is_taken(run, devices):
     devices.append(devices[1])
-    assert run("task=devices", *HERE) == (0, "")
+    assert run("command=devices", *HERE) == (0, "")
     assert [line.endswith("takes this one") for line in run.out.splitlines()] == [False, True, False]
 
 
@@ -272,7 +278,8 @@ def test_a_multirun_goes_past_a_failure_and_reports(run, tmp_path):
     assert code == 1
     assert "gaigs: gaussians.count must be at least one a receiver (1), got 0" in err
     assert "Traceback" not in err
-    assert report(tmp_path / "sweep").row_count == 4 + 2
+    (table,) = report(tmp_path / "sweep").renderables
+    assert table.row_count == 4 + 2
     with open(tmp_path / "sweep" / "ablation.csv", newline="") as file:
         ended = {(row["tokenizer"], row["gaussians.count"]): row["status"] for row in csv.DictReader(file)}
     for tokenizer in ("euclidean", "ga"):

@@ -5,24 +5,41 @@ import pytest
 import torch
 
 import gaigs
-from gaigs.data import Grid, Receiver, Scene
+from gaigs.directions import Grid
 from gaigs.geometry import Pose
 from gaigs.model import Model, Prediction
 from gaigs.radio_map import POINTS, RadioMap, radio_map
+from gaigs.scene import Receiver, Scene
+from gaigs.task.csi import Csi
+from gaigs.task.rssi import Rssi
+from gaigs.task.scalar import Scalar
+from gaigs.task.spectrum import Spectrum
+
+
+class DelaySpread(Scalar):
+    name, quantity, unit, error_unit = "delay_spread", "delay spread", "ns", "ns"
+
+
+class Narrow(Csi):
+    """One complex number a link, without axes."""
+
+    shape = ()
 
 
 class Slope(Model):
     """An RSSI that tells where its transmitter stands and who hears it."""
 
     def forward(self, batch):
-        weights = batch.transmitters.new_tensor([1, 10, 100])
-        return Prediction(batch.transmitters @ weights - 1000 * torch.as_tensor(batch.receivers), {})
+        query = batch.query
+        value = query.transmitters @ torch.tensor([1.0, 10, 100]) - 1000 * query.receivers
+        return Prediction(value if query.frequencies is None else value + query.frequencies, {})
 
 
-def scene(upper=(4.0, 2.0, 1.5), grid=None, far=(5.0, 1.0, 2.5)):
+def scene(upper=(4.0, 2.0, 1.5), task=None, far=(5.0, 1.0, 2.5), frequencies=()):
     gateways = {"door": (0.0, -0.2, 2.0), "window": far}
     receivers = tuple(Receiver(name, Pose(torch.tensor(p), torch.eye(3))) for name, p in gateways.items())
-    return Scene(receivers, torch.tensor([1.0, 0.5, 0.5]), torch.tensor(upper), 0.3, grid, "dBm")
+    corners = torch.tensor([1.0, 0.5, 0.5]), torch.tensor(upper)
+    return Scene(receivers, *corners, 0.3, task or Rssi(), torch.tensor(frequencies))
 
 
 def test_each_value_is_that_of_its_place_and_receiver():
@@ -52,7 +69,7 @@ def test_pitch_is_a_decimetre_unless_the_room_is_large():
 
 def test_a_row_of_transmitters_still_makes_a_plane():
     receivers = (Receiver("end", Pose(torch.zeros(3), torch.eye(3))),)
-    row = Scene(receivers, torch.tensor([0.0, 0, 1]), torch.tensor([2.0, 0, 1]), 0.3, None, "dBm")
+    row = Scene(receivers, torch.tensor([0.0, 0, 1]), torch.tensor([2.0, 0, 1]), 0.3, Rssi())
     assert radio_map(Slope(row), pitch=0.5, margin=0).values.shape == (1, 2, 6)
 
 
@@ -78,21 +95,68 @@ def test_what_makes_no_map_is_refused(options, message):
         radio_map(Slope(scene()), **options)
 
 
-def test_spectra_make_no_map():
-    with pytest.raises(ValueError, match="takes a model of RSSI, got one of spectra"):
-        radio_map(Slope(scene(grid=Grid.degrees())))
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        (Spectrum(*vars(Grid.degrees()).values(), ""), r"'spectrum', whose labels are \(90, 360\) of torch.float32"),
+        (Narrow(1, torch.tensor([2.4e9])), r"'csi', whose labels are \(\) of torch.complex64"),
+    ],
+)
+def test_what_is_no_real_number_makes_no_map(task, message):
+    with pytest.raises(ValueError, match=f"takes a model of one real number a link, got one of task {message}"):
+        radio_map(Slope(scene(task=task)))
+
+
+def test_carrier_is_the_training_links_of_several_the_middle_one_or_the_one_asked_for():
+    pitch = {"pitch": 0.5}
+    unknown = radio_map(Slope(scene()), **pitch)
+    assert unknown.frequency is None
+    for carriers, asked, used in (((7.0,), None, 7), ((5.0, 7.0, 12.0), None, 7), ((5.0, 12.0), 9, 9), ((), 9, 9)):
+        drawn = radio_map(Slope(scene(frequencies=carriers)), frequency=asked, **pitch)
+        assert drawn.frequency == used
+        np.testing.assert_allclose(drawn.values, unknown.values + used, atol=1e-3)
+    with pytest.raises(ValueError, match="frequency must be positive"):
+        radio_map(Slope(scene()), frequency=-1.0)
 
 
 def test_file_holds_the_map_and_its_axes(tmp_path):
     drawn = radio_map(Slope(scene()), pitch=0.5)
     drawn.save(tmp_path / "floor")
     with np.load(tmp_path / "floor", allow_pickle=False) as file:
-        assert set(file.files) == {"values_dbm", "x", "y", "height", "receivers"}
+        assert set(file.files) == {"values_dbm", "x", "y", "height", "receivers", "quantity", "unit"}
         assert file["values_dbm"].dtype == np.float32
-    loaded = RadioMap.load(tmp_path / "floor")
+        assert (str(file["quantity"]), str(file["unit"])) == ("RSSI", "dBm")
+    same(RadioMap.load(tmp_path / "floor"), drawn)
+
+
+@pytest.mark.parametrize(
+    ("unit", "key"), [("ns", "values_ns"), ("dB", "values_db"), ("dB/m", "values"), ("", "values")]
+)
+def test_file_names_the_values_by_their_unit(tmp_path, unit, key):
+    task = DelaySpread()
+    task.unit = unit
+    drawn = radio_map(Slope(scene(task=task, frequencies=(2.5e9,))), pitch=0.5)
+    assert (drawn.quantity, drawn.unit) == ("delay spread", unit)
+    drawn.save(tmp_path / "floor.npz")
+    with np.load(tmp_path / "floor.npz") as file:
+        assert key in file.files
+        assert float(file["frequency"]) == 2.5e9
+    same(RadioMap.load(tmp_path / "floor.npz"), drawn)
+
+
+def test_a_file_without_words_is_one_of_rssi(tmp_path):
+    drawn = radio_map(Slope(scene()), pitch=0.5)
+    np.savez(
+        tmp_path / "old.npz", values_dbm=drawn.values, x=drawn.x, y=drawn.y, height=1.0, receivers=["door", "window"]
+    )
+    same(RadioMap.load(tmp_path / "old.npz"), drawn)
+
+
+def same(one, other):
     for name in ("values", "x", "y"):
-        np.testing.assert_array_equal(getattr(loaded, name), getattr(drawn, name))
-    assert (loaded.height, loaded.receivers) == (drawn.height, drawn.receivers)
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    for name in ("height", "receivers", "quantity", "unit", "frequency"):
+        assert getattr(one, name) == getattr(other, name)
 
 
 def test_public_name_is_the_function_though_its_module_bears_it_too():

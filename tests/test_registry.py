@@ -59,6 +59,29 @@ def component(kind, name, body="value = 1"):
     return f"from gaigs.registry import register\n\n\n@register({kind!r}, {name!r})\nclass Component:\n    {body}\n"
 
 
+BUILT_IN = {
+    "task": {"spectrum", "rssi", "csi"},
+    "data": {"nerf2_spectrum", "nerf2_rssi", "rssi_csv", "csi_npz", "synthetic", "synthetic_rssi", "synthetic_csi"},
+    "split": {"official", "random", "sparse", "runs", "blocks"},
+    "placement": {"free"},
+    "tokenizer": {"ga", "euclidean", "multiview"},
+    "deformation": {"two_branch", "none"},
+    "projection": {"mercator", "equirectangular", "direction_cosine"},
+    "rasterizer": {"torch", "opencl", "fastest"},
+    "pooling": {"spectrum", "softmax_attention", "mean_power", "element_sum"},
+    "loss": {"absolute", "squared", "huber", "l1_ssim", "nmse"},
+    "model": {"gaigs", "mean", "knn", "path_loss", "friis", "gaussian_process"},
+    "training": {"descent", "adversarial"},
+}
+
+
+def test_each_kind_has_its_components():
+    assert BUILT_IN.keys() == set(KINDS)
+    for kind, names in BUILT_IN.items():
+        assert names <= set(registry(kind).names()), kind
+        assert all(callable(registry(kind).get(name)) for name in names - {"opencl"})  # which needs a driver
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_built_in_file_bears_the_registered_name(kind):
     holders, unreadable = find_holders(kind)
@@ -70,9 +93,7 @@ def test_a_built_in_file_bears_the_registered_name(kind):
 
 
 def test_registry_of_an_unknown_kind_suggests_the_nearest():
-    with pytest.raises(
-        ValueError, match=r"'tokeniser' \(did you mean 'tokenizer'\?\); there are: tokenizer, projection"
-    ):
+    with pytest.raises(ValueError, match=r"'tokeniser' \(did you mean 'tokenizer'\?\); there are: task, data, split, "):
         registry("tokeniser")
     with pytest.raises(ValueError, match="unknown kind"):
         register("antenna", "horn")
@@ -254,13 +275,14 @@ def test_options_of_the_trainer_are_checked_as_lightning_annotates_them(tmp_path
 # --- files dropped in ./plugins ---
 
 
-def test_of_dropped_files_only_the_one_asked_for_is_imported(plugins):
-    plugins("slot.py", component("pooling", "slot"))
-    plugins("patch.py", component("pooling", "patch"))
-    assert {"slot", "patch"} <= set(registry("pooling").names())
-    assert "slot" not in registry("model").names()
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_dropped_files_only_the_one_asked_for_is_imported(plugins, kind):
+    plugins("slot.py", component(kind, "slot"))
+    plugins("patch.py", component(kind, "patch"))
+    assert {"slot", "patch"} <= set(registry(kind).names())
+    assert not any("slot" in registry(other).names() for other in KINDS if other != kind)
     assert not any(module.startswith("plugins") for module in sys.modules)
-    assert registry("pooling").build({"name": "slot"}).value == 1
+    assert registry(kind).build({"name": "slot"}).value == 1
     assert "plugins.slot" in sys.modules
     assert "plugins.patch" not in sys.modules
 

@@ -1,5 +1,6 @@
 """Text files of data sets: what is wrong is collected with its file, line and value, and listed by one error."""
 
+import csv
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -56,25 +57,27 @@ def read_points(file: Path, names: Sequence[str], expected: str, defects: list[s
     points = []
     for number, line in [*enumerate(lines, 1)][header:]:
         place = f"{file.name}, line {number}"
-        cells = to_cells(line)
-        if has_columns(place, line, names, defects):
-            points.append(to_coordinates(place, names, cells, defects))
-        else:
-            points.append([])
+        cells = to_columns(place, line, names, defects)
+        points.append(to_coordinates(place, names, cells, defects) if cells else [])
     return points
 
 
 def to_cells(line: str) -> list[str]:
-    """Cells of a line with commas, without blanks and quotation marks around them."""
-    return [cell.strip().strip('"') for cell in line.split(",")]
+    """Cells of a line with commas, without the blanks around them."""
+    try:
+        (cells,) = csv.reader([line], skipinitialspace=True)
+    except csv.Error:  # a cell of 100,000 characters: no table of ours
+        cells = []
+    return [cell.strip() for cell in cells] or [line]
 
 
-def has_columns(place: str, line: str, names: Sequence[str], defects: list[str]) -> bool:
-    """Whether a line has as many cells as there are names."""
-    count = line.count(",") + 1
-    if count != len(names):
-        defects.append(f"{place}: expected {len(names)} columns {','.join(names)}, got {count}: {line!r}")
-    return count == len(names)
+def to_columns(place: str, line: str, names: Sequence[str], defects: list[str]) -> list[str]:
+    """Cells of a line, one for each name; none, and a defect, where their number is another."""
+    cells = to_cells(line)
+    if len(cells) == len(names):
+        return cells
+    defects.append(f"{place}: expected {len(names)} columns {','.join(names)}, got {len(cells)}: {line!r}")
+    return []
 
 
 def to_numbers(

@@ -3,32 +3,32 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 import yaml
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gaigs.data import Links, Receiver
+from gaigs.data import Links, Parts
 from gaigs.data._files import (
     FAR,
     NEAR,
     find_folder,
-    has_columns,
     read_lines,
     read_points,
     refuse,
     to_cells,
+    to_columns,
     to_number,
     to_numbers,
 )
-from gaigs.data.splits import split as split_links
 from gaigs.geometry import Pose
+from gaigs.query import Query
 from gaigs.registry import register
-
-NORMALISATION = "dBm"
+from gaigs.scene import Receiver
+from gaigs.task.rssi import Rssi
 
 NOT_HEARD = -100.0
 """What stands for a reading that was not heard [dBm]."""
@@ -42,16 +42,15 @@ INDICES = ("train_index.txt", "test_index.txt")
 
 
 @register("data", "nerf2_rssi")
-def read(root: str | Path, split: Mapping) -> Links:
+def read(root: str | Path) -> Links:
     """A data set from its folder, which is only read: one link for each reading that a gateway heard.
 
     Readings of -100 dBm were not heard; they, and gateways that heard nothing, are left out and counted in the remarks.
-    Gateways look along the world's axes.
+    Gateways look along the world's axes. The readings of one measurement share a row.
 
     Args:
         root: Folder with ``tx_pos.csv``, ``gateway_rssi.csv``, ``gateway_position.yml``, for the official split
             ``train_index.txt`` and ``test_index.txt``, and where there is one ``layout.csv``.
-        split: Options of ``gaigs.data.splits.split``; the readings of one row stay together.
 
     Raises:
         FileNotFoundError: There is no such folder.
@@ -67,37 +66,26 @@ def read(root: str | Path, split: Mapping) -> Links:
     if positions and readings and len(positions) != len(readings):
         defects.append(f"{READINGS}: expected {len(positions)} rows of readings as in tx_pos.csv, got {len(readings)}")
     walls = read_walls(root / LAYOUT, defects) if (root / LAYOUT).exists() else torch.zeros(0, 2, 3)
-    is_official = split.get("protocol", "official") == "official"
-    entries = _read_official(root, len(positions), names, defects) if is_official else None
     refuse(root, defects)
 
-    dbm = np.array(readings)
+    dbm = torch.tensor(readings, dtype=torch.float64)
     heard = dbm > NOT_HEARD
-    official = entries and tuple(_listed(part, heard) for part in entries)
-    for file, part in zip(INDICES, official or (), strict=False):
-        if not len(part):
-            defects.append(f"{file}: expected a reading that was heard, got none but {NOT_HEARD:g} in {READINGS}")
-    refuse(root, defects)
-    rows, columns = (torch.from_numpy(index) for index in heard.nonzero())
-    present, receiver_index = columns.unique(return_inverse=True)
-    transmitters = torch.tensor(positions)[rows]
+    rows, columns = heard.nonzero(as_tuple=True)
+    present, receivers = columns.unique(return_inverse=True)
     remarks = (
         f"{len(rows)} readings of {len(dbm)} rows at {len(present)} gateways; "
         f"{int((~heard).sum())} of {NOT_HEARD:g} dBm were not heard and are left out"
     )
-    deaf = [name for name, hears in zip(names, heard.any(0), strict=True) if not hears]
-    if deaf:
-        remarks += f", and so are the gateways that heard nothing: {', '.join(deaf)}"
-    if official and (unlisted := len(rows) - sum(map(len, official))):
-        remarks += f"; {unlisted} readings stand in no index file"
+    silent = [name for k, name in enumerate(names) if k not in present]
+    if silent:
+        remarks += f", and so are the gateways that heard nothing: {', '.join(silent)}"
     return Links(
-        transmitters=transmitters,
+        query=Query(torch.tensor(positions)[rows], receivers),
         receivers=tuple(gateway(names[k], gateways[names[k]][1]) for k in present.tolist()),
-        receiver_index=receiver_index,
-        labels=torch.from_numpy(dbm[heard]).float(),
-        split=split_links(transmitters, official=official, rows=rows, **split),
-        grid=None,
-        normalisation=NORMALISATION,
+        labels=dbm[heard].float(),
+        task=Rssi(),
+        rows=rows,
+        official=partial(_read_official, root, heard, names),
         edges=walls,
         remarks=remarks,
     )
@@ -148,7 +136,7 @@ def _read_gateways(root: Path, defects: list[str]) -> dict[str, tuple[int, list[
         items = value.value if isinstance(value, yaml.SequenceNode) else []
         position = [to_number(item.value) for item in items if isinstance(item, yaml.ScalarNode)]
         written = " ".join(text[value.start_mark.index : value.end_mark.index].split())
-        if len(items) != 3 or len(position) != 3 or not np.isfinite(position).all():
+        if len(items) != 3 or len(position) != 3 or not all(map(math.isfinite, position)):
             defects.append(f"{place}: position must be 3 finite numbers x, y, z, got {written!r}")
         elif max(map(abs, position)) >= FAR:
             defects.append(f"{place}: expected {NEAR}, got {written!r}")
@@ -182,21 +170,27 @@ def _read_readings(root: Path, gateways: Mapping, defects: list[str]) -> tuple[l
     readings = []
     for number, line in [*enumerate(lines, 1)][header:]:
         place = f"{READINGS}, line {number}"
-        fits = has_columns(place, line, names, defects)
-        readings.append(to_dbm(place, names, to_cells(line), NOT_HEARD, NOT_HEARD, defects) if fits else [])
+        cells = to_columns(place, line, names, defects)
+        readings.append(to_dbm(place, names, cells, NOT_HEARD, NOT_HEARD, defects) if cells else [])
     if readings and all(value == NOT_HEARD for row in readings for value in row):
         defects.append(f"{READINGS}: expected readings above {NOT_HEARD:g} dBm, got none; no gateway heard anything")
     return names, readings
 
 
-def _read_official(root: Path, count: int, names: Sequence[str], defects: list[str]) -> tuple[list[tuple], list[tuple]]:
-    """Rows, or pairs of row and column, of the training and test files, from 0."""
+def _read_official(root: Path, heard: Bool[Tensor, "rows gateways"], names: Sequence[str]) -> Parts:
+    """Training and test links of the index files, which list rows, or pairs of row and gateway.
+
+    Raises:
+        ValueError: Something is wrong with the files; the message lists the defects by file, line and value.
+    """
+    defects: list[str] = []
     # A gateway is named by its column's number unless numbers are names.
     columns = {} if any(name.isdecimal() for name in names) else {str(k): k for k in range(len(names))}
     columns |= {name: k for k, name in enumerate(names)}
     expected = {None: "a row from 0, or a row and a gateway", False: "one row from 0", True: "a row and a gateway"}
-    paired, seen, parts = None, {}, ([], [])
-    for file, part in zip(INDICES, parts, strict=True):
+    paired, seen, parts = None, {}, []
+    for file in INDICES:
+        before, listed = len(defects), torch.zeros_like(heard)
         for number, line in enumerate(read_lines(root / file, f"{expected[None]}, on each line", defects), 1):
             place = f"{file}, line {number}"
             row, *column = re.split(r"\s*,\s*|\s+", line.strip(), maxsplit=1)
@@ -206,21 +200,18 @@ def _read_official(root: Path, count: int, names: Sequence[str], defects: list[s
                 defects.append(f"{place}: expected {expected[paired]}, got {line!r}")
                 continue
             entry = (int(row), *(columns.get(name) for name in column))
-            if count and int(row) >= count:
-                defects.append(f"{place}: expected a row in 0..{count - 1}, got {row}")
-            elif names and None in entry:
+            if int(row) >= len(heard):
+                defects.append(f"{place}: expected a row in 0..{len(heard) - 1}, got {row}")
+            elif None in entry:
                 defects.append(f"{place}: expected a gateway by name or column from 0, got {column[0]!r}")
             elif entry in seen:
                 defects.append(f"{place}: {line.strip()!r} stands in {seen[entry]} already")
             else:
                 seen[entry] = place
-                part.append(entry)
-    return parts
-
-
-def _listed(entries: list[tuple], heard: np.ndarray) -> Tensor:
-    """Links, which are the heard readings row by row, that stand in an index file."""
-    chosen = np.zeros_like(heard)
-    for entry in entries:
-        chosen[entry] = True
-    return torch.from_numpy(chosen[heard]).nonzero().flatten()
+                listed[entry] = True
+        # Links are the readings that were heard, row by row.
+        parts.append(listed[heard].nonzero()[:, 0])
+        if len(defects) == before and not len(parts[-1]):
+            defects.append(f"{file}: expected a reading that was heard, got none but {NOT_HEARD:g} in {READINGS}")
+    refuse(root, defects)
+    return parts[0], parts[1]

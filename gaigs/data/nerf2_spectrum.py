@@ -1,7 +1,8 @@
 """Spatial spectra in the folder layout of NeRF²; docs/data.md describes the files."""
 
-import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,60 +10,81 @@ import torch
 import yaml
 from jaxtyping import Float, Int
 from PIL import Image
+from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gaigs.data import Grid, Links, Receiver
-from gaigs.data._files import find_folder, read_lines, read_points, refuse
-from gaigs.data.splits import split as split_links
+from gaigs.data import Links, Parts
+from gaigs.data._files import find_folder, read_lines, read_points, refuse, to_number
+from gaigs.directions import Grid
 from gaigs.geometry import Pose
+from gaigs.query import Query
 from gaigs.registry import register
+from gaigs.scene import Array, Receiver
+from gaigs.task.spectrum import Spectrum
 
 SHAPE = (90, 360)
 """Elevations 1..90 deg and azimuths 0..359 deg, fixed by the format."""
 
 NORMALISATION = "min-max of each spectrum's amplitude"
 
-PNG_COLOURS = {0: "grey", 2: "colour", 3: "palette", 4: "grey with alpha", 6: "colour with alpha"}
-"""What the colour type in a PNG file's header means."""
+FREQUENCIES = "freq.txt"
+"""Carrier of each link [GHz]; most folders have none."""
+
+HIGHEST = 1000.0
+"""No carrier reaches it [GHz]: a larger number is in MHz or Hz."""
 
 
 @register("data", "nerf2_spectrum")
-def read(root: str | Path, split: Mapping) -> Links:
+def read(root: str | Path, elements: Sequence[int] | None = (4, 4), frequency: float | None = 920e6) -> Links:
     """A data set from its folder, which is only read.
 
     Everything but the pixels is checked here; images are decoded when their labels are first asked for.
 
     Args:
-        root: Folder with ``tx_pos.csv``, ``gateway_info.yml``, ``spectrum/`` and, for the official split,
-            ``train_index.txt`` and ``test_index.txt``.
-        split: Options of ``gaigs.data.splits.split``.
+        root: Folder with ``tx_pos.csv``, ``gateway_info.yml``, ``spectrum/``, for the official split
+            ``train_index.txt`` and ``test_index.txt``, and where links have carriers of their own ``freq.txt``.
+        elements: Rows and columns of the receiver's planar array, half a wavelength of the highest carrier apart; None
+            where they are unknown.
+        frequency: Carrier of all links where there is no ``freq.txt`` [Hz]; None where it is unknown, and with it how
+            far apart the elements stand. What is unknown of the array counts as a single antenna.
 
     Raises:
         FileNotFoundError: There is no such folder.
-        ValueError: Something is wrong with the files; the message lists the defects by file, line and value.
+        ValueError: An option is out of range, or something is wrong with the files; the message lists the defects by
+            file, line and value.
 
-    Source: NeRF², https://github.com/XPengZhao/NeRF2.
+    Source: NeRF², https://github.com/XPengZhao/NeRF2; its spectra s23 are of a 4 x 4 array at about 920 MHz.
     """
+    _check_options(elements, frequency)
     root = find_folder(root)
     defects: list[str] = []
     positions = read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one spectrum a line", defects)
     receiver = _read_receiver(root, defects)
     files = [root / "spectrum" / f"{k:05d}.png" for k in range(1, len(positions) + 1)]
     defects += _image_defects(root, files)
-    official = None
-    if split.get("protocol", "official") == "official":
-        official = _read_official(root, len(files), defects)
+    frequencies = None if frequency is None else torch.full((len(files),), float(frequency))
+    has_own = (root / FREQUENCIES).exists()
+    if has_own:
+        frequencies = _read_frequencies(root, len(files), defects)
     refuse(root, defects)
-    transmitters = torch.tensor(positions)
+    grid = Grid.degrees()
+    remarks = []
+    if has_own:
+        low, high = (frequencies.min().item() / 1e6, frequencies.max().item() / 1e6)
+        remarks.append(f"{len(frequencies.unique())} carriers of {FREQUENCIES}, {low:.6g} to {high:.6g} MHz")
+    array = Array.single()
+    if elements is not None and frequencies is not None:
+        array = Array.planar(*elements, speed_of_light / frequencies.double().max().item() / 2)
+    elif elements is not None:
+        remarks.append("the array counts as a single antenna, since without a frequency its extent is unknown")
     return Links(
-        transmitters=transmitters,
-        receivers=(receiver,),
-        receiver_index=torch.zeros(len(files), dtype=torch.long),
+        query=Query(torch.tensor(positions), torch.zeros(len(files), dtype=torch.long), frequencies),
+        receivers=(replace(receiver, array=array),),
         labels=Spectra(files),
-        split=split_links(transmitters, official=official, **split),
-        grid=Grid.degrees(),
-        normalisation=NORMALISATION,
+        task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
+        official=partial(_read_official, root, len(files)),
+        remarks="; ".join(remarks),
     )
 
 
@@ -96,35 +118,50 @@ class Spectra:
 def write(folder: str | Path, links: Links) -> None:
     """Writes a data set of spectra in the layout that ``read`` reads; labels are rounded to 8 bits.
 
-    The index files hold the split's training and validation links together, and its test links.
+    The index files hold the split's training and validation links together, and its test links. ``freq.txt`` holds the
+    carriers where they are known; the layout has no place for the array.
 
     Raises:
         FileExistsError: There is something in the folder.
-        ValueError: There is more than one receiver, or the labels are not spectra on the format's grid.
+        ValueError: There is more than one receiver, the labels are not spectra on the format's grid, or there is no
+            split.
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} must be an empty folder or none, and is not; choose another name")
-    if len(links.receivers) != 1 or links.grid is None or links.grid.shape != SHAPE:
+    if len(links.receivers) != 1 or not isinstance(links.task, Spectrum) or links.task.shape != SHAPE:
         raise ValueError(
-            f"the layout holds spectra of {SHAPE[0]} x {SHAPE[1]} directions at one receiver, got "
-            f"{links.grid and links.grid.shape} at {len(links.receivers)}"
+            f"the layout holds spectra of {SHAPE[0]} x {SHAPE[1]} directions at one receiver, got labels of "
+            f"{links.task.name} {links.task.shape} at {len(links.receivers)}"
         )
+    split = links.split
+    if split is None:
+        raise ValueError("the layout's index files hold a split, got links without one; make them by gaigs.data.load")
     (folder / "spectrum").mkdir(parents=True)
-    for k in range(len(links.transmitters)):
+    for k in range(len(links)):
         pixels = (links.labels[torch.tensor([k])][0] * 255).round().byte()
         Image.fromarray(pixels.numpy()).save(folder / "spectrum" / f"{k + 1:05d}.png")
     # Nine digits bring the same float32 back.
-    rows = ["x,y,z", *(",".join(f"{value:.9g}" for value in row) for row in links.transmitters.tolist())]
+    rows = ["x,y,z", *(",".join(f"{value:.9g}" for value in row) for row in links.query.transmitters.tolist())]
     (folder / "tx_pos.csv").write_text("\n".join(rows) + "\n")
+    frequencies = links.query.frequencies
+    if frequencies is not None:
+        (folder / FREQUENCIES).write_text("".join(f"{value / 1e9:.9g}\n" for value in frequencies.tolist()))
     receiver = links.receivers[0]
     quaternion = Rotation.from_matrix(receiver.pose.rotation.double().numpy()).as_quat()
     pose = {"position": receiver.pose.position.tolist(), "orientation": quaternion.tolist()}
     (folder / "gateway_info.yml").write_text(yaml.safe_dump({receiver.name: pose}, default_flow_style=None))
-    split = links.split
     for name, part in (("train", torch.cat((split.train, split.validation))), ("test", split.test)):
         text = "".join(f"{k + 1:05d}\n" for k in part.tolist())
         (folder / f"{name}_index.txt").write_text(text)
+
+
+def _check_options(elements: Sequence[int] | None, frequency: float | None) -> None:
+    if frequency is not None and not 0 < frequency < HIGHEST * 1e9:
+        raise ValueError(f"frequency must be a carrier above 0 and below 1e12 Hz, or null, got {frequency}")
+    is_pair = isinstance(elements, Sequence) and len(elements) == 2
+    if elements is not None and not (is_pair and all(isinstance(count, int) and count > 0 for count in elements)):
+        raise ValueError(f"elements must be the array's rows and columns, such as [4, 4], or null, got {elements!r}")
 
 
 def _read_receiver(root: Path, defects: list[str]) -> Receiver | None:
@@ -159,6 +196,19 @@ def _read_receiver(root: Path, defects: list[str]) -> Receiver | None:
         return None
 
 
+def _read_frequencies(root: Path, count: int, defects: list[str]) -> Float[Tensor, "n"]:
+    """The carrier of each link [Hz]."""
+    lines = read_lines(root / FREQUENCIES, "the carrier [GHz] of one spectrum a line", defects)
+    if lines and count and len(lines) != count:
+        defects.append(f"{FREQUENCIES}: expected {count} lines, one for each row of tx_pos.csv, got {len(lines)}")
+    gigahertz = [to_number(line) for line in lines]
+    for number, value in enumerate(gigahertz, 1):
+        if not 0 < value < HIGHEST:
+            expected = f"one carrier above 0 and below {HIGHEST:g} GHz"
+            defects.append(f"{FREQUENCIES}, line {number}: expected {expected}, got {lines[number - 1]!r}")
+    return (1e9 * torch.tensor(gigahertz, dtype=torch.float64)).float()
+
+
 def _image_defects(root: Path, files: list[Path]) -> Iterator[str]:
     if not files:
         return
@@ -172,21 +222,25 @@ def _image_defects(root: Path, files: list[Path]) -> Iterator[str]:
         if file.name not in found:
             yield f"{place}: missing; row {number} of tx_pos.csv belongs to it"
             continue
-        with file.open("rb") as stream:
-            head = stream.read(26)
-        # Signature, then the first chunk: length, "IHDR", width, height, bits, colour type.
-        if len(head) < 26 or head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR":
-            yield f"{place}: no PNG file, begins with {head[:8]!r}"
+        try:
+            with Image.open(file, formats=["PNG"]) as image:  # reads the header, decodes nothing
+                mode, (width, height) = image.mode, image.size
+        except (OSError, Image.DecompressionBombError) as error:
+            yield f"{place}: no readable PNG file ({error})"
             continue
-        width, height, bits, colour = struct.unpack(">IIBB", head[16:])
-        if (bits, colour) != (8, 0):
-            yield f"{place}: expected 8-bit grey, got {bits}-bit {PNG_COLOURS.get(colour, colour)}"
+        if mode != "L":
+            yield f"{place}: expected 8-bit grey, which is Pillow's mode L, got mode {mode}"
         if (height, width) != SHAPE:
             yield f"{place}: expected {SHAPE[0]} x {SHAPE[1]} pixels, got {height} x {width}"
 
 
-def _read_official(root: Path, count: int, defects: list[str]) -> tuple[Tensor, Tensor]:
-    """Training and test links of the index files, from 0."""
+def _read_official(root: Path, count: int) -> Parts:
+    """Training and test links of the index files, from 0.
+
+    Raises:
+        ValueError: Something is wrong with the files; the message lists the defects by file, line and value.
+    """
+    defects: list[str] = []
     seen: dict[int, str] = {}
     parts = []
     for file in ("train_index.txt", "test_index.txt"):
@@ -195,14 +249,15 @@ def _read_official(root: Path, count: int, defects: list[str]) -> tuple[Tensor, 
             place, text = f"{file}, line {number}", line.strip()
             if not (text.isascii() and text.isdecimal()):
                 defects.append(f"{place}: expected one image number, got {line!r}")
-            elif count and not 1 <= int(text) <= count:
+            elif not 1 <= int(text) <= count:
                 defects.append(f"{place}: expected an image number in 1..{count}, got {text}")
             elif int(text) in seen:
                 defects.append(f"{place}: image {text} stands in {seen[int(text)]} already")
             else:
                 seen[int(text)] = place
                 part.append(int(text) - 1)
-        parts.append(torch.tensor(part, dtype=torch.long))
+        parts.append(torch.tensor(sorted(part), dtype=torch.long))
+    refuse(root, defects)
     return parts[0], parts[1]
 
 

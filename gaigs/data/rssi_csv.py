@@ -1,17 +1,18 @@
 """Received signal strength from one table; docs/data.md describes its columns."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.data._files import has_columns, read_lines, refuse, to_cells, to_coordinates
-from gaigs.data.nerf2_rssi import LOUDEST, NORMALISATION, NOT_HEARD, gateway, read_walls, to_dbm
-from gaigs.data.splits import split as split_links
+from gaigs.data._files import read_lines, refuse, to_cells, to_columns, to_coordinates
+from gaigs.data.nerf2_rssi import LOUDEST, NOT_HEARD, gateway, read_walls, to_dbm
+from gaigs.query import Query
 from gaigs.registry import register
+from gaigs.task.rssi import Rssi
 
 ENDS = ("tx", "rx")
 COLUMNS = (*(f"{end}_{axis}" for end in ENDS for axis in "xyz"), "rss_dbm")
@@ -27,7 +28,6 @@ QUIETEST = -200.0
 @register("data", "rssi_csv")
 def read(
     file: str | Path,
-    split: Mapping,
     layout: str | Path | None = None,
     fixed: str | None = None,
     not_heard: float = NOT_HEARD,
@@ -41,12 +41,12 @@ def read(
     hearing, the reading is what the fixed end would hear if the moving one sent with the fixed one's power.
 
     Readings of ``not_heard`` were not heard; they, and fixed places that nothing was heard at, are left out and counted
-    in the remarks, which also count levels below it. There is no official split.
+    in the remarks, which also count levels below it. The readings of one place of the moving end share a row. There is
+    no official split.
 
     Args:
         file: Has the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m] and ``rss_dbm`` in any
             order and in any case; others are ignored, and named in the remarks.
-        split: Options of ``gaigs.data.splits.split``; the readings of one place of the moving end stay together.
         layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; none unless given.
         fixed: The end that stands still, ``tx`` or ``rx``.
         not_heard: What stands for a reading that was not heard [dBm]; all others lie in [-200, 0).
@@ -68,7 +68,7 @@ def read(
     walls = torch.zeros(0, 2, 3) if layout is None else read_walls(Path(layout).expanduser(), defects)
     refuse(file, defects)
 
-    numbered = {end: _number(points[end]) for end in ENDS}
+    numbered = {end: _number_places(points[end]) for end in ENDS}
     tx, rx = (len(numbered[end][0]) for end in ENDS)
     counts = f"{FIXED} places at most, got {tx} of the transmitter and {rx} of the receiver"
     if min(tx, rx) > FIXED:
@@ -81,28 +81,26 @@ def read(
     if len(places) > FIXED:
         raise ValueError(f"{file}: with fixed={fixed} this end must stand at {counts}; set fixed={moving} or null")
     heard = torch.tensor([value != not_heard for value in dbm])
-    present, receiver_index = at[heard].unique(return_inverse=True)
+    present, receivers = at[heard].unique(return_inverse=True)
     transmitters = torch.tensor(points[moving])[heard]
     words = {"tx": "transmitter", "rx": "receiver"}
     remarks = (
         f"{len(transmitters)} readings of a moving {words[moving]} at {len(present)} places of a fixed {words[fixed]}; "
         f"{int((~heard).sum())} of {not_heard:g} dBm were not heard and are left out"
     )
-    deaf = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
-    if deaf:
-        remarks += f", and so are the places that nothing was heard at: {', '.join(deaf)}"
+    silent = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
+    if silent:
+        remarks += f", and so are the places that nothing was heard at: {', '.join(silent)}"
     if below := sum(value < not_heard < LOUDEST for value in dbm):
         remarks += f"; {below} readings below {not_heard:g} dBm are taken for levels"
     if ignored:
         remarks += f"; columns ignored: {', '.join(ignored)}"
     return Links(
-        transmitters=transmitters,
+        query=Query(transmitters, receivers),
         receivers=tuple(gateway(f"{fixed}{k + 1}", places[k]) for k in present.tolist()),
-        receiver_index=receiver_index,
         labels=torch.tensor(dbm)[heard],
-        split=split_links(transmitters, rows=numbered[moving][1][heard], **split),
-        grid=None,
-        normalisation=NORMALISATION,
+        task=Rssi(),
+        rows=numbered[moving][1][heard],
         edges=walls,
         remarks=remarks,
     )
@@ -127,9 +125,9 @@ def _read_table(file: Path, not_heard: float, defects: list[str]) -> tuple[dict[
     at = [names.index(name) for name in COLUMNS]
     for number, line in enumerate(lines[1:], 2):
         place = f"{file.name}, line {number}"
-        if not has_columns(place, line, names, defects):
+        cells = to_columns(place, line, names, defects)
+        if not cells:
             continue
-        cells = to_cells(line)
         cells = [cells[k] for k in at]
         coordinates = to_coordinates(place, COLUMNS, cells[:6], defects)
         points["tx"].append(coordinates[:3])
@@ -140,7 +138,7 @@ def _read_table(file: Path, not_heard: float, defects: list[str]) -> tuple[dict[
     return points, dbm, [name for name in written if name.lower() not in COLUMNS]
 
 
-def _number(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:
+def _number_places(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:
     """The distinct points in the order in which they appear, and which of them each one is."""
     numbers: dict[tuple, int] = {}
     index = [numbers.setdefault(tuple(point), len(numbers)) for point in points]

@@ -1,16 +1,17 @@
 """Received signal strength in the built-in room, as Bluetooth gateways on its walls report it."""
 
 import math
-from collections.abc import Mapping
+from functools import partial
 
 import torch
 
 from gaigs.data import Links
-from gaigs.data.nerf2_rssi import NORMALISATION, gateway
-from gaigs.data.splits import split as split_links
+from gaigs.data.nerf2_rssi import gateway
 from gaigs.data.synthetic import ROOM, edges, last_fifth, place
-from gaigs.data.synthetic.image_source import frequency_offsets, respond_isotropic, rss_dbm
+from gaigs.data.synthetic.image_source import frequency_offsets, respond, rss_dbm
+from gaigs.query import Query
 from gaigs.registry import register
+from gaigs.task.rssi import Rssi
 
 FREQUENCY, BANDWIDTH = 2.441e9, 78e6
 """Middle and width of the band that Bluetooth's advertising channels span, 2.402 to 2.480 GHz [Hz]."""
@@ -26,7 +27,6 @@ GATEWAYS = {
 
 @register("data", "synthetic_rssi")
 def furnished_room_rssi(
-    split: Mapping,
     transmitters: int = 600,
     noise: float = 2.0,
     sensitivity: float = -95.0,
@@ -36,10 +36,10 @@ def furnished_room_rssi(
     """Signal strength of transmitters of 0 dBm at random places in the default room, at four gateways.
 
     Every antenna is isotropic, so a gateway has no orientation: its axes are the world's. Power is averaged over the
-    band before it is told in dB. The official split tests on the last fifth of the places.
+    band before it is told in dB. The links of one place share a row; the official split tests on the last fifth of the
+    places.
 
     Args:
-        split: Options of ``gaigs.data.splits.split``; the links of one place stay together.
         transmitters: How many places.
         noise: Standard deviation of the Gaussian error of each reading [dB].
         sensitivity: Readings below it are not heard, and left out [dBm].
@@ -51,15 +51,11 @@ def furnished_room_rssi(
     """
     if not 0 <= noise < math.inf:
         raise ValueError(f"noise must be a standard deviation, 0 or more [dB], got {noise}")
-    official = last_fifth(transmitters)
     places = place(transmitters, seed)
     offsets = frequency_offsets(ROOM, BANDWIDTH, order)
+    receivers = tuple(gateway(name, position) for name, position in GATEWAYS.items())
     readings = torch.stack(
-        [
-            rss_dbm(respond_isotropic(ROOM, places, torch.tensor(position), FREQUENCY, offsets, order))
-            for position in GATEWAYS.values()
-        ],
-        1,
+        [rss_dbm(respond(ROOM, places, receiver, FREQUENCY, offsets, order)) for receiver in receivers], 1
     )
     # A seed of its own: from the places' seed come the random numbers that the places are made of.
     generator = torch.Generator().manual_seed(hash((seed, 1)) % 2**63)
@@ -71,20 +67,14 @@ def furnished_room_rssi(
                 f"sensitivity must let each gateway hear a reading, but {name!r} hears none of {transmitters} at "
                 f"{sensitivity:g} dBm; lower it"
             )
-    rows, receiver_index = heard.nonzero(as_tuple=True)
+    rows, columns = heard.nonzero(as_tuple=True)
     return Links(
-        transmitters=places[rows],
-        receivers=tuple(gateway(name, position) for name, position in GATEWAYS.items()),
-        receiver_index=receiver_index,
+        query=Query(places[rows], columns, torch.full((len(rows),), FREQUENCY)),
+        receivers=receivers,
         labels=readings[heard].float(),
-        split=split_links(
-            places[rows],
-            rows=rows,
-            official=tuple(torch.isin(rows, part).nonzero().flatten() for part in official),
-            **split,
-        ),
-        grid=None,
-        normalisation=NORMALISATION,
+        task=Rssi(),
+        rows=rows,
+        official=partial(last_fifth, transmitters, rows),
         edges=edges(ROOM),
         remarks=(
             f"{len(rows)} readings of {transmitters} places at {len(GATEWAYS)} gateways; "

@@ -1,113 +1,193 @@
-"""Models predict a label from who sends, who hears and, for spectra, into which directions."""
+"""Models predict a task's value from who sends, who hears, at which frequency and, for spectra, in which directions."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gaigs.data import Grid, Links, Scene
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Links, each of one transmitter to one receiver.
-
-    Attributes:
-        transmitters: Positions, world frame (b, 3) [m].
-        receivers: Indices into the scene's receivers (b,).
-        grid: Directions to predict; None where the label is no spectrum.
-        labels: What was measured, (b, rows, columns) or (b,); None when predicting.
-    """
-
-    transmitters: Float[Tensor, "b 3"]
-    receivers: Int[Tensor, "b"]
-    grid: Grid | None
-    labels: Tensor | None = None
-
-    def thin(self, rows: slice, columns: slice) -> "Batch":
-        """The same links seen in fewer directions."""
-        return replace(self, grid=self.grid.thin(rows, columns), labels=self.labels[:, rows, columns])
-
-    def to(self, device: torch.device) -> "Batch":
-        """The same batch on another device."""
-        move = lambda part: None if part is None else part.to(device)
-        return Batch(*map(move, (self.transmitters, self.receivers, self.grid, self.labels)))
+from gaigs.data import Links
+from gaigs.directions import Directions
+from gaigs.gaussians import Gaussians
+from gaigs.query import Batch, Query
+from gaigs.scene import Scene
 
 
 class Prediction(NamedTuple):
     """What a model gives for a batch.
 
     Attributes:
-        label: (b, rows, columns) spectra or (b,) RSSI [dBm].
-        penalties: Scalars to be added to the loss, by name.
+        value: (b, *shape) of the task, or of the directions that the batch asks for.
+        penalties: Scalars to be added to the loss, by name; means over the batch's places.
     """
 
-    label: Tensor
+    value: Tensor
     penalties: dict[str, Tensor]
 
 
 class Model(nn.Module):
     """The contract of kind ``model``: ``forward`` takes a ``Batch`` and gives a ``Prediction``.
 
-    A model with parameters is trained by gradient descent, and all that ``predict`` needs is in its state dict. One
-    without parameters, a look-up, learns in ``fit`` alone and is not stored.
+    A model with parameters is trained, and all that ``predict`` needs is in its state dict. One without parameters, a
+    look-up, learns in ``fit`` alone and is not stored.
 
     Args:
-        scene: Receivers, grid and normalisation of the labels.
+        scene: Receivers and task.
+
+    Attributes:
+        trained_by: The component of kind ``training`` that trains it.
+        chunk: Most pairs of a link and a direction that are evaluated at a time; None: whole labels, whatever their
+            size. Training sees whatever ``training.thinning`` leaves.
     """
+
+    trained_by = "descent"
+    chunk: int | None = None
 
     def __init__(self, scene: Scene):
         super().__init__()
         self.scene = scene
 
+    # --- training ---
+
     def fit(self, links: Links) -> None:
         """Takes what can be computed from the training links at once; by default nothing."""
+
+    @property
+    def predicts_untrained(self) -> bool:
+        """Whether ``fit`` alone makes it a predictor, so that the start of the training counts as a candidate."""
+        return False
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by the name of the learning rate they follow."""
         return {"network": list(self.parameters())}
 
+    @property
+    def primitives(self) -> Gaussians | None:
+        """The Gaussians that density control changes and figures draw; None for a model without."""
+        return None
+
+    # --- what a run reports of it ---
+
+    def facts(self) -> dict[str, object]:
+        """What ``metrics.json`` says of the model, beside its sizes; by default nothing."""
+        return {}
+
+    def rendering(self, batch: Batch) -> Callable[[], object] | None:
+        """What of a prediction is rendering alone, to be timed; None for a model that renders nothing."""
+        return None
+
+    def export(self, folder: Path) -> None:
+        """Writes files for other programs into a run's folder; by default none."""
+
+    # --- prediction ---
+
+    @torch.no_grad()
+    def evaluate(self, batch: Batch) -> Tensor:
+        """Values of a batch in all the directions it asks for, at most ``chunk`` pairs of link and direction at a time.
+
+        Returns:
+            (b, *shape), on the batch's device.
+        """
+        if self.chunk is None or batch.directions is None:
+            return self(batch).value
+        rays = batch.directions.flatten()
+        (count,) = rays.shape
+        links = max(1, self.chunk // count)
+        values = []
+        for query in batch.query.parts(links):
+            parts = (rays[start : start + self.chunk] for start in range(0, count, self.chunk))
+            asked = [replace(batch, query=query, directions=part, labels=None) for part in parts]
+            value = torch.cat([self(part).value for part in asked], 1)
+            values.append(value.unflatten(1, batch.directions.shape))
+        return torch.cat(values) if values else self(batch).value
+
     @torch.no_grad()
     def predict(
         self,
-        transmitters: Float[Tensor, "*points 3"],
+        transmitters: Query | Float[Tensor, "*points 3"],
         receiver: int | str | Int[Tensor, "*points"] = 0,
+        frequency: float | Float[Tensor, "*points"] | None = None,
         batch_size: int = 16,
+        directions: Directions | None = None,
     ) -> Tensor:
-        """Labels for transmitters anywhere: a point, a list of them, or a grid.
+        """Values for transmitters anywhere: a query, or a point, a list of them, or a grid.
 
         Args:
-            transmitters: Positions, world frame [m]; anything that becomes a float tensor.
+            transmitters: Positions, world frame [m], anything that becomes a float tensor; or a whole query.
             receiver: Name, or index into the scene's receivers; or the index of each position's receiver.
-            batch_size: Transmitters worked on at a time.
+            frequency: Carrier, one for all or one for each position [Hz]; None is the training links' own where they
+                have one carrier or none.
+            batch_size: Links worked on at a time.
+            directions: Those to predict, where the label has directions; None: the label's own.
 
         Returns:
-            For each position a spectrum (rows, columns), scaled as the training labels were
-            (``model.scene.normalisation``), or an RSSI [dBm]; on the device of the model.
+            For each position a value of the task's shape, scaled as the training labels were
+            (``model.scene.task.normalisation``); on the device of the model.
 
         Raises:
-            ValueError: The positions are not (..., 3) or not finite, or there is no such receiver.
+            ValueError: The positions are not (..., 3) or not finite, there is no such receiver, a frequency is not
+                positive, none is given and the training links have several, or a query is given with a receiver or a
+                frequency beside it.
         """
-        device = next((tensor.device for tensor in self.state_dict().values()), None)
-        transmitters = torch.as_tensor(transmitters, dtype=torch.float32, device=device)
+        device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
+        if isinstance(transmitters, Query):
+            if frequency is not None or not isinstance(receiver, int) or receiver:
+                raise ValueError("a query says itself who hears at which frequency; leave receiver and frequency out")
+            transmitters, receiver, frequency = (
+                transmitters.transmitters,
+                transmitters.receivers,
+                transmitters.frequencies,
+            )
+        query, shape = self._ask(transmitters, receiver, frequency)
+        query = query.to(device)
+        directions = self.scene.task.directions if directions is None else directions
+        directions = None if directions is None else directions.to(device)
+        training = self.training
+        self.eval()
+        parts = [*query.parts(batch_size)] or [query]
+        values = torch.cat([self.evaluate(Batch(part, directions)) for part in parts])
+        self.train(training)
+        return values.reshape(shape + values.shape[1:])
+
+    def _ask(self, transmitters, receiver, frequency) -> tuple[Query, tuple[int, ...]]:
+        """The query that positions stand for, and their shape."""
+        transmitters = torch.as_tensor(transmitters, dtype=torch.float32)
         if not transmitters.ndim or transmitters.shape[-1] != 3:
             raise ValueError(f"transmitters must be (..., 3) positions [m], got shape {tuple(transmitters.shape)}")
+        shape = transmitters.shape[:-1]
         points = transmitters.reshape(-1, 3)
         if not torch.isfinite(points).all():
             row = int((~torch.isfinite(points)).any(1).nonzero()[0])
             raise ValueError(f"transmitters must be finite, got {points[row].tolist()} in row {row}")
-        receivers = self._index(receiver, transmitters)
-        training = self.training
-        self.eval()
-        parts = zip(points.split(batch_size), receivers.split(batch_size), strict=True)
-        batches = (Batch(*part, self.scene.grid).to(points.device) for part in parts)
-        labels = torch.cat([self(batch).label for batch in batches])
-        self.train(training)
-        return labels.reshape(transmitters.shape[:-1] + labels.shape[1:])
+        receivers = self._index(receiver, shape)
+        return Query(points, receivers.to(points.device), self._frequencies(frequency, shape)), shape
 
-    def _index(self, receiver: int | str | Tensor, transmitters: Float[Tensor, "*points 3"]) -> Int[Tensor, "n"]:
+    def _frequencies(self, frequency, shape: tuple[int, ...]) -> Float[Tensor, "b"] | None:
+        """The carrier of each position [Hz]."""
+        known = self.scene.frequencies.cpu()
+        if frequency is None:
+            if len(known) > 1:
+                raise ValueError(
+                    f"the training links have {len(known)} carriers, {known[0]:.6g} to {known[-1]:.6g} Hz; say which "
+                    "with frequency=..."
+                )
+            frequency = known[0] if len(known) else None
+        if frequency is None:
+            return None
+        frequency = torch.as_tensor(frequency, dtype=torch.float32)
+        if not (torch.isfinite(frequency) & (frequency > 0)).all():
+            raise ValueError(f"a frequency must be positive and finite [Hz], got {frequency.tolist()}")
+        if frequency.ndim and frequency.shape != shape:
+            raise ValueError(
+                f"frequencies must be one, or one for each of the {tuple(shape)} positions, got "
+                f"{tuple(frequency.shape)}"
+            )
+        return frequency.expand(shape).reshape(-1)
+
+    def _index(self, receiver: int | str | Tensor, shape: tuple[int, ...]) -> Int[Tensor, "n"]:
         """The index of each position's receiver."""
         names = [receiver.name for receiver in self.scene.receivers]
         listed = ", ".join(f"{i} = {name}" for i, name in enumerate(names))
@@ -117,9 +197,8 @@ class Model(nn.Module):
             index = torch.tensor(-1)
         if index.dtype not in (torch.int64, torch.int32) or ((index < 0) | (index >= len(names))).any():
             raise ValueError(f"receiver must be one of {listed}, got {receiver!r}")
-        if index.ndim and index.shape != transmitters.shape[:-1]:
+        if index.ndim and index.shape != shape:
             raise ValueError(
-                f"receivers must be one, or one for each of the {tuple(transmitters.shape[:-1])} positions, got "
-                f"{tuple(index.shape)}"
+                f"receivers must be one, or one for each of the {tuple(shape)} positions, got {tuple(index.shape)}"
             )
-        return index.to(transmitters.device).expand(transmitters.shape[:-1]).reshape(-1)
+        return index.expand(shape).reshape(-1)

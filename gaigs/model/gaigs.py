@@ -1,137 +1,209 @@
 """The splatting pipeline: GAI-GS, its ablations and its neighbours, put together from registered parts."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor, nn
 
-from gaigs.data import Grid, Links, Scene
+from gaigs.data import Links
+from gaigs.deformation import Residuals
+from gaigs.directions import Directions
 from gaigs.gaussians import SH_DC, Gaussians
-from gaigs.geometry import Pose, covariances
-from gaigs.mapping import Residuals, SceneMapping
-from gaigs.model import Batch, Model, Prediction
+from gaigs.geometry import covariances
+from gaigs.model import Model, Prediction
+from gaigs.placement import Placed
 from gaigs.projection import Splats
+from gaigs.query import Batch, Query
 from gaigs.registry import call, register, registry
+from gaigs.scene import Scene
 
 
 @register("model", "gaigs")
 class GaussianSplatting(Model):
-    """Tokens -> residuals -> Gaussians as the transmitter excites them -> splats -> map -> label.
+    """Placement -> tokens -> residuals -> Gaussians as the query excites them -> splats -> map -> value.
 
     Args:
-        scene: Receivers and grid.
-        tokenizer, projection, rasterizer, pooling: Configurations of registered components.
+        scene: Receivers and task.
         gaussians: Options of ``gaigs.gaussians.Gaussians``.
-        mapping: Options of ``gaigs.mapping.SceneMapping``.
-        grid: Rows and columns of the map over the full sphere that the pooling makes an RSSI of; None for spectra,
-            whose grid is the label's.
-        reference: Configuration of a model whose RSSI the pooled map is added to [dB]; None for spectra.
+        placement, tokenizer, deformation, projection, rasterizer, pooling: Configurations of registered components.
+        trend: Configuration of a model whose value the pooled map is added to; None for none.
 
     Raises:
-        ValueError: ``grid`` or ``reference`` is given for spectra, or lacking for RSSI; the pooling does not give such
-            labels; the reference is a look-up.
+        ValueError: The pooling does not give the task's labels; the projection does not see all of the map; the trend
+            is a look-up.
 
-    Source: GAI-GS, section "Framework"; the reference is ours (docs/methods.md).
+    Source: GAI-GS, section "Framework"; the trend is ours (docs/methods.md).
     """
 
     def __init__(
         self,
         scene: Scene,
+        gaussians: dict,
+        placement: dict,
         tokenizer: dict,
+        deformation: dict,
         projection: dict,
         rasterizer: dict,
         pooling: dict,
-        gaussians: dict,
-        mapping: dict,
-        grid: list[int] | None = None,
-        reference: dict | None = None,
+        trend: dict | None = None,
     ):
         super().__init__(scene)
-        for option, value in (("grid", grid), ("reference", reference)):
-            if (value is None) == (scene.grid is None):
-                kind, there = ("RSSI", "lacking") if value is None else ("spectra", f"{value}")
+        self.trend = None
+        if trend is not None:
+            self.trend = registry("model").build(trend, scene=scene)
+            if not self.trend.state_dict():
                 raise ValueError(
-                    f"model.{option} must be given for RSSI and null for spectra, and for {kind} it is {there}; take "
-                    "+experiment=rssi or +experiment=spectrum, whichever suits the data"
+                    f"model.trend must be a model that a checkpoint can store, and {trend['name']} is a look-up that "
+                    "needs its data; take path_loss, friis or mean"
                 )
-        if grid is not None and (len(grid) != 2 or not all(type(size) is int for size in grid)):
-            raise ValueError(f"model.grid must be [rows, columns], two whole numbers, got {grid}")
-        self.grid = scene.grid or Grid.sphere(*grid)
-        self.reference = None
-        if reference is not None:
-            self.reference = registry("model").build(reference, scene=scene)
-            if not self.reference.state_dict():
-                raise ValueError(
-                    f"model.reference must be a model that a checkpoint can store, and {reference['name']} is a "
-                    "look-up that needs its data; take path_loss or mean"
-                )
-            self.register_buffer("level", torch.zeros(()))  # of the untrained map [dB]
-        self.pooling = registry("pooling").build(pooling, grid=self.grid)
-        gives = self.pooling(torch.zeros(1, self.pooling.channels, *self.grid.shape)).ndim
-        if gives != (1 if scene.grid is None else 3):
-            labels, kind = ("RSSI", "numbers") if scene.grid is None else ("spectra", "maps")
+            self.register_buffer("level", torch.zeros(()))  # of the untrained map, in the label's unit
+        self.pooling = registry("pooling").build(pooling, scene=scene)
+        grid = self.pooling.grid or scene.task.directions
+        if grid is None:
             raise ValueError(
-                f"the labels are {labels}, so the pooling must give {kind}, and {pooling['name']} does not; take "
-                "spectrum for spectra, softmax_attention or mean_power for RSSI"
+                f"labels of task {scene.task.name!r} have no directions, so the pooling must have a grid of its own, "
+                f"and {pooling['name']} has none; take the task's own pooling"
             )
-        self.projection = registry("projection").build(projection, pixel=self.grid.pitch)
-        if self.grid.elevations.min() < 0 and not self.projection.sees_below:
+        nothing = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long))
+        gives = tuple(self.pooling(torch.zeros(1, self.pooling.channels, *grid.shape), nothing).shape[1:])
+        if gives != scene.task.shape:
+            raise ValueError(
+                f"the pooling must give labels of task {scene.task.name!r}, {scene.task.shape}, and {pooling['name']} "
+                f"gives {gives}; take the task's own pooling"
+            )
+        self.projection = registry("projection").build(projection, pixel=grid.pitch)
+        if grid.elevations.min() < 0 and not self.projection.sees_below:
             raise ValueError(
                 f"the map's grid reaches below the array's plane, which {projection['name']} folds onto what is above; "
                 "take mercator or equirectangular"
             )
         self.rasterizer = registry("rasterizer").build(rasterizer)
-        self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, channels=self.pooling.channels)
-        self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
-        widths = (self.tokenizer.scene_width, self.tokenizer.gaussian_width, self.tokenizer.transmitter_width)
-        context = {"tokenizer_widths": widths, "channels": self.pooling.channels}
-        self.mapping = call("mapping", SceneMapping, mapping, **context)
+        zone = self.pooling.zone
+        if self.pooling.grid is None:
+            zone = grid.elevations.min().item(), grid.elevations.max().item()
+        channels = self.pooling.channels
+        self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels)
+        self.placement = registry("placement").build(placement, scene=scene)
+        reads_tokens = registry("deformation").get(deformation["name"]).reads_tokens
+        self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene) if reads_tokens else None
+        context = {"scene": scene, "channels": channels}
+        if reads_tokens:
+            parts = self.tokenizer
+            context["tokenizer_widths"] = parts.scene_width, parts.gaussian_width, parts.transmitter_width
+        self.deformation = registry("deformation").build(deformation, **context)
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """For RSSI fits the reference, and has the training start from there: the map's mean level is taken off."""
-        if self.reference is not None:
-            self.reference.fit(links)
-            count = len(links.split.train)
-            # Evenly spread, though not at whole steps, which might meet the same receiver time and again.
-            some = links.split.train[torch.linspace(0, count - 1, min(64, count)).long()]
-            batch = Batch(links.transmitters[some], links.receiver_index[some], None).to(self.level.device)
-            self.level += (self(batch).label - self.reference(batch).label).mean()
+        """Fits pooling and trend, and has the training start from the trend: the map's mean level is taken off."""
+        self.pooling.fit(links)
+        if self.trend is None:
+            return
+        self.trend.fit(links)
+        if self.scene.task.dtype.is_complex:
+            return  # waves have no level: their phases differ from link to link
+        count = len(links.split.train)
+        # Evenly spread, though not at whole steps, which might meet the same receiver time and again.
+        some = links.split.train[torch.linspace(0, count - 1, min(64, count)).long()]
+        batch = Batch(links.query[some], links.task.directions).to(self.level.device)
+        self.level += (self(batch).value - self.trend(batch).value).mean()
+
+    @property
+    def predicts_untrained(self) -> bool:
+        return self.trend is not None
 
     def forward(self, batch: Batch) -> Prediction:
-        # What a transmitter excites is the same for all who hear it.
-        transmitters, which = batch.transmitters.unique(dim=0, return_inverse=True)
-        residuals = self._residuals(transmitters)
-        links, labels = [], []
-        for receiver in batch.receivers.unique().tolist() or [0]:  # no links have a label's shape too
-            links.append((batch.receivers == receiver).nonzero()[:, 0])
-            image, _ = self.rasterizer(*self._excite(residuals, which[links[-1]], receiver, batch.grid))
-            labels.append(self.pooling(image))
-        label = torch.cat(labels)[torch.cat(links).argsort()]
-        if self.reference is not None:
-            label = self.reference(batch).label + label - self.level
+        query = batch.query
+        # What a place excites is the same for all who hear it, unless a part looks at the receiver.
+        places, which = query.unique(with_receivers=self._sees_receivers)
+        placed, residuals = self._excite(places)
+        links, values = [], []
+        for receiver in query.receivers.unique().tolist() or [0]:  # no links have a label's shape too
+            links.append((query.receivers == receiver).nonzero()[:, 0])
+            own = query[links[-1]]
+            maps = [
+                self.rasterizer(*arguments)[0]
+                for arguments in self._arguments(placed, residuals, which[links[-1]], receiver, batch.directions)
+            ]
+            value = self.pooling(torch.cat(maps), own)
+            if self.pooling.grid is None and batch.directions is not None:
+                value = value.reshape(len(own), *batch.directions.shape)  # a list of rays was rendered as one row
+            values.append(value)
+        value = torch.cat(values)[torch.cat(links).argsort()]
+        if self.trend is not None:
+            value = self.trend(batch).value + value - self.level
         penalties = {}
         if residuals.delta_opacities is not None:
             penalties["opacity"] = residuals.delta_opacities.square().mean()
-        return Prediction(label, penalties)
-
-    def render_arguments(self, batch: Batch) -> tuple:
-        """What the rasterizer is called with for the first link's receiver; to time it alone."""
-        transmitters = batch.transmitters[batch.receivers == batch.receivers[0]]
-        which = torch.arange(len(transmitters), device=transmitters.device)
-        return self._excite(self._residuals(transmitters), which, int(batch.receivers[0]), batch.grid)
+        return Prediction(value, penalties)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {name: [parameter] for name, parameter in self.gaussians.named_parameters()}
-        network = [*self.tokenizer.parameters(), *self.mapping.parameters(), *self.pooling.parameters()]
+        network = [
+            parameter
+            for part in (self.placement, self.tokenizer, self.deformation, self.pooling)
+            if part is not None
+            for parameter in part.parameters()
+        ]
         return groups | {"network": network}
 
-    def _residuals(self, transmitters: Float[Tensor, "b 3"]) -> Residuals:
-        # The network says how a place responds to a transmitter; where the Gaussians go is learnt from the image alone.
-        means, opacities = self.gaussians.means.detach(), self.gaussians.opacities.detach()
-        return self.mapping(self.tokenizer(means, opacities, transmitters))
+    @property
+    def primitives(self) -> Gaussians:
+        return self.gaussians
 
-    def _excite(self, residuals: Residuals, which: Int[Tensor, "b"], receiver: int, grid: Grid | None) -> tuple:
-        """The rasterizer's arguments: the Gaussians as some transmitters excite them, on the receiver's plane."""
+    def facts(self) -> dict[str, object]:
+        """The rasterizer that the last map was rendered with."""
+        return {"rasterizer": self.rasterizer.used}
+
+    def rendering(self, batch: Batch) -> Callable[[], object]:
+        """The rasterizer alone, for the links to the first link's receiver."""
+        receiver = int(batch.query.receivers[0])
+        query = batch.query[(batch.query.receivers == receiver).nonzero()[:, 0]]
+        with torch.no_grad():
+            which = torch.arange(len(query), device=query.transmitters.device)
+            calls = self._arguments(*self._excite(query), which, receiver, batch.directions)
+        return lambda: [self.rasterizer(*arguments) for arguments in calls]
+
+    def export(self, folder: Path) -> None:
+        """``gaussians.ply``, for 3-D splatting viewers."""
+        self.gaussians.save_ply(folder / "gaussians.ply")
+
+    @property
+    def _sees_receivers(self) -> bool:
+        parts = self.placement, self.tokenizer, self.deformation
+        return any(getattr(part, "sees_receivers", False) for part in parts)
+
+    def _excite(self, query: Query) -> tuple[Placed, Residuals]:
+        """Where the Gaussians stand for each query, and what it changes in them."""
+        placed, opacities = self.placement(self.gaussians, query), self.gaussians.opacities
+        # The network says how a place responds to a transmitter; where the Gaussians go is learnt from the image alone.
+        seen = Placed(*(None if part is None else part.detach() for part in placed))
+        tokens = None if self.tokenizer is None else self.tokenizer(seen, opacities.detach(), query)
+        return placed, self.deformation(tokens, seen, query)
+
+    def _arguments(
+        self,
+        placed: Placed,
+        residuals: Residuals,
+        which: Int[Tensor, "b"],
+        receiver: int,
+        directions: Directions | None,
+    ) -> list[tuple]:
+        """The rasterizer's arguments: the Gaussians as some queries excite them, on the receiver's plane.
+
+        One call does for all where the Gaussians stand still, else there is one for each query.
+        """
+        if not len(placed.means):  # nobody asks: where Gaussians stand that follow the query does not matter
+            placed = Placed(self.gaussians.means[None])
+        if len(placed.means) > 1:
+            return [
+                self._call(Placed(placed.means[i : i + 1]), residuals, which[k : k + 1], receiver, directions)
+                for k, i in enumerate(which.tolist())
+            ]
+        return [self._call(placed, residuals, which, receiver, directions)]
+
+    def _call(self, placed, residuals, which, receiver, directions) -> tuple:
         gaussians, b = self.gaussians, len(which)
         residuals = Residuals(*(None if values is None else values[which] for values in residuals))
         signal, opacities = gaussians.signal, gaussians.opacities
@@ -139,17 +211,19 @@ class GaussianSplatting(Model):
             signal = signal + residuals.delta_signal
         if residuals.delta_opacities is not None:
             opacities = (opacities + residuals.delta_opacities).clamp(0, 1)
-        splats = self._splats(residuals, self.scene.receivers[receiver].pose)
-        grid = (grid or self.grid).to(signal.device)
-        plane = self.projection.plane(grid.elevations, grid.azimuths)
+        splats = self._splats(placed, residuals, receiver)
+        if self.pooling.grid is not None or directions is None:
+            directions = self.pooling.grid or self.scene.task.directions
+        plane = self.projection.plane(directions.to(signal.device).to(signal.dtype))
         signal = SH_DC * signal.squeeze(-1)
         return splats, signal.expand(b, -1, -1), opacities.expand(b, -1), residuals.attenuations, plane
 
-    def _splats(self, residuals: Residuals, receiver: Pose) -> Splats:
+    def _splats(self, placed: Placed, residuals: Residuals, receiver: int) -> Splats:
         gaussians = self.gaussians
         quats, scales = gaussians.unit_quats[None], gaussians.scales[None]
         if residuals.delta_quats is not None:
             quats = quats + residuals.delta_quats
         if residuals.delta_scales is not None:
             scales = scales + residuals.delta_scales
-        return self.projection.project(gaussians.means, covariances(quats, scales), receiver)
+        pose = self.scene.receivers[receiver].pose
+        return self.projection.project(placed.means[0], covariances(quats, scales), pose)

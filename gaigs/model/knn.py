@@ -6,10 +6,18 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gaigs.data import Links, Scene
-from gaigs.model import Batch, Model, Prediction
-from gaigs.model._known import known_links
+from gaigs.data import Links
+from gaigs.model import Model, Prediction
+from gaigs.model._known import at_directions, coordinates, distances, evenly, known_links, scale_bounds
+from gaigs.query import Batch, Query
 from gaigs.registry import register
+from gaigs.scene import Scene
+
+TRIED = 256
+"""Known links, evenly spread, whose labels are predicted from the others to choose the scale of frequencies."""
+
+SCALES = 16
+"""Scales of frequencies that are tried, in even ratios."""
 
 
 @register("model", "knn")
@@ -18,6 +26,10 @@ class KNearestNeighbours(Model):
 
     Links that stand as near as the k-th count too, so it does not matter in which order they come. It keeps the whole
     training set, one byte a pixel where the labels are images.
+
+    Where the training links have several carriers, the distance is that in place and frequency,
+    d² = |dx|² + (s d ln f)². ``fit`` takes the scale s [m] with which the known links are predicted best from those
+    at other places.
 
     Args:
         k: Neighbours; as many as there are, if fewer.
@@ -36,37 +48,62 @@ class KNearestNeighbours(Model):
         if not 0 <= power < math.inf:
             raise ValueError(f"model.power must be 0 or more, and finite, got {power}")
         self.k, self.power = k, power
-        self.links, self.known = None, None
+        self.links, self.known, self.scale = None, None, None
 
     def fit(self, links: Links) -> None:
-        """Keeps the links.
+        """Keeps the links, and chooses the scale of frequencies.
 
         Raises:
             ValueError: A receiver has no links to learn from.
         """
-        self.links, self.known = links, known_links(links)
+        self.links, self.known, self.scale = links, known_links(links), None
+        if self.scene.has_band:
+            low, high = scale_bounds(self.scene)
+            scales = torch.logspace(math.log10(low), math.log10(high), SCALES, dtype=torch.float64).tolist()
+            self.scale = min(scales, key=self._leave_one_out)
+
+    def facts(self) -> dict[str, object]:
+        """The scale of frequencies, where there are several [m]."""
+        return {} if self.scale is None else {"frequency_scale_m": self.scale}
 
     def forward(self, batch: Batch) -> Prediction:
+        query = batch.query
         labels = self.links.labels[self.known[0][:0]]  # none, of the right shape
-        labels = labels.new_empty(len(batch.transmitters), *labels.shape[1:])
-        for receiver in batch.receivers.unique():
-            own = batch.receivers == receiver
-            labels[own] = self._look_up(batch.transmitters[own], self.known[receiver])
-        return Prediction(labels, {})
+        labels = labels.new_empty(len(query), *labels.shape[1:])
+        for receiver in query.receivers.unique():
+            own = query.receivers == receiver
+            apart = self._distances(query[own], self.known[receiver], self.scale)
+            labels[own] = self._look_up(apart, self.known[receiver])
+        return Prediction(at_directions(labels, batch, self.scene), {})
 
-    def _look_up(self, transmitters: Float[Tensor, "b 3"], index: Int[Tensor, "k"]) -> Tensor:
-        """Labels of one receiver from its known links."""
-        # Plain differences: by the matrix product, links at one place would get different distances.
-        distances = torch.cdist(
-            transmitters.double(),
-            self.links.transmitters[index].double(),
-            compute_mode="donot_use_mm_for_euclid_dist",
-        )
-        farthest = distances.topk(min(self.k, len(index)), largest=False).values[:, -1:]
-        near = distances <= farthest
+    def _distances(self, query: Query, index: Int[Tensor, "k"], scale: float | None) -> Float[Tensor, "b k"]:
+        """From links to some known ones [m]."""
+        asked, known = (coordinates(self.scene, part, scale) for part in (query, self.links.query[index]))
+        return distances(asked, known)
+
+    def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, "k"]) -> Tensor:
+        """Labels from those of known links, by their distances; infinite ones are left out."""
+        farthest = apart.topk(min(self.k, len(index)), largest=False).values[:, -1:]
+        near = (apart <= farthest) & apart.isfinite()
         # A transmitter that stands where one was measured, to a micrometre, gets that label.
-        distances = distances.clamp_min(1e-6)
-        weights = near * (distances.amin(1, keepdim=True) / distances) ** self.power  # relative: none is infinite
-        weights = (weights / weights.sum(1, keepdim=True)).float()
+        apart = apart.clamp_min(1e-6)
+        weights = near * (apart.amin(1, keepdim=True) / apart) ** self.power  # relative: none is infinite
+        weights = weights / weights.sum(1, keepdim=True)
         used = near.any(0)
-        return torch.tensordot(weights[:, used], self.links.labels[index[used]], 1)
+        labels = self.links.labels[index[used]]
+        return torch.tensordot(weights[:, used].to(labels), labels, 1)
+
+    def _leave_one_out(self, scale: float) -> float:
+        """Mean squared error of known links that are predicted from those at other places, as links of the test are."""
+        errors, count = 0.0, 0
+        for index in self.known:
+            for part in evenly(index, max(1, TRIED // len(self.known))).split(32):
+                asked, known = self.links.query[part], self.links.query[index]
+                here = (asked.transmitters[:, None] == known.transmitters).all(-1)
+                apart = self._distances(asked, index, scale).masked_fill(here, math.inf)
+                found = apart.isfinite().any(1)  # it may be the only place
+                part = part[found]
+                error = self._look_up(apart[found], index) - self.links.labels[part]
+                errors += error.abs().double().square().sum().item()
+                count += len(part)
+        return errors / max(count, 1)

@@ -2,10 +2,12 @@
 
 import torch
 
-from gaigs.data import Links, Scene
-from gaigs.model import Batch, Model, Prediction
-from gaigs.model._known import known_links
+from gaigs.data import Links
+from gaigs.model import Model, Prediction
+from gaigs.model._known import at_directions, known_links
+from gaigs.query import Batch
 from gaigs.registry import register
+from gaigs.scene import Scene
 
 
 @register("model", "mean")
@@ -14,8 +16,8 @@ class Mean(Model):
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
-        shape = scene.grid.shape if scene.grid else ()
-        self.register_buffer("means", torch.full((len(scene.receivers), *shape), torch.nan))
+        shape = (len(scene.receivers), *scene.task.shape)
+        self.register_buffer("means", torch.full(shape, torch.nan, dtype=scene.task.dtype))
 
     def fit(self, links: Links) -> None:
         """Takes the means.
@@ -24,8 +26,9 @@ class Mean(Model):
             ValueError: A receiver has no links to learn from.
         """
         for receiver, index in enumerate(known_links(links)):
-            total = sum(links.labels[part].sum(0, dtype=torch.float64) for part in index.split(256))
-            self.means[receiver] = total / len(index)
+            wide = torch.promote_types(self.scene.task.dtype, torch.float64)
+            total = sum(links.labels[part].sum(0, dtype=wide) for part in index.split(256))
+            self.means[receiver] = (total / len(index)).to(self.means)
 
     def forward(self, batch: Batch) -> Prediction:
-        return Prediction(self.means[batch.receivers], {})
+        return Prediction(at_directions(self.means[batch.query.receivers], batch, self.scene), {})

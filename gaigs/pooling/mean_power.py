@@ -2,29 +2,30 @@
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from gaigs.data import Grid
+from gaigs.pooling import Pooling, sphere
+from gaigs.query import Query
 from gaigs.registry import register
 
 
 @register("pooling", "mean_power")
-class MeanPower(nn.Module):
+class MeanPower(Pooling):
     """The mean over the grid's solid angle of |C_0|^2, or |C_0|^2 + |C_1|^2, and the receiver's noise, in dB.
 
     Powers add, so paths do not cancel: RSSI is averaged over bandwidth and time. A receiver hears its own noise even
     where nothing arrives, so a silent map is at the floor, with a gradient of 0.
 
     Args:
-        grid: Directions of the map's pixels; those of a single row weigh the same.
+        grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
         channels: 1 (real) or 2 (complex).
-        floor_db: Power of the noise relative to the model's reference, between -300 and 0 [dB].
+        floor_db: Power of the noise relative to the model's trend, between -300 and 0 [dB].
 
     Raises:
         ValueError: An option is out of range.
     """
 
-    def __init__(self, grid: Grid, channels: int, floor_db: float):
+    def __init__(self, grid: list[int], channels: int, floor_db: float):
         super().__init__()
         if channels not in (1, 2):
             raise ValueError(f"pooling 'mean_power' renders 1 real or 2 complex channels, got channels={channels}")
@@ -32,12 +33,11 @@ class MeanPower(nn.Module):
             raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
         self.channels = channels
         self.floor = 10 ** (floor_db / 20)
-        rows, columns = grid.shape
-        weights = grid.solid_angles if rows > 1 else torch.full((1, columns), 1 / columns)
-        self.register_buffer("weights", weights, persistent=False)
+        self.grid = sphere("pooling.grid", grid)
+        self.register_buffer("weights", self.grid.solid_angles, persistent=False)
 
-    def forward(self, image: Float[Tensor, "b c rows columns"]) -> Float[Tensor, "b"]:
-        """Level relative to the model's reference [dB]; float32 where the map is of half precision.
+    def forward(self, image: Float[Tensor, "b c rows columns"], query: Query) -> Float[Tensor, "b"]:
+        """Level relative to the model's trend [dB]; float32 where the map is of half precision.
 
         Raises:
             ValueError: The map is not of the grid's size.

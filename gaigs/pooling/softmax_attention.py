@@ -6,17 +6,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from gaigs.pooling import Pooling, sphere
+from gaigs.query import Query
 from gaigs.registry import register
 
 
 @register("pooling", "softmax_attention")
-class SoftmaxAttention(nn.Module):
+class SoftmaxAttention(Pooling):
     """The attention-weighted average of a map of levels, in bels: the label is ten times it, in dB.
 
     Each pixel weighs (1 - prior) softmax((m - mean m) / temperature) + prior / pixels. The prior is uniform over
     pixels, and so over the sphere where their solid angles are equal, as on ``Grid.sphere``.
 
     Args:
+        grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
         temperature: How far below the brightest pixel a pixel still counts, between 1e-6 and 1e6 [bel]; far below the
             map's range the attention finds the maximum, far above it the mean.
         prior: Share of the uniform weights, between 0 and 1; with 1 the average is the plain mean.
@@ -30,7 +33,7 @@ class SoftmaxAttention(nn.Module):
 
     channels = 1
 
-    def __init__(self, temperature: float, prior: float, learn: bool = False):
+    def __init__(self, grid: list[int], temperature: float, prior: float, learn: bool = False):
         super().__init__()
         if not 1e-6 <= temperature <= 1e6:
             raise ValueError(
@@ -41,6 +44,7 @@ class SoftmaxAttention(nn.Module):
             raise ValueError(f"pooling option prior must lie between 0 and 1, got {prior}")
         if learn and prior in (0, 1):
             raise ValueError(f"a prior that is learnt must start between 0 and 1, got {prior}; e.g. 0.1")
+        self.grid = sphere("pooling.grid", grid)
         options = {"log_temperature": torch.tensor(math.log(temperature))}
         options["prior_logit"] = torch.tensor(float(prior)).logit()
         for name, value in options.items():
@@ -57,8 +61,8 @@ class SoftmaxAttention(nn.Module):
     def prior(self) -> Float[Tensor, ""]:
         return self.prior_logit.sigmoid()
 
-    def forward(self, image: Float[Tensor, "b 1 rows columns"]) -> Float[Tensor, "b"]:
-        """Level relative to the model's reference [dB]; float32 where the map is of half precision."""
+    def forward(self, image: Float[Tensor, "b 1 rows columns"], query: Query) -> Float[Tensor, "b"]:
+        """Level relative to the model's trend [dB]; float32 where the map is of half precision."""
         bels = image.to(torch.promote_types(image.dtype, torch.float32)).flatten(1)
         # The paper subtracts the mean, and later the maximum, in which the mean cancels. Subtracting the maximum alone
         # is the same, and exact for the pixels that count, where one huge value makes the mean swallow the others.

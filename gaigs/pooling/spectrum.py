@@ -2,13 +2,15 @@
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
+from gaigs.pooling import Pooling
+from gaigs.query import Query
 from gaigs.registry import register
 
 
 @register("pooling", "spectrum")
-class Spectrum(nn.Module):
+class Spectrum(Pooling):
     """|C_0|, or |C_0 + j C_1|: channels are signed, so that paths can cancel.
 
     Args:
@@ -21,6 +23,6 @@ class Spectrum(nn.Module):
             raise ValueError(f"pooling 'spectrum' renders 1 real or 2 complex channels, got channels={channels}")
         self.channels = channels
 
-    def forward(self, image: Float[Tensor, "b c rows columns"]) -> Float[Tensor, "b rows columns"]:
+    def forward(self, image: Float[Tensor, "b c rows columns"], query: Query) -> Float[Tensor, "b rows columns"]:
         """The predicted spectrum; where the map is 0, so is its gradient."""
         return image[:, 0].abs() if self.channels == 1 else torch.complex(*image.unbind(1)).abs()

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gaigs.directions import Directions
 from gaigs.geometry import Pose
 
 NEAR = 1e-6
@@ -79,9 +80,16 @@ class Projection(ABC):
     def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
         """Derivative of ``coordinates`` [1/m]; finite everywhere but at the origin."""
 
+    @property
     @abstractmethod
-    def plane(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"]) -> Plane:
-        """Plane coordinates of a label's pixel centres, given in radians."""
+    def period(self) -> float | None:
+        """u repeats after this; None: it does not."""
+
+    def plane(self, directions: Directions) -> Plane:
+        """Plane coordinates of a label's pixel centres; a list of rays becomes a single row."""
+        vectors = directions.vectors()
+        u, v = self.coordinates(vectors if vectors.ndim == 3 else vectors[None]).unbind(-1)
+        return Plane(u, v, self.period)
 
     def project(self, means: Float[Tensor, "n 3"], covariances: Float[Tensor, "b n 3 3"], receiver: Pose) -> Splats:
         """Gaussians as the receiver sees them.

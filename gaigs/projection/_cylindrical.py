@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gaigs.directions import Directions, Grid
 from gaigs.geometry import to_spherical
 from gaigs.projection import Plane, Projection
 
@@ -21,6 +22,8 @@ class Cylindrical(Projection):
     Raises:
         ValueError: An option is out of range.
     """
+
+    period = 2 * math.pi
 
     def __init__(self, pixel: float, limit_deg: float):
         super().__init__(pixel)
@@ -49,6 +52,8 @@ class Cylindrical(Projection):
         rates = torch.stack((1 / torch.cos(clamped), slope), -1) / distances[..., None]
         return rates[..., None] * torch.stack((east, north), -2)
 
-    def plane(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"]) -> Plane:
-        v, _ = self.stretch(elevations.clamp(-self.limit, self.limit))
-        return Plane(azimuths[None, :], v[:, None], 2 * math.pi)
+    def plane(self, directions: Directions) -> Plane:
+        """Plane coordinates; of a grid's columns and rows apart, as they are separable."""
+        v, _ = self.stretch(directions.elevations.clamp(-self.limit, self.limit))
+        rows = v[:, None] if isinstance(directions, Grid) else v[None]
+        return Plane(directions.azimuths[None], rows, self.period)

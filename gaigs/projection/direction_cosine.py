@@ -4,8 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.geometry import from_spherical
-from gaigs.projection import Plane, Projection
+from gaigs.projection import Projection
 from gaigs.registry import register
 
 
@@ -23,6 +22,7 @@ class DirectionCosine(Projection):
     """
 
     sees_below = False
+    period = None
 
     def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
         return (points / points.norm(dim=-1, keepdim=True))[..., :2]
@@ -32,7 +32,3 @@ class DirectionCosine(Projection):
         unit = points[..., None, :] / distances
         identity = torch.eye(3, dtype=points.dtype, device=points.device)
         return (identity - unit.mT @ unit)[..., :2, :] / distances
-
-    def plane(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"]) -> Plane:
-        directions = from_spherical(*torch.meshgrid(azimuths, elevations, indexing="xy"))
-        return Plane(directions[..., 0], directions[..., 1], None)

@@ -26,10 +26,16 @@ class Rasterizer(Protocol):
 
     x is the pixel minus the splat's centre, u taken to the nearest image where the plane is periodic. Splats that are
     not ``visible`` do nothing. Every input but depths is differentiable: means2d, covariances2d, signal, opacities,
-    attenuations.
+    attenuations. A signal may have any number of channels.
+
+    Attributes:
+        used: What drew the last map, as a run's metrics have it: the name, and the device where there is a choice.
+            None where that shows with the first map only.
 
     Source: GAI-GS, "Mapping, Projection and Render Module"; the area over which d_j acts is ours (docs/methods.md).
     """
+
+    used: str | None
 
     def __call__(
         self,

@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 @register("rasterizer", "fastest")
 class FastestRasterizer:
-    """``opencl`` for what it takes where a driver is installed, else ``torch``; the log says which.
+    """``opencl`` for what it takes where a driver is installed that builds kernels, else ``torch``; the log says which.
 
     The two agree to 2e-6 of the image's maximum, so a checkpoint may be rendered by either.
 
@@ -46,5 +46,5 @@ class FastestRasterizer:
         if self.opencl is not None and self.opencl.takes(*arguments):
             self.used = self.opencl.used
             return self.opencl(*arguments)
-        self.used = "torch"
+        self.used = self.torch.used
         return self.torch(*arguments)

@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,10 @@ from torch import Tensor
 
 from gaigs.projection import Plane, Splats
 from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN
+from gaigs.rasterizer._devices import cause_of, default_device, devices, find_fault, name_of, open_queue
 from gaigs.registry import register
+
+__all__ = ["OpenCLRasterizer", "default_device", "devices"]
 
 ROWS, COLUMNS = 16, 8
 """Edges of a tile in pixels; the kernels say the same."""
@@ -27,8 +29,11 @@ GROUP = 8
 """Transmitters that one work-item composites at most, where they share footprints; more would leave the nearest
 cache."""
 
-CHANNELS, SPLATS = 8, 2**24
-"""More channels than this, or as many splats, are too many."""
+CHANNELS = 8
+"""Channels that are composited at a time: the registers hold a row of each. More of them come in chunks."""
+
+SPLATS = 2**24
+"""As many splats are too many: an entry of a list has 24 bits for the splat."""
 
 
 @register("rasterizer", "opencl")
@@ -37,25 +42,32 @@ class OpenCLRasterizer:
 
     Splats are sorted by depth once, and listed by the tiles that their ellipses reach: once for all transmitters where
     these share covariances, which then share footprints too. On a CPU device tensors are handed over without a copy.
-    Two runs give the same bits. Contract and formulas: ``gaigs.rasterizer.Rasterizer``.
+    Signals of many channels come in chunks of ``CHANNELS``. Two runs give the same bits. Contract and formulas:
+    ``gaigs.rasterizer.Rasterizer``.
 
     Args:
         device: Part of a name that ``devices`` lists, e.g. "cpu" or "pocl"; None takes the environment variable
             GAIGS_OPENCL_DEVICE, and without it the first CPU, for which the kernels are made.
 
     Raises:
-        RuntimeError: There is no OpenCL driver, or it is broken.
+        RuntimeError: There is no OpenCL driver, or it is broken, or it does not know the processor.
         ValueError: No device has such a name.
     """
 
     def __init__(self, device: str | None = None):
         self.device = device
-        _queue(device)
+        queue = open_queue(device)
+        fault = find_fault(queue)
+        if fault is not None:
+            raise RuntimeError(
+                f"rasterizer 'opencl': {name_of(queue.device)} cannot build kernels ({fault}); use rasterizer=torch, "
+                "or install a newer driver"
+            )
 
     @property
     def used(self) -> str:
         """What a run's metrics call it: its name and its device."""
-        return f"opencl on {_name(_queue(self.device).device)}"
+        return f"opencl on {name_of(open_queue(self.device).device)}"
 
     def takes(
         self,
@@ -68,7 +80,7 @@ class OpenCLRasterizer:
         """Whether dtype, device and number of what it is given suit it; where they do not, ``torch`` takes them."""
         floats = splats.means2d, splats.covariances2d, splats.depths, signal, opacities, attenuations, plane.u, plane.v
         suits = (x is None or (x.dtype == torch.float32 and x.device.type == "cpu") for x in floats)
-        return all(suits) and 1 <= signal.shape[2] <= CHANNELS and signal.shape[1] < SPLATS
+        return all(suits) and signal.shape[2] >= 1 and signal.shape[1] < SPLATS
 
     def __call__(
         self,
@@ -82,83 +94,18 @@ class OpenCLRasterizer:
 
         Raises:
             TypeError: A tensor is not float32 (``visible``: bool), or not on the CPU.
-            ValueError: Shapes do not fit together, or there are more than 8 channels.
+            ValueError: Shapes do not fit together, there is no channel, or there are too many splats.
             RuntimeError: The device cannot build the kernels.
         """
         _check(splats, signal, opacities, attenuations, plane)
+        call = functools.partial(_Composite.apply, open_queue(self.device), splats, plane, torch.is_grad_enabled())
         # What autograd differentiates has to be an argument of its own; `_Render` finds it in the splats.
-        inputs = splats.means2d, splats.covariances2d, signal, opacities, attenuations
-        return _Composite.apply(_queue(self.device), splats, plane, torch.is_grad_enabled(), *inputs)
-
-
-def devices() -> list[str]:
-    """The OpenCL devices of this machine, each as "platform: device (kind)".
-
-    Raises:
-        RuntimeError: There is no OpenCL driver, or it is broken.
-    """
-    return [_name(device) for device in _devices()]
-
-
-def default_device() -> str:
-    """The one of ``devices`` that is taken where none is asked for.
-
-    Raises:
-        RuntimeError: There is no OpenCL driver, or it is broken.
-        ValueError: No device has the name in GAIGS_OPENCL_DEVICE.
-    """
-    return _name(_choose(os.environ.get("GAIGS_OPENCL_DEVICE")))
-
-
-def _devices() -> list[cl.Device]:
-    """The devices of all drivers; one that is broken hurts only where it is the only one."""
-    found, causes = [], []
-    try:
-        for platform in cl.get_platforms():
-            try:
-                found += platform.get_devices()
-            except cl.Error as error:
-                causes.append(f"; {platform.name} lists no devices ({error})")
-    except cl.Error as error:  # with no platform, too
-        causes.append(f" ({error})")
-    if not found:
-        needs = "rasterizer 'opencl' needs an OpenCL driver: pip install 'pyopencl[pocl]', or use rasterizer=torch"
-        raise RuntimeError(needs + "".join(causes))
-    return found
-
-
-def _name(device: cl.Device) -> str:
-    kinds = (kind for kind in ("CPU", "GPU", "ACCELERATOR") if device.type & getattr(cl.device_type, kind))
-    return f"{device.platform.name}: {device.name} ({' '.join(kinds)})"
-
-
-def _queue(name: str | None) -> cl.CommandQueue:
-    return _open(name or os.environ.get("GAIGS_OPENCL_DEVICE"))
-
-
-@functools.cache
-def _open(name: str | None) -> cl.CommandQueue:
-    device = _choose(name)
-    try:
-        return cl.CommandQueue(cl.Context([device]))
-    except cl.Error as error:
-        raise RuntimeError(
-            f"rasterizer 'opencl': {_name(device)} cannot be opened ({error}); mend its driver, take another device "
-            "with GAIGS_OPENCL_DEVICE, or use rasterizer=torch"
-        ) from error
-
-
-def _choose(name: str | None) -> cl.Device:
-    """The first device whose name has such a part; without one the first CPU, or the first device of any kind."""
-    found = _devices()
-    if name:
-        chosen = [device for device in found if name.lower() in _name(device).lower()]
-    else:
-        chosen = [device for device in found if device.type & cl.device_type.CPU] or found
-    if not chosen:
-        listed = "; ".join(map(_name, found))
-        raise ValueError(f"rasterizer 'opencl': no OpenCL device is called {name!r}; there are: {listed}")
-    return chosen[0]
+        chunks = [
+            call(splats.means2d, splats.covariances2d, part, opacities, attenuations)
+            for part in signal.split(CHANNELS, 2)
+        ]
+        images, transmittances = zip(*chunks, strict=True)
+        return torch.cat(images, 1) if len(images) > 1 else images[0], transmittances[0]
 
 
 @functools.cache
@@ -181,8 +128,10 @@ def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel
     try:
         program = cl.Program(queue.context, _source()).build(options)
     except cl.Error as error:
-        device = _name(queue.device)
-        raise RuntimeError(f"rasterizer 'opencl': {device} cannot build the kernels; use rasterizer=torch") from error
+        device = name_of(queue.device)
+        raise RuntimeError(
+            f"rasterizer 'opencl': {device} cannot build the kernels ({cause_of(error)}); use rasterizer=torch"
+        ) from error
     return {kernel.function_name: kernel for kernel in program.all_kernels()}
 
 
@@ -213,8 +162,8 @@ def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tens
         if tuple(tensor.shape) not in shapes:
             allowed = " or ".join(map(str, shapes))
             raise ValueError(f"{name} must be {allowed} where signal is {(b, n, c)}, got {tuple(tensor.shape)}")
-    if not 1 <= c <= CHANNELS:
-        raise ValueError(f"rasterizer 'opencl' takes 1 to {CHANNELS} channels, got {c}; use rasterizer=torch")
+    if c < 1:
+        raise ValueError(f"rasterizer 'opencl' takes at least 1 channel, got {c}; use rasterizer=torch")
     if n >= SPLATS:
         raise ValueError(f"rasterizer 'opencl' takes fewer than 2^24 splats, got {n}; use rasterizer=torch")
 
@@ -257,13 +206,13 @@ class _Render:
         down, across, words = -(-height // ROWS), -(-width // COLUMNS), -(-n // WORD)
         self.sizes = _Sizes(b, sets, groups, group, n, words, height, width, down, across)
         self.tiles, self.lists = down * across, sets * down * across
-        self.walks = groups if sets == 1 else 1  # through each list
+        self.groups_per_list = groups if sets == 1 else 1
         self.attenuates = attenuations is not None
-        looks = 1 + self.attenuates + self.channels  # opacity, attenuation, signal
-        together = 1 if group == 1 else GROUP
-        self.together, self.partials = together, MOMENTS + together * looks
+        appearance_size = 1 + self.attenuates + self.channels  # opacity, attenuation, signal: of one transmitter
+        self.group_capacity = 1 if group == 1 else GROUP
+        self.partials = MOMENTS + self.group_capacity * appearance_size
         separable = plane.u.shape[0] == plane.v.shape[1] == 1
-        macros = {"CHANNELS": self.channels, "ATTENUATION": int(self.attenuates), "TRANSMITTERS": together}
+        macros = {"CHANNELS": self.channels, "ATTENUATION": int(self.attenuates), "TRANSMITTERS": self.group_capacity}
         macros |= {"SEPARABLE": int(separable), "ALPHA_MIN": _literal(ALPHA_MIN), "ALPHA_MAX": _literal(ALPHA_MAX)}
         if plane.period is not None:
             rest = plane.period - float(np.float32(plane.period))
@@ -272,7 +221,8 @@ class _Render:
 
         order = self._share(_front_to_back(splats.depths))
         u, v, spans, edges = _tiling(queue, *map(_freeze, (plane.u, plane.v)), plane.period)
-        geometry, appearance = self._empty(sets * words * WORD * GEOMETRY), self._empty(words * WORD * b * looks)
+        geometry = self._empty(sets * words * WORD * GEOMETRY)
+        appearance = self._empty(words * WORD * b * appearance_size)
         hits = self._empty(sets * words * (across + down if separable else 2 * self.tiles))
         inputs = splats.means2d, splats.covariances2d, splats.visible, signal, opacities, attenuations
         inputs = [self._share(tensor) for tensor in inputs]  # named, so that they live until the kernels are through
@@ -299,8 +249,8 @@ class _Render:
         outputs = self._share(image), self._share(left)
         ends, checkpoints, bounds = self._empty(sizes.groups * self.tiles), None, None
         if differentiate:
-            size = self.walks * (sizes.entries // CHUNK + self.lists)
-            checkpoints = self._empty(size * self.together * ROWS * COLUMNS)
+            size = self.groups_per_list * (sizes.entries // CHUNK + self.lists)
+            checkpoints = self._empty(size * self.group_capacity * ROWS * COLUMNS)
             bounds = self._empty(size * 2)
         self._run("forward", sizes.groups * self.tiles, *self.scene, self.loudest, *outputs, ends, checkpoints, bounds)
         self.path = ends, checkpoints, bounds
@@ -311,7 +261,7 @@ class _Render:
         sizes = self.sizes
         b, n = sizes.transmitters, sizes.splats
         images = self._share(image_gradient), self._share(left_gradient)
-        partials = self._empty(self.walks * sizes.entries * self.partials)
+        partials = self._empty(self.groups_per_list * sizes.entries * self.partials)
         self._run("backward", sizes.groups * self.tiles, *self.scene, *self.path, *images, partials)
         shapes = (n, 2), (sizes.sets, n, 2, 2), (b, n, self.channels), (b, n), (b, n) if self.attenuates else None
         gradients = [None if shape is None else torch.empty(shape) for shape in shapes]

@@ -27,6 +27,8 @@ class TorchRasterizer:
     (splat, pixel) pairs. Contract and formulas: ``gaigs.rasterizer.Rasterizer``.
     """
 
+    used = "torch"
+
     def __call__(
         self,
         splats: Splats,

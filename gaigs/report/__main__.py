@@ -1,4 +1,4 @@
-"""``python -m gaigs.report FOLDER``: the runs of a Hydra multirun as one table."""
+"""``python -m gaigs.report FOLDER``: the runs of a Hydra multirun as one table, and their spread over seeds."""
 
 from argparse import ArgumentParser
 from pathlib import Path
@@ -9,14 +9,15 @@ from gaigs.report.multirun import report
 
 
 def main() -> None:
-    """Prints the table of a multirun folder and writes it, with a figure, into that folder."""
+    """Prints the tables of a multirun folder and writes them, with a figure, into that folder."""
     parser = ArgumentParser(prog="python -m gaigs.report", description=__doc__)
-    parser.add_argument("folder", type=Path, help="folder that Hydra made for python -m gaigs --multirun ...")
+    about = "folder that Hydra made for python -m gaigs --multirun ..., or one above several"
+    parser.add_argument("folder", type=Path, help=about)
     try:
-        table = report(parser.parse_args().folder)
+        tables = report(parser.parse_args().folder)
     except (FileNotFoundError, ValueError) as error:
         parser.error(str(error))
-    Console().print(table)
+    Console().print(tables)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import csv
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,8 @@ def cdf(
         limits: Ends of the axis of values; None for one that the data choose.
     """
     with rc_context(STYLE):
-        figure = Figure(figsize=(COLUMN, 2.6), layout="constrained")
+        ncols = 3 if max(map(len, values)) <= 12 else 2  # letters that fit a third of a column
+        figure = Figure(figsize=(COLUMN, 2.45 + 0.15 * ceil(len(values) / ncols)), layout="constrained")
         ax = figure.subplots()
         ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
         for (name, sample), (colour, dash) in zip(values.items(), cycle(LINES), strict=False):
@@ -42,9 +44,8 @@ def cdf(
             ax.plot(median, 0.5, "o", color=colour, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
         ax.set(xlabel=f"{quantity}, split {split}", ylabel=f"share of test {samples}", ylim=(0, 1.01))
         ax.set_xlim(*limits)
-        figure.legend(
-            loc="outside upper center", title=f"median {quantity}", ncols=3, handlelength=1.8, columnspacing=1.2
-        )
+        key = {"ncols": ncols, "handlelength": 2.4, "columnspacing": 1.2}
+        figure.legend(loc="outside upper center", title=f"median {quantity}", **key)
         ax.grid(axis="x")
     return figure
 
@@ -116,7 +117,7 @@ def speed_against_error(
         scores: Score of each run.
         times: Times of each run by axis label; NaN where unknown.
         score_label: What the score is, with its unit.
-        baselines: Scores of the look-ups, drawn as lines over all times.
+        baselines: Scores of the baselines, drawn as lines over all times.
     """
     with rc_context(STYLE):
         key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page

@@ -1,7 +1,10 @@
-"""The runs of a Hydra multirun as one table, and their speed against their error."""
+"""The runs of a Hydra multirun, or of several: one table, their spread over seeds, their speed against their error."""
 
 import csv
 import json
+import re
+import statistics
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,13 +13,14 @@ import yaml
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from rich.box import SIMPLE_HEAD
+from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
 from gaigs.configuration import differences
 from gaigs.report.curves import speed_against_error
 from gaigs.report.style import DPI
-from gaigs.report.table import METRICS, written
+from gaigs.report.table import metrics_of, stacked, written
 
 COSTS = {
     "train_seconds": "training [s]",
@@ -26,8 +30,11 @@ COSTS = {
 }
 """What a reader calls the costs of ``metrics.json``."""
 
-WRITTEN_ONLY = ("ssim_mean", "ssim_p10", "ssim_p90", "median_ae_db", "rmse_db", "num_gaussians")
-"""Columns for which a terminal has no room."""
+WRITTEN_ONLY = "num_gaussians"
+"""The cost for which a terminal has no room."""
+
+SEEDS = "Runs that differ in the seed alone: mean ± standard deviation (n - 1), and the least"
+"""What the second table shows."""
 
 
 class Run(NamedTuple):
@@ -44,14 +51,23 @@ class Run(NamedTuple):
     metrics: dict | None
 
 
+class Spread(NamedTuple):
+    """A metric of several runs: mean, standard deviation of a sample, least value."""
+
+    mean: float
+    deviation: float
+    least: float
+
+
 def read_runs(folder: Path) -> list[Run]:
-    """The jobs of a multirun folder in the order of their numbers.
+    """The runs at any depth of a folder, in the order of their names, the numbers in these by their size.
 
     Raises:
         FileNotFoundError: The folder holds no run.
+        ValueError: One was started anew with another configuration, or they are of several tasks.
     """
     runs = []
-    for path in folder.glob("*/.hydra/overrides.yaml"):
+    for path in folder.glob("**/.hydra/overrides.yaml"):
         run_config, started = path.parents[1] / "config.yaml", path.parent / "config.yaml"
         if run_config.is_file() and started.is_file() and differences(_resolved(run_config), _resolved(started)):
             raise ValueError(
@@ -62,17 +78,24 @@ def read_runs(folder: Path) -> list[Run]:
         metrics = path.parents[1] / "metrics.json"
         runs.append(
             Run(
-                path.parents[1].name,
+                path.parents[1].relative_to(folder).as_posix(),
                 {key.lstrip("+"): value for key, _, value in overrides},
                 json.loads(metrics.read_text()) if metrics.is_file() else None,
             )
         )
     if not runs:
         raise FileNotFoundError(
-            f"{folder} must hold the runs of a multirun (0/.hydra/overrides.yaml, 1/...), found none; "
+            f"{folder} must hold runs, each with its .hydra/overrides.yaml, found none; "
             "pass the folder that Hydra made for 'python -m gaigs --multirun ...'"
         )
-    return sorted(runs, key=lambda run: (int(run.name) if run.name.isdigit() else len(runs), run.name))
+    # Text and numbers take turns, so that like is compared with like.
+    parts = lambda name: [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
+    runs.sort(key=lambda run: parts(run.name))
+    tasks = {run.metrics.get("task"): run.name for run in runs if run.metrics is not None}
+    if len(tasks) > 1:
+        listed = ", ".join(f"{task} in {name}" for task, name in tasks.items())
+        raise ValueError(f"the runs of a table must be of one task, got {listed}; pass a folder with runs of one")
+    return runs
 
 
 def _resolved(path: Path) -> dict:
@@ -82,8 +105,8 @@ def _resolved(path: Path) -> dict:
 def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
     """Rows of the table, each a dictionary by column, and what all runs have in common.
 
-    Varied overrides lead, then come scores and costs. A failed run has a row without scores. The look-ups that the runs
-    were held against follow, once for each split.
+    Varied overrides lead, then come scores and costs. A failed run has a row without scores. The baselines that the
+    runs were held against follow, once for each split.
     """
     shared, varied = {}, []
     for key in dict.fromkeys(key for run in runs for key in run.overrides):
@@ -101,7 +124,7 @@ def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
         else:
             facts.append(key)
 
-    rows, lookups = [], {}
+    rows, baselines = [], {}
     for name, overrides, metrics in runs:
         row = {"run": name, "status": "failed", "model": ""} | {key: overrides.get(key, "") for key in varied}
         if metrics is not None:
@@ -109,67 +132,152 @@ def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
             row |= {"status": "done", "model": row["model"] or own} | {key: metrics[key] for key in facts}
             row |= scores | {key: metrics.get(key) for key in COSTS}
             for model, scores in others:
-                lookup = {"status": "look-up", "model": model} | scores
+                baseline = {"status": "baseline", "model": model} | scores
                 if "split" in facts:
-                    lookup["split"] = metrics["split"]
+                    baseline["split"] = metrics["split"]
                 # As written: two devices give scores that differ in the last bits.
-                lookups[tuple(written(value) for value in lookup.values())] = lookup
+                baselines[tuple(written(value) for value in baseline.values())] = baseline
         rows.append(row)
-    return rows + list(lookups.values()), shared
+    return rows + list(baselines.values()), shared
 
 
-def report(folder: Path) -> Table:
+def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
+    """A row for each group of runs that differ in ``seed`` alone, where two seeds or more did not fail.
+
+    Args:
+        runs: All runs of the table.
+        shared: What they have in common, as ``ablation`` gives it; it is left out.
+
+    Returns:
+        Rows with the group's model, its overrides, its split, how many ``runs`` there are, and a ``Spread`` of each
+        metric.
+    """
+    groups: dict[frozenset, list[Run]] = {}
+    for run in runs:
+        if run.metrics is not None:
+            fixed = frozenset((key, value) for key, value in run.overrides.items() if key != "seed")
+            groups.setdefault(fixed, []).append(run)
+    varied = [key for key in _columns(run.overrides for run in runs) if key != "seed" and key not in shared]
+    rows = []
+    for group in groups.values():
+        done = [run.metrics for run in group]
+        if len({metrics["seed"] for metrics in done}) < 2:
+            continue
+        scores = [next(iter(metrics["models"].values())) for metrics in done]
+        row = {"status": "seeds", "model": next(iter(done[0]["models"]))}
+        row |= {key: group[0].overrides.get(key, "") for key in varied}
+        if "split" not in shared:
+            splits = {metrics["split"] for metrics in done}
+            row["split"] = splits.pop() if len(splits) == 1 else f"{len(splits)} splits"
+        row["runs"] = len(group)
+        for name in scores[0]:
+            values = [score[name] for score in scores]
+            row[name] = Spread(statistics.mean(values), statistics.stdev(values), min(values))
+        rows.append(row)
+    return rows
+
+
+def report(folder: Path) -> Group:
     """Writes ``ablation.csv``, ``ablation.md`` and, unless all runs failed, ``speed_against_error.png`` there.
 
     Args:
-        folder: Of a Hydra multirun.
+        folder: Of a Hydra multirun, or one above several.
 
     Returns:
-        The table, for a terminal of 80 columns: without ``WRITTEN_ONLY``, and without the status if nothing failed.
+        The tables, for a terminal of 80 columns: the runs and, if there are any, the groups of runs that differ in the
+        seed alone. Metrics that are not brief are in the files only, and so is what tells no run from another.
 
     Raises:
         FileNotFoundError: The folder holds no run.
+        ValueError: The runs make no table.
     """
     runs = read_runs(folder)
+    known = next((metrics_of(run.metrics) for run in runs if run.metrics is not None), {})
+    titles = {name: metric.title for name, metric in known.items()} | COSTS
     rows, shared = ablation(runs)
-    columns = list(dict.fromkeys(column for row in rows for column in row))
-    heads = [(METRICS | COSTS).get(column, column) for column in columns]
-    cells = [[written(row.get(column)) for column in columns] for row in rows]
+    groups = over_seeds(runs, shared)
     caption = ", ".join(f"{key}={value}" for key, value in shared.items())
 
+    written_rows = rows + [_flat(row) for row in groups]
     with open(folder / "ablation.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, columns)
+        writer = csv.DictWriter(file, _columns(written_rows))
         writer.writeheader()
-        writer.writerows(rows)
-    lines = [heads, ["---"] * len(columns), *cells]
-    markdown = "".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |\n" for line in lines)
-    (folder / "ablation.md").write_text(f"{markdown}\n{caption}\n")
+        writer.writerows(written_rows)
+    markdown = f"{_markdown(rows, titles)}\n{caption}\n"
+    if groups:
+        markdown += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
+    (folder / "ablation.md").write_text(markdown)
     if any(run.metrics is not None for run in runs):
-        _speed(runs, rows, shared).savefig(folder / "speed_against_error.png", dpi=DPI)
+        _speed(runs, rows, shared, titles).savefig(folder / "speed_against_error.png", dpi=DPI)
 
-    failed = any(row["status"] == "failed" for row in rows)
-    shown = [i for i, column in enumerate(columns) if column not in WRITTEN_ONLY and (column != "status" or failed)]
+    hidden = {name for name, metric in known.items() if not metric.is_brief} | {WRITTEN_ONLY}
+    if not any(row["status"] == "failed" for row in rows):
+        hidden.add("status")
+    varied = [[value for key, value in run.overrides.items() if key not in shared] for run in runs]
+    if all(varied.count(values) == 1 for values in varied):
+        hidden.add("run")  # whose name would repeat the varied overrides
     caption += "; all columns in ablation.md"
-    table = Table(title=f"Runs of {escape(str(folder))}", caption=escape(caption), box=SIMPLE_HEAD, pad_edge=False)
-    for i in shown:
-        justify = "right" if columns[i] in METRICS | COSTS else "left"
-        table.add_column(escape(heads[i]), justify=justify, overflow="fold")
-    for row, line in zip(rows, cells, strict=True):
-        style = {"failed": "red", "look-up": "dim"}.get(row["status"])
-        table.add_row(*(escape(line[i]) for i in shown), style=style)
+    tables = [_table(f"Runs of {folder}", rows, titles, hidden, caption)]
+    if groups:
+        tables.append(_table("Over seeds", groups, titles, hidden | {"status"}, f"{SEEDS}; all columns in ablation.md"))
+    return Group(*tables)
+
+
+def _columns(rows: Iterable[Mapping]) -> list[str]:
+    return list(dict.fromkeys(column for row in rows for column in row))
+
+
+def _flat(row: dict) -> dict:
+    """A row with a spread in three columns: the metric's own for the mean, and two that say what they are."""
+    flat = {}
+    for key, value in row.items():
+        if isinstance(value, Spread):
+            flat |= {key: value.mean, f"{key}_sd": value.deviation, f"{key}_least": value.least}
+        else:
+            flat[key] = value
+    return flat
+
+
+def _text(value: float | int | str | Spread | None, between: str) -> str:
+    if isinstance(value, Spread):
+        return f"{written(value.mean)} ± {written(value.deviation)}{between}least {written(value.least)}"
+    return written(value)
+
+
+def _markdown(rows: list[dict], titles: Mapping[str, str]) -> str:
+    columns = _columns(rows)
+    cells = [[_text(row.get(column), ", ") for column in columns] for row in rows]
+    lines = [[titles.get(column, column) for column in columns], ["---"] * len(columns), *cells]
+    return "".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |\n" for line in lines)
+
+
+def _table(title: str, rows: list[dict], titles: Mapping[str, str], hidden: set[str], caption: str) -> Table:
+    columns = [column for column in _columns(rows) if column not in hidden]
+    table = Table(title=escape(title), caption=escape(caption), box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for column in columns:
+        is_number = column in titles  # which stays whole; where room lacks, words are folded
+        table.add_column(
+            stacked(titles[column]) if is_number else escape(column.replace(".", ".\n")),
+            justify="right" if is_number else "left",
+            no_wrap=is_number,
+            overflow="fold",
+        )
+    for row in rows:
+        style = {"failed": "red", "baseline": "dim"}.get(row["status"])
+        table.add_row(*(escape(_text(row.get(column), "\n")) for column in columns), style=style)
     return table
 
 
-def _speed(runs: list[Run], rows: list[dict], shared: dict) -> Figure:
+def _speed(runs: list[Run], rows: list[dict], shared: Mapping, titles: Mapping[str, str]) -> Figure:
     done = [(run, row) for run, row in zip(runs, rows, strict=False) if run.metrics is not None]
-    metric = next(iter(next(iter(done[0][0].metrics["models"].values()))))
+    metric = next(iter(titles))
     names = [
         " ".join(f"{key}={value}" for key, value in run.overrides.items() if key not in shared) or row["model"]
         for run, row in done
     ]
+    if len(set(names)) < len(names):
+        names = [run.name for run, _ in done]
     number = lambda key: np.array([np.nan if row.get(key) is None else row[key] for _, row in done], float)
     times = {"inference [ms a transmitter]": number("inference_ms"), "training [s]": number("train_seconds")}
-    lookups = {
-        f"{row['model']} {row.get('split', '')}".strip(): row[metric] for row in rows[len(runs) :] if metric in row
-    }
-    return speed_against_error(names, number(metric), times, METRICS.get(metric, metric), lookups)
+    baselines = {f"{row['model']} {row.get('split', '')}".strip(): row[metric] for row in rows[len(runs) :]}
+    return speed_against_error(names, number(metric), times, titles[metric], baselines)

@@ -1,5 +1,6 @@
 """One panel a receiver, as many on a page as can be read."""
 
+from collections.abc import Mapping, Sequence
 from math import ceil
 
 from matplotlib.axes import Axes
@@ -40,3 +41,12 @@ def panels(count: int, width: float, height: float, xlabel: str, ylabel: str) ->
             ax.set_xlabel(xlabel)
             ax.tick_params(labelbottom=True)
     return figure, axes[:count]
+
+
+def numbered(paged: Mapping[str, Sequence[Figure]]) -> dict[str, Figure]:
+    """The figures of each name by file name: the name itself for the first, name_2, name_3, ... for the others."""
+    return {
+        name if page == 1 else f"{name}_{page}": figure
+        for name, figures in paged.items()
+        for page, figure in enumerate(figures, 1)
+    }

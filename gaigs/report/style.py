@@ -1,5 +1,7 @@
 """The look that all figures share: sizes for a printed page, colours that survive colour blindness and grey print."""
 
+import math
+
 COLUMN, PAGE = 3.5, 7.16
 """Widths of one column and of a page of two columns [inch]."""
 
@@ -26,7 +28,7 @@ STYLE = {
 
 BLUE, ORANGE, GREEN, PURPLE, SKY, GREY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#6E6E6E"
 
-LINES = ((BLUE, "-"), (GREY, "--"), (ORANGE, "-."), (GREEN, ":"), (PURPLE, (0, (5, 1))), (SKY, (0, (1, 1))))
+LINES = ((BLUE, "-"), (GREY, "--"), (ORANGE, "-."), (GREEN, ":"), (PURPLE, (0, (7, 2))), (SKY, (0, (4, 1, 1, 1, 1, 1))))
 """Colour and dash of the first, second, ... line; the run's own model comes first, and unbroken."""
 
 MARKERS = tuple(
@@ -35,3 +37,15 @@ MARKERS = tuple(
     for colour in (BLUE, ORANGE, GREEN, PURPLE, SKY)
 )
 """Looks of the points of up to 25 runs."""
+
+
+def round_step(span: float, most: int) -> float:
+    """The smallest of 1, 2 or 5 times a power of ten of which at most so many cover a span above 0."""
+    least = span / most
+    power = 10.0 ** math.floor(math.log10(least))
+    return next((step * power for step in (1, 2, 5) if step * power >= least), 10 * power)
+
+
+def with_unit(quantity: str, unit: str) -> str:
+    """The label of an axis: the unit in brackets; a ratio has none."""
+    return f"{quantity} [{unit}]" if unit else quantity

@@ -1,4 +1,4 @@
-"""The scores of a run, beside those of the look-ups on the same split."""
+"""The scores of a run, beside those of its baselines on the same split."""
 
 from collections.abc import Mapping
 
@@ -6,22 +6,27 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
-METRICS = {
-    "ssim_median": "median SSIM",
-    "ssim_mean": "mean SSIM",
-    "ssim_p10": "p10 SSIM",
-    "ssim_p90": "p90 SSIM",
-    "mae": "MAE",
-    "mae_db": "MAE [dB]",
-    "median_ae_db": "median AE [dB]",
-    "rmse_db": "RMSE [dB]",
-}
-"""What a reader calls the metrics of ``metrics.json``."""
+from gaigs.registry import registry
+
+FITTING = 5
+"""Most metrics that a terminal has room for; of more, only the brief ones are shown."""
 
 
-def larger_is_better(metric: str) -> bool:
-    """Whether a metric is a similarity; the others are errors."""
-    return metric.startswith("ssim")
+def metrics_of(metrics: Mapping) -> dict:
+    """What a reader calls the metrics of a run, and which way they are better: those of its task, in their order.
+
+    Args:
+        metrics: Contents of ``metrics.json``, of which ``task`` counts.
+
+    Raises:
+        ValueError: They do not say the task, or it is not installed here.
+    """
+    if "task" not in metrics:
+        raise ValueError(
+            f"metrics.json must have the key 'task', got {', '.join(metrics)}; one without is of an earlier version of "
+            "gaigs: do the run anew, in another folder"
+        )
+    return registry("task").get(metrics["task"]).metrics()
 
 
 def written(value: float | int | str | None) -> str:
@@ -33,66 +38,72 @@ def written(value: float | int | str | None) -> str:
     return value or ""
 
 
+def stacked(title: str) -> str:
+    """The head of a column, a word a line, so that the column is no wider than its numbers need."""
+    return escape(title.replace(" ", "\n"))
+
+
 def metrics_table(metrics: Mapping) -> Group:
     """Models down, metrics across, the best of each metric in bold; below it the same models at each receiver.
 
     Args:
-        metrics: Contents of ``metrics.json``: ``split``, ``seed``, ``device``, and ``models`` with the scores of each;
-            ``receivers``, where there are several, has those ``models`` for each of them.
+        metrics: Contents of ``metrics.json``: ``task``, ``split``, ``seed``, ``device``, and ``models`` with the test
+            scores of each. Where links were held out, ``validation`` has the same models' scores on those, of which the
+            first metric is shown too; where there are several receivers, ``receivers`` has ``models`` for each of them.
     """
-    models = metrics["models"]
-    names = list(next(iter(models.values())))
+    known, models, validation = metrics_of(metrics), metrics["models"], metrics.get("validation") or {}
+    names = [name for name, metric in known.items() if metric.is_brief or len(known) <= FITTING]
     # A split's name may end with a seed of its own.
     caption = escape(f"split {metrics['split']}\nrun with seed {metrics['seed']} on {metrics['device']}")
-    table = Table("model", title="Test scores", caption=caption)
-    best = _best(models)
+    table = Table(title="Test scores", caption=caption)
+    table.add_column("model", no_wrap=True)
+    columns = []
     for name in names:
-        table.add_column(escape(METRICS.get(name, name)), justify="right")
-    for model, scores in models.items():
-        table.add_row(escape(model), *(_cell(scores[name], best[name]) for name in names))
-    return Group(table, *([_receivers_table(metrics["receivers"])] if metrics.get("receivers") else []))
-
-
-def _receivers_table(receivers: Mapping) -> Table:
-    """Receivers down, models across, and of the metrics the first."""
-    models = next(iter(receivers.values()))
-    metric = next(iter(next(iter(models.values()))))
-    table = Table("receiver", title=f"{escape(METRICS.get(metric, metric))} at each receiver")
+        table.add_column(stacked(known[name].title), justify="right")
+        columns.append(_cells(models, name, known[name].larger_is_better))
+    if validation:
+        first, metric = next(iter(known.items()))
+        table.add_column(stacked(f"{metric.title}, validation"), justify="right")
+        columns.append(_cells(validation, first, metric.larger_is_better))
     for model in models:
+        table.add_row(escape(model), *(cells.get(model, "") for cells in columns))
+    return Group(table, *([_receivers_table(metrics["receivers"], known)] if metrics.get("receivers") else []))
+
+
+def _receivers_table(receivers: Mapping, known: dict) -> Table:
+    """Receivers down, models across, and of the metrics the first."""
+    name, metric = next(iter(known.items()))
+    table = Table("receiver", title=f"{escape(metric.title)} at each receiver")
+    for model in next(iter(receivers.values())):
         table.add_column(escape(model), justify="right")
-    for receiver, scores in receivers.items():
-        best = _best(scores)[metric]
-        table.add_row(escape(receiver), *(_cell(scores[model][metric], best) for model in models))
+    for receiver, models in receivers.items():
+        table.add_row(escape(receiver), *_cells(models, name, metric.larger_is_better).values())
     return table
 
 
-def _best(models: Mapping) -> dict[str, float]:
-    """The best of each metric over the models."""
-    return {
-        name: (max if larger_is_better(name) else min)(scores[name] for scores in models.values())
-        for name in next(iter(models.values()))
-    }
-
-
-def _cell(value: float, best: float) -> str:
-    return f"[bold]{written(value)}[/bold]" if value == best else written(value)
+def _cells(models: Mapping, name: str, larger_is_better: bool) -> dict[str, str]:
+    """One metric of each model as text, the best in bold."""
+    best = (max if larger_is_better else min)(scores[name] for scores in models.values())
+    texts = {model: written(scores[name]) for model, scores in models.items()}
+    return {model: f"[bold]{text}[/bold]" if models[model][name] == best else text for model, text in texts.items()}
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence on where the run's own model stands against the look-ups.
+    """A sentence on where the run's own model stands against the baselines.
 
     Args:
-        metrics: As for ``metrics_table``; the first of ``models`` is the run's own, the first of its metrics counts.
+        metrics: As for ``metrics_table``; the first of ``models`` is the run's own, the first of the task's metrics
+            counts.
     """
     (model, own), *others = metrics["models"].items()
-    metric = next(iter(own))
-    quantity, _, unit = METRICS.get(metric, metric).removesuffix("]").partition(" [")
+    name, metric = next(iter(metrics_of(metrics).items()))
+    quantity, _, unit = metric.title.removesuffix("]").partition(" [")
     digits, unit = (2, f" {unit}") if unit else (3, "")
     stands = []
-    for name, scores in others:
-        gap = f"{own[metric] - scores[metric]:+.{digits}f}"
+    for other, scores in others:
+        gap = f"{own[name] - scores[name]:+.{digits}f}"
         side = {"+": "above", "-": "below"}[gap[0]]
-        stands.append(f"level with {name}" if float(gap) == 0 else f"{gap[1:]}{unit} {side} {name}")
-    stand = " and ".join(filter(None, (", ".join(stands[:-1]), *stands[-1:]))) or f"at {own[metric]:.{digits}f}{unit}"
-    hint = "" if larger_is_better(metric) else " (lower is better)"
+        stands.append(f"level with {other}" if float(gap) == 0 else f"{gap[1:]}{unit} {side} {other}")
+    stand = " and ".join(filter(None, (", ".join(stands[:-1]), *stands[-1:]))) or f"at {own[name]:.{digits}f}{unit}"
+    hint = "" if metric.larger_is_better else " (lower is better)"
     return f"{model} is {stand} in {quantity}{hint} on split {metrics['split']}."

@@ -6,25 +6,32 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs.data import Scene
+from gaigs.placement import Placed
+from gaigs.query import Query
 from gaigs.registry import register
+from gaigs.scene import Scene
 from gaigs.tokenizer import Tokens
 
 PERIOD = 16
 """The shortest period of the transmitter's features over the distance between neighbouring training transmitters;
 chosen on validation parts of rfid-s23-200 and the built-in room."""
 
-RSSI_OCTAVE = -4
-"""The highest octave of the transmitter's features where labels are RSSI: a reading scatters by decibels however close
+NOISY_OCTAVE = -4
+"""The highest octave of the transmitter's features where labels are noisy: an RSSI scatters by decibels however close
 the next one is, and features of 16 m leave it to the network how sharp a wall's shadow is; chosen by leaving out one of
 the robot's training runs in ble-flat."""
+
+BAND_FREQUENCIES = math.pi * 2.0 ** torch.arange(-1, 3)
+"""Angular frequencies of the features of the carrier, over its position in the band, -1 to 1: periods from twice the
+band down to a quarter of it."""
 
 
 @register("tokenizer", "euclidean")
 class EuclideanTokenizer(nn.Module):
     """Fourier features of the Gaussians, and of the transmitter through a two-layer network.
 
-    The transmitter's network runs once a transmitter, not once a Gaussian, so its width costs next to nothing.
+    The transmitter's network runs once a transmitter, not once a Gaussian, so its width costs next to nothing. Where
+    the data have several carriers, it also sees where in their band the query's lies.
 
     Args:
         scene: Positions are taken relative to the middle of the transmitters' box, and of the receivers.
@@ -33,6 +40,9 @@ class EuclideanTokenizer(nn.Module):
             see ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
         width: Width of E(P_TX).
+
+    Raises:
+        ValueError: A range of octaves is empty, or a width out of range.
 
     Source: GAI-GS, "Multi-view Tokenizer"; Tancik et al., Fourier Features, 2020.
     """
@@ -48,8 +58,11 @@ class EuclideanTokenizer(nn.Module):
         width: int,
     ):
         super().__init__()
-        positions = torch.stack([receiver.pose.position for receiver in scene.receivers])
-        self.register_buffer("receivers_middle", positions.mean(0))
+        for option, count in (("hidden", hidden), ("width", width)):
+            if count < 1:
+                raise ValueError(f"tokenizer option {option} must be at least 1, got {count}")
+        self.scene = scene
+        self.register_buffer("receivers_middle", scene.positions(scene.lower).mean(0))
         self.register_buffer("transmitters_middle", (scene.lower + scene.upper) / 2)
         self.register_buffer("gaussian_frequencies", octaves("gaussian_octaves", *gaussian_octaves))
         transmitter_octaves = transmitter_octaves or learnable_octaves(scene)
@@ -57,28 +70,32 @@ class EuclideanTokenizer(nn.Module):
         self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
         self.transmitter_width = width
         features = 3 * (1 + 2 * len(self.transmitter_frequencies))
+        if scene.has_band:
+            features += 1 + 2 * len(BAND_FREQUENCIES)
         self.network = nn.Sequential(nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, width))
 
-    def forward(
-        self, means: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], transmitters: Float[Tensor, "b 3"]
-    ) -> Tokens:
+    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
         """E(P_x) and E(P_TX); opacities are not looked at."""
+        means = placed.means[0] if len(placed.means) == 1 else placed.means
         gaussians = fourier_features(means - self.receivers_middle, self.gaussian_frequencies)
-        features = fourier_features(transmitters - self.transmitters_middle, self.transmitter_frequencies)
-        return Tokens(transmitters.new_zeros(len(transmitters), 0), gaussians, self.network(features))
+        features = fourier_features(query.transmitters - self.transmitters_middle, self.transmitter_frequencies)
+        if self.scene.has_band:
+            band = fourier_features(self.scene.band_positions(query)[:, None], BAND_FREQUENCIES.to(features))
+            features = torch.cat((features, band), 1)
+        return Tokens(features.new_zeros(len(query), 0), gaussians, self.network(features))
 
 
 def learnable_octaves(scene: Scene) -> tuple[int, int]:
     """Lowest and highest octave of features of the transmitter, as far as the training transmitters bear them out.
 
     Periods go from twice the box's longest edge down to ``PERIOD`` distances between neighbouring transmitters: the
-    network multiplies frequencies, so what it is given must be well below what these sample. RSSI is noisy, and bears
-    out no more than ``RSSI_OCTAVE``.
+    network multiplies frequencies, so what it is given must be well below what these sample. Noisy labels bear out no
+    more than ``NOISY_OCTAVE``.
     """
     edge = (scene.upper - scene.lower).max().item()
     highest = round(-math.log2(PERIOD * scene.spacing))
-    if scene.grid is None:
-        highest = min(highest, RSSI_OCTAVE)
+    if scene.task.is_noisy:
+        highest = min(highest, NOISY_OCTAVE)
     return min(highest, math.floor(-math.log2(2 * edge))), highest
 
 

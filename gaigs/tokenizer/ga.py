@@ -7,8 +7,10 @@ from torch import Tensor, nn
 from gaigs.algebra import PROJECTIVE, SPACETIME
 from gaigs.algebra.embedding import embed_event, embed_point
 from gaigs.algebra.layers import EquivariantLinear, GATrBlock
-from gaigs.data import Scene
+from gaigs.placement import Placed
+from gaigs.query import Query
 from gaigs.registry import register
+from gaigs.scene import Scene
 from gaigs.tokenizer import Tokens
 
 ALGEBRAS = {"projective": (PROJECTIVE, embed_point), "spacetime": (SPACETIME, embed_event)}
@@ -20,7 +22,8 @@ class GATokenizer(nn.Module):
 
     Tokens are [CLS, TX, anchors]: CLS is a learnable point, anchors are the centres of the most opaque Gaussians,
     chosen anew at every call, the same for all transmitters, without a gradient. Each is a multivector, and two scalars
-    say which of the three it is. The linear read-out makes CLS depend on the room's axes, as the field does.
+    say which of the three it is; where the data have several carriers, a third says where in their band the query's
+    lies. The linear read-out makes CLS depend on the room's axes, as the field does.
 
     Positions are taken relative to the middle of the box around the transmitters and receivers and divided by half its
     longest edge, one scale for all axes, so that they are of order one and motions remain motions.
@@ -67,7 +70,7 @@ class GATokenizer(nn.Module):
         for option, count in counts.items():
             if count < 1:
                 raise ValueError(f"tokenizer option {option} must be at least 1, got {count}")
-        corners = torch.stack((scene.lower, scene.upper, *(receiver.pose.position for receiver in scene.receivers)))
+        corners = torch.cat((scene.lower[None], scene.upper[None], scene.positions(scene.lower)))
         lower, upper = corners.amin(0), corners.amax(0)
         scale = (upper - lower).max() / 2
         if not scale > 0:
@@ -81,28 +84,32 @@ class GATokenizer(nn.Module):
         self.algebra, self.embed = ALGEBRAS[algebra]
         self.cls = nn.Parameter(torch.zeros(3))
         self.types = nn.Parameter(torch.randn(3, 2))
-        self.first = EquivariantLinear(self.algebra, (1, multivectors), (2, scalars))
+        self.scene = scene
+        self.first = EquivariantLinear(self.algebra, (1, multivectors), (2 + scene.has_band, scalars))
         self.blocks = nn.ModuleList(GATrBlock(self.algebra, multivectors, scalars, heads) for _ in range(blocks))
         self.last = EquivariantLinear(self.algebra, (multivectors, 1), (scalars, 2))
         self.read_out = nn.Linear(self.algebra.size + 2, width)
 
-    def forward(
-        self, means: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], transmitters: Float[Tensor, "b 3"]
-    ) -> Tokens:
-        """CLS for every transmitter.
+    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
+        """CLS for every query.
 
         Args:
-            means: Gaussian centres, world frame [m].
+            placed: Gaussian centres, world frame [m].
             opacities: Their opacities; only their order matters.
-            transmitters: Positions, world frame [m].
+            query: Transmitters, and their frequencies where the data have several.
         """
-        b, m = len(transmitters), min(self.anchors, len(means))
-        anchors = means.detach()[opacities.topk(m).indices]
+        means, transmitters = placed.means.detach(), query.transmitters
+        b, m = len(query), min(self.anchors, means.shape[1])
+        anchors = means[:, opacities.topk(m).indices]
         tx, anchors = ((positions - self.middle) / self.scale for positions in (transmitters, anchors))
         points = self.embed(torch.cat((self.cls.expand(b, 1, 3), tx[:, None], anchors.expand(b, m, 3)), 1))
         types = torch.cat((self.types[:2], self.types[2:].expand(m, 2)))
+        types = types.expand(b, -1, -1)
+        if self.scene.has_band:
+            band = self.scene.band_positions(query)[:, None, None].expand(-1, types.shape[1], 1)
+            types = torch.cat((types, band), 2)
 
-        multivectors, scalars = self.first(points[..., None, :], types.expand(b, -1, -1))
+        multivectors, scalars = self.first(points[..., None, :], types)
         reference = points.mean(1)
         *blocks, final = self.blocks
         for block in blocks:
@@ -111,4 +118,4 @@ class GATokenizer(nn.Module):
         multivectors, scalars = (x[:, :1] for x in final.attend(multivectors, scalars))
         multivectors, scalars = self.last(*final.transform(multivectors, scalars, reference))
         scene = self.read_out(torch.cat((multivectors.flatten(1), scalars.flatten(1)), -1))
-        return Tokens(scene, means.new_zeros(len(means), 0), transmitters.new_zeros(b, 0))
+        return Tokens(scene, means.new_zeros(means.shape[1], 0), transmitters.new_zeros(b, 0))

@@ -3,8 +3,10 @@
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs.data import Scene
+from gaigs.placement import Placed
+from gaigs.query import Query
 from gaigs.registry import register, registry
+from gaigs.scene import Scene
 from gaigs.tokenizer import Tokens
 
 
@@ -28,9 +30,7 @@ class MultiviewTokenizer(nn.Module):
         self.gaussian_width = self.euclidean.gaussian_width
         self.transmitter_width = self.euclidean.transmitter_width
 
-    def forward(
-        self, means: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], transmitters: Float[Tensor, "b 3"]
-    ) -> Tokens:
+    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
         """CLS of the one, E(P_x) and E(P_TX) of the other."""
-        _, gaussians, transmitters_ = self.euclidean(means, opacities, transmitters)
-        return Tokens(self.ga(means, opacities, transmitters).scene, gaussians, transmitters_)
+        _, gaussians, transmitters = self.euclidean(placed, opacities, query)
+        return Tokens(self.ga(placed, opacities, query).scene, gaussians, transmitters)

@@ -1,0 +1,42 @@
+"""Training fits a model to the links: how it descends, in which batches, and what happens between the steps."""
+
+import torch
+
+from gaigs.query import Batch
+from gaigs.task import Task
+
+
+def seeded(*numbers: int) -> torch.Generator:
+    """A random generator that a seed and, say, a step decide alone."""
+    return torch.Generator().manual_seed(hash(numbers) % 2**63)
+
+
+class MeanScores:
+    """Means of a task's scores over links, which may be spread over several processes.
+
+    Args:
+        task: Whose scores.
+    """
+
+    def __init__(self, task: Task):
+        self.task = task
+        self.sums: dict[str, float] = {}
+        self.count = 0
+
+    def add(self, batch: Batch, values: torch.Tensor) -> None:
+        """Scores the links of a batch; one whose share is 0 counts for nothing."""
+        share = batch.shares[0]
+        self.count += share * len(batch)
+        for name, scores in self.task.scores(batch.labels, values).items():
+            self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
+
+    def over_processes(self, strategy) -> dict[str, float]:
+        """The mean of each score; every process has to ask.
+
+        Args:
+            strategy: Lightning's, which knows the processes.
+        """
+        names = list(self.sums)
+        totals = torch.tensor([self.count, *self.sums.values()], dtype=torch.float64, device=strategy.root_device)
+        count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()
+        return {name: total / count for name, total in zip(names, sums, strict=True)}

@@ -1,26 +1,40 @@
-"""Batches of links: shuffled for training, such that a run can stop anywhere and go on there; in order for scores."""
+"""Batches of links: shuffled for training, such that a run can stop anywhere and go on there; in order for scores.
+
+Where several processes train together, each takes its share of every batch.
+"""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 from jaxtyping import Int
-from torch import Tensor
+from torch import Tensor, distributed
 
 from gaigs.data import Links
-from gaigs.model import Batch
+from gaigs.query import Batch
+from gaigs.training import seeded
+
+
+def process() -> tuple[int, int]:
+    """The number of this process, from 0, and how many train together."""
+    if distributed.is_available() and distributed.is_initialized():
+        return distributed.get_rank(), distributed.get_world_size()
+    return 0, 1
 
 
 class Batches:
-    """Batches of a fixed number of transmitters with all their links, in an order that seed and step alone decide.
+    """Batches of a fixed number of places with all their links, in an order that seed and step alone decide.
 
-    What a transmitter excites is the same for all receivers, and is computed once where its links come together. Every
-    pass goes through all transmitters once, anew shuffled. The batch of step k is the same whether or not the run was
-    interrupted before it, so a resumed training sees what an uninterrupted one would have.
+    A place is a transmitter's position and frequency: what it excites is the same for all receivers, and is computed
+    once where its links come together. Every pass goes through all places once, anew shuffled. The batch of step k is
+    the same whether or not the run was interrupted before it, so a resumed training sees what an uninterrupted one
+    would have. Of several processes each gets every so-manieth place of the batch, with the weights (``Batch.shares``)
+    that make the mean over processes the mean over the batch.
 
     Args:
         links: The data set.
         index: The links to draw from.
-        size: Transmitter positions a batch; the last batch of a pass may hold fewer.
+        size: Places a batch, of all processes together; the last batch of a pass may hold fewer.
         seed: Of the order.
         steps: How many batches there are in all.
 
@@ -33,8 +47,8 @@ class Batches:
             if value < 1:
                 raise ValueError(f"{option} must be at least 1, got {value}")
         self.links, self.size, self.seed, self.steps = links, size, seed, steps
-        _, place, counts = links.transmitters[index].unique(dim=0, return_inverse=True, return_counts=True)
-        self.places = index[place.argsort(stable=True)].split(counts.tolist())
+        _, place = links.query[index].unique(with_receivers=False)
+        self.places = index[place.argsort(stable=True)].split(place.bincount().tolist())
         self.position = 0
 
     def __len__(self) -> int:
@@ -44,11 +58,21 @@ class Batches:
         length = -(-len(self.places) // self.size)
         while self.position < self.steps:
             passed, within = divmod(self.position, length)
-            generator = torch.Generator().manual_seed(hash((self.seed, passed)) % 2**63)
-            parts = torch.randperm(len(self.places), generator=generator).split(self.size)
+            parts = torch.randperm(len(self.places), generator=seeded(self.seed, passed)).split(self.size)
             for chosen in parts[within : within + self.steps - self.position]:
                 self.position += 1
-                yield take(self.links, torch.cat([self.places[i] for i in chosen]))
+                yield self._share([self.places[i] for i in chosen])
+
+    def _share(self, places: list[Int[Tensor, "k"]]) -> Batch:
+        rank, processes = process()
+        # A process that would have none takes one with no weight: it has to take part in the step.
+        own = places[rank::processes] or places[:1]
+        batch = self.links.batch(torch.cat(own))
+        if processes == 1:
+            return batch
+        held = len(places[rank::processes]) > 0
+        links = held * processes * len(batch) / sum(map(len, places))
+        return replace(batch, shares=(links, held * processes * len(own) / len(places)))
 
     def state_dict(self) -> dict:
         """How far the training has come."""
@@ -59,13 +83,13 @@ class Batches:
         self.position = state["position"]
 
 
-class Pass:
-    """One pass over links in their order.
+class InOrder:
+    """One pass over links in their order; of several processes each gets every so-manieth link of a batch.
 
     Args:
         links: The data set.
         index: The links to go over.
-        size: Links a batch; the last one may hold fewer.
+        size: Links a batch, of all processes together; the last one may hold fewer.
     """
 
     def __init__(self, links: Links, index: Int[Tensor, "k"], size: int):
@@ -76,9 +100,9 @@ class Pass:
         return len(self.parts)
 
     def __iter__(self) -> Iterator[Batch]:
-        return (take(self.links, part) for part in self.parts)
-
-
-def take(links: Links, index: Int[Tensor, "b"]) -> Batch:
-    """Links as a batch with labels."""
-    return Batch(links.transmitters[index], links.receiver_index[index], links.grid, links.labels[index])
+        rank, processes = process()
+        for part in self.parts:
+            own = part[rank::processes]
+            # A process that would have none takes one with no weight: all go through the same number of batches.
+            share = float(len(own) > 0)
+            yield replace(self.links.batch(own if share else part[:1]), shares=(share, share))

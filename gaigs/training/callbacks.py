@@ -1,6 +1,13 @@
-"""What happens between the steps: density control, checkpoints to go on from, a line that tells how far it is."""
+"""What happens between the steps: density control, checkpoints to go on from, a line that tells how far it is.
+
+Lightning's own checkpoint and progress callbacks are not used. ``ModelCheckpoint`` saves before a validation that is
+due, by each process's own clock, and knows no stop at a signal: a training could not go on exactly where it stopped.
+Its progress bars count the batches of an epoch, and a run counts steps.
+"""
 
 import math
+import signal
+import threading
 import time
 from pathlib import Path
 
@@ -10,6 +17,8 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from gaigs import density
+from gaigs.processes import STOPPING
+from gaigs.training import MeanScores, seeded
 
 
 class DensityControl(Callback):
@@ -23,9 +32,9 @@ class DensityControl(Callback):
         every: Steps between two rounds.
         start, stop: First and last step at which a round may happen.
         gradient: Bound on that pull [loss/rad].
-        wide: A Gaussian is wide if its largest standard deviation over its distance exceeds this [rad].
+        split_angle: A Gaussian is wide if its largest standard deviation over its distance exceeds this [rad].
         opacity: Gaussians below this opacity are pruned.
-        most: Their number does not grow beyond this.
+        max_count: Their number does not grow beyond this.
         seed: Of the halves' random places.
 
     Raises:
@@ -35,12 +44,21 @@ class DensityControl(Callback):
     """
 
     def __init__(
-        self, every: int, start: int, stop: int, gradient: float, wide: float, opacity: float, most: int, seed: int
+        self,
+        every: int,
+        start: int,
+        stop: int,
+        gradient: float,
+        split_angle: float,
+        opacity: float,
+        max_count: int,
+        seed: int,
     ):
         if every < 1:
             raise ValueError(f"density.every must be at least 1 step, got {every}")
         self.every, self.start, self.stop = every, start, stop
-        self.gradient, self.wide, self.opacity, self.most, self.seed = gradient, wide, opacity, most, seed
+        self.gradient, self.split_angle, self.opacity = gradient, split_angle, opacity
+        self.max_count, self.seed = max_count, seed
         self.pull = torch.zeros(0)
         self.steps = 0
 
@@ -51,11 +69,11 @@ class DensityControl(Callback):
         self.pull, self.steps = state["pull"], state["steps"]
 
     def on_fit_start(self, trainer, module) -> None:
-        if not hasattr(module.model, "gaussians"):
+        if module.model.primitives is None:
             raise ValueError("density needs a model with Gaussians, and this one has none; set density=null")
 
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
-        gaussians = module.model.gaussians
+        gaussians = module.model.primitives
         pull = gaussians.means.grad.norm(dim=-1) * self._distances(module)
         self.pull = pull if self.steps == 0 else self.pull.to(pull) + pull
         self.steps += 1
@@ -65,31 +83,34 @@ class DensityControl(Callback):
         step = trainer.global_step
         if step % self.every or not self.start <= step <= self.stop:
             return
-        gaussians, optimizer = module.model.gaussians, trainer.optimizers[0]
+        gaussians, optimizer = module.model.primitives, trainer.optimizers[0]
         pulled = self.pull / self.steps > self.gradient
-        room = max(0, self.most - len(gaussians))
+        room = max(0, self.max_count - len(gaussians))
         if int(pulled.sum()) > room:  # only the hardest pulled
             chosen = torch.topk(torch.where(pulled, self.pull, -1), room).indices
             pulled = torch.zeros_like(pulled).index_fill(0, chosen, True)
-        wide = gaussians.scales.amax(-1) / self._distances(module) > self.wide
+        wide = gaussians.scales.amax(-1) / self._distances(module) > self.split_angle
         cloned, split = pulled & ~wide, pulled & wide
         density.clone(gaussians, optimizer, cloned)
         split = torch.cat((split, split.new_zeros(len(gaussians) - len(split))))
-        generator = torch.Generator().manual_seed(hash((self.seed, step)) % 2**63)
-        density.split(gaussians, optimizer, split, generator)
+        density.split(gaussians, optimizer, split, seeded(self.seed, step))
         faint = gaussians.opacities < self.opacity
         if faint.any():
             density.prune(gaussians, optimizer, faint)
         self.steps = 0
+        if trainer.world_size > 1:
+            # All processes have the same Gaussians, as gradients are averaged before they are added up here, and draw
+            # alike. What averages them, though, holds on to the parameters that were replaced.
+            trainer.strategy.model = trainer.strategy._setup_model(module)
 
     def _distances(self, module) -> torch.Tensor:
-        gaussians = module.model.gaussians
-        middle = torch.stack([receiver.pose.position for receiver in module.model.scene.receivers]).mean(0)
-        return (gaussians.means.detach() - middle.to(gaussians.means)).norm(dim=-1)
+        gaussians = module.model.primitives
+        middle = module.model.scene.positions(gaussians.means).mean(0)
+        return (gaussians.means.detach() - middle).norm(dim=-1)
 
 
 class KeepBest(Checkpoint):
-    """Writes the checkpoint of the best validation score (``Training.scoring``), or of the last step where nothing was
+    """Writes the checkpoint of the best validation score (``Task.watched``), or of the last step where nothing was
     validated.
 
     Args:
@@ -114,15 +135,15 @@ class KeepBest(Checkpoint):
 
     @torch.no_grad()
     def on_train_start(self, trainer, module) -> None:
-        """RSSI starts from its reference, which few readings may not better: so that start counts too."""
+        """A model that predicts untrained counts as it starts, too: few readings may not better it."""
         self._stop_in_time(trainer)  # a run that was killed once it had stopped
-        if trainer.enable_validation and self.best == -math.inf and module.model.scene.grid is None:
+        if trainer.enable_validation and self.best == -math.inf and module.model.predicts_untrained:
             self._validate(trainer, module)
 
     def on_validation_end(self, trainer, module) -> None:
         if trainer.sanity_checking:
             return
-        score = trainer.callback_metrics[f"validation/{module.scoring.watched}"].item()
+        score = trainer.callback_metrics[f"validation/{module.task.watched}"].item()
         self.waited = 0 if self._keep(trainer, module, score) else self.waited + 1
         self._stop_in_time(trainer)
 
@@ -134,17 +155,20 @@ class KeepBest(Checkpoint):
 
     def _validate(self, trainer, module) -> None:
         module.eval()
-        batches = (batch.to(module.device) for batch in trainer.val_dataloaders)
-        scores = [module.scoring.scores(batch.labels, module.model(batch).label) for batch in batches]
+        scores = MeanScores(module.task)
+        for batch in trainer.val_dataloaders:
+            batch = trainer.precision_plugin.convert_input(batch).to(module.device)
+            with trainer.precision_plugin.val_step_context():
+                scores.add(batch, module.model.evaluate(batch))
         module.train()
-        self._keep(trainer, module, torch.cat([score[module.scoring.watched] for score in scores]).mean().item())
+        self._keep(trainer, module, scores.over_processes(trainer.strategy)[module.task.watched])
 
     def on_fit_end(self, trainer, module) -> None:
         if self.best == -math.inf:
             save(trainer, self.path)
 
     def _keep(self, trainer, module, score: float) -> bool:
-        score = score if module.scoring.larger_is_better else -score
+        score = score if module.task.larger_is_better else -score
         better = score > self.best
         if better:
             self.best = score
@@ -157,11 +181,11 @@ class KeepBest(Checkpoint):
 
 
 class KeepLast(Checkpoint):
-    """Writes the checkpoint to go on from: every so often, at Ctrl-C, and at the end.
+    """Writes the checkpoint to go on from: every so often, at Ctrl-C or SIGTERM, and at the end.
 
     It does so between two steps, behind the validation where one is due, and behind the other callbacks, whose state it
-    stores: from there a training goes on as if it had never stopped. At the first Ctrl-C it stops there, at the second
-    at once.
+    stores: from there a training goes on as if it had never stopped. At the first signal it stops there, at the second
+    at once. Several processes go by the clock of the first, and stop together whichever of them got the signal.
 
     Args:
         path: Where it goes.
@@ -170,16 +194,33 @@ class KeepLast(Checkpoint):
 
     def __init__(self, path: Path, every: float):
         self.path, self.every = path, every
-        self.interrupted = False
+        self.received: int | None = None
+        self.random: dict | None = None
 
-    def interrupt(self, *_) -> None:
-        """The handler of the signal that Ctrl-C sends."""
-        if self.interrupted:
-            raise Interrupted("stopped within a step")
-        self.interrupted = True
+    def state_dict(self) -> dict:
+        """The states of torch's global generators, which a model may draw from."""
+        devices = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+        return {"processor": torch.random.get_rng_state(), "devices": devices}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.random = state
+
+    def interrupt(self, number: int, *_) -> None:
+        """The handler of the signals that stop a run."""
+        if self.received is not None:
+            raise Interrupted("stopped within a step", number)
+        self.received = number
 
     def on_train_start(self, trainer, module) -> None:
         self.saved = time.monotonic()
+        if threading.current_thread() is threading.main_thread():  # others may set no handlers
+            for number in STOPPING:
+                # Here, behind Lightning's own for SIGTERM, which talks to the other processes in the midst of a step.
+                signal.signal(number, self.interrupt)
+        if self.random is not None:
+            torch.random.set_rng_state(self.random["processor"])
+            for device, state in enumerate(self.random["devices"][: torch.cuda.device_count()]):
+                torch.cuda.set_rng_state(state, device)
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
         if not (trainer.enable_validation and trainer.global_step % trainer.val_check_batch == 0):
@@ -193,33 +234,51 @@ class KeepLast(Checkpoint):
         save(trainer, self.path)
 
     def _rest(self, trainer) -> None:
-        if self.interrupted or time.monotonic() >= self.saved + self.every:
-            save(trainer, self.path)
-            self.saved = time.monotonic()
-        if self.interrupted:
-            raise Interrupted(f"stopped after step {trainer.global_step}")
+        anyone = lambda holds: trainer.strategy.reduce_boolean_decision(holds, all=False)
+        is_due = trainer.is_global_zero and time.monotonic() >= self.saved + self.every
+        if not anyone(is_due or self.received is not None):
+            return
+        save(trainer, self.path)
+        self.saved = time.monotonic()
+        if anyone(self.received is not None):
+            raise Interrupted(f"stopped after step {trainer.global_step}", self.received or signal.SIGINT)
 
 
 class Interrupted(Exception):
-    """Ctrl-C. No KeyboardInterrupt, at which Lightning would end the process."""
+    """Ctrl-C or SIGTERM. No KeyboardInterrupt, at which Lightning would end the process.
+
+    Args:
+        message: Where it stopped.
+        number: Of the signal.
+    """
+
+    def __init__(self, message: str, number: int):
+        super().__init__(message)
+        self.number = number
 
 
 def save(trainer: lightning.Trainer, path: Path) -> None:
-    """Writes a checkpoint, whole or not at all, behind the log of the steps before it."""
+    """Writes a checkpoint, whole or not at all, behind the log of the steps before it; every process has to call it."""
     for logger in trainer.loggers:
         logger.save()
     part = path.with_suffix(".part")
     trainer.save_checkpoint(part, weights_only=False)
-    part.replace(path)
+    if trainer.is_global_zero:
+        part.replace(path)
+    trainer.strategy.barrier()
 
 
 class ProgressLine(ProgressBar):
-    """Steps done, their rate, the time left, loss and validation score in one line of the terminal."""
+    """Steps done, their rate, the time left, loss and validation score in one line of the first process's terminal."""
+
+    def disable(self) -> None:
+        """Lightning's call in all other processes, whose lines stay hidden from the start."""
 
     def on_train_start(self, trainer, module) -> None:
         bar, count, left = BarColumn(None), MofNCompleteColumn(), TimeRemainingColumn()
         rate, scores = "{task.fields[rate]:.1f} steps/s", "{task.fields[scores]}"
-        self.line = Progress("training", bar, count, rate, left, scores, expand=True)
+        hidden = not trainer.is_global_zero
+        self.line = Progress("training", bar, count, rate, left, scores, expand=True, disable=hidden)
         self.start, self.first = time.monotonic(), trainer.global_step
         self.task = self.line.add_task("", total=trainer.max_steps, completed=self.first, rate=0, scores="")
         self.line.start()
@@ -227,7 +286,7 @@ class ProgressLine(ProgressBar):
     def on_train_batch_end(self, trainer, module, *_) -> None:
         step, values = trainer.global_step, trainer.progress_bar_metrics
         rate = (step - self.first) / (time.monotonic() - self.start)
-        words = {"train/loss": "loss", "validation/ssim": "SSIM", "validation/mae_db": "MAE/dB"}
+        words = {"train/loss": "loss", f"validation/{module.task.watched}": module.task.watched}
         scores = " ".join(f"{word} {values[name]:.3f}" for name, word in words.items() if name in values)
         self.line.update(self.task, completed=step, rate=rate, scores=scores)
 

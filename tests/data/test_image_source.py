@@ -10,12 +10,10 @@ from scipy.constants import speed_of_light
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from gaigs.data import Grid
 from gaigs.data.synthetic.image_source import (
     MATERIALS,
     Box,
     Room,
-    array_elements,
     bartlett,
     frequency_offsets,
     min_max,
@@ -26,11 +24,17 @@ from gaigs.data.synthetic.image_source import (
     rss_dbm,
     trace,
 )
+from gaigs.directions import Grid
 from gaigs.geometry import Pose, from_spherical
+from gaigs.scene import Array, Receiver
 
 FREQUENCY = 3e9
 WAVELENGTH = speed_of_light / FREQUENCY
 CARRIER = torch.zeros(1)
+PATCHES = Array.planar(4, 4, WAVELENGTH / 2, "cosine")
+SCATTERED = Array(torch.tensor([[0.0, 0.0, 0.0], [0.04, -0.01, 0.02], [-0.03, 0.05, -0.06], [0.11, 0.02, 0.01]]))
+"""No two of its elements are as far apart, nor the same way."""
+
 WALLS = ("concrete", "glass", "plasterboard", "brick", "wood", "ceiling_board")
 HALL = Room((400.0, 400.0, 400.0), WALLS)
 """So large that order 0 in its middle is free space."""
@@ -55,25 +59,35 @@ def pose(position, angles=(0.0, 0.0, 0.0)):
     return Pose.from_xyzw(position, Rotation.from_euler("ZYZ", angles, degrees=True).as_quat())
 
 
+def patches(position, angles=(0.0, 0.0, 0.0)):
+    return Receiver("gateway1", pose(position, angles), PATCHES)
+
+
+def places(receiver):
+    """Of the elements, world frame, in float64."""
+    return receiver.pose.position.double() + receiver.array.elements.double() @ receiver.pose.rotation.double().T
+
+
 def fold(points, size):
     """Unfolded points back in the room: a triangle wave along each axis."""
     return size - np.abs(points % (2 * size) - size)
 
 
-def test_free_space_follows_friis():
-    centre = pose((200.0, 200.0, 200.0))
+@pytest.mark.parametrize("array", [PATCHES, SCATTERED, Array.single()], ids=["patches", "scattered", "single"])
+def test_free_space_follows_friis(array):
+    receiver = Receiver("gateway1", pose((200.0, 200.0, 200.0)), array)
     for distance in (1.0, 3.7, 25.0):
-        transmitter = centre.position + torch.tensor([0.0, 0.0, distance])
-        response = respond(HALL, transmitter[None], centre, FREQUENCY, CARRIER, 0)[0, :, 0]
-        distances = (transmitter.double() - array_elements(centre, WAVELENGTH)).norm(dim=-1)
+        transmitter = receiver.pose.position + torch.tensor([0.0, 0.0, distance])
+        response = respond(HALL, transmitter[None], receiver, FREQUENCY, CARRIER, 0)[0, :, 0]
+        distances = (transmitter.double() - places(receiver)).norm(dim=-1)
         expected = WAVELENGTH / (4 * math.pi * distances) * torch.exp(-2j * math.pi * distances / WAVELENGTH)
         torch.testing.assert_close(response, expected, rtol=1e-6, atol=0)
 
 
 def test_signal_strength_in_free_space():
-    centre = pose((200.0, 200.0, 200.0))
-    transmitters = centre.position + torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, 10.0]])
-    responses = respond(HALL, transmitters, centre, FREQUENCY, CARRIER, 0)
+    receiver = patches((200.0, 200.0, 200.0))
+    transmitters = receiver.pose.position + torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, 10.0]])
+    responses = respond(HALL, transmitters, receiver, FREQUENCY, CARRIER, 0)
     path_loss_db = [20 * math.log10(4 * math.pi * d / WAVELENGTH) for d in (5, 10)]
     assert rss_dbm(responses, tx_power_dbm=20.0).tolist() == pytest.approx(
         [20 - loss for loss in path_loss_db], abs=5e-3
@@ -81,64 +95,64 @@ def test_signal_strength_in_free_space():
     assert rss_dbm(responses)[0] - rss_dbm(responses)[1] == pytest.approx(6.02, abs=1e-2)
 
 
-def test_elements_are_half_a_wavelength_apart_in_the_plane_of_the_array():
-    centre = pose((1.0, 2.0, 0.5), (20, 50, -70))
-    local = centre.local(array_elements(centre, WAVELENGTH).float()) / WAVELENGTH
-    places = {(round(x, 3), round(y, 3), abs(round(z, 3))) for x, y, z in local.tolist()}
-    steps = (-0.75, -0.25, 0.25, 0.75)
-    assert places == {(x, y, 0.0) for x in steps for y in steps}
-
-
 def test_patches_do_not_hear_from_behind_and_fade_as_the_cosine():
-    centre = pose((200.0, 200.0, 200.0), (0, 90, 0))
+    receiver = patches((200.0, 200.0, 200.0), (0, 90, 0))
     angles = torch.tensor([0.0, 60.0, 85.0, 95.0, 180.0]).deg2rad()
     directions = torch.stack((angles.cos(), angles.sin(), 0 * angles), -1)  # the normal points along x
-    transmitters = centre.position + 20 * directions
-    responses = respond(HALL, transmitters, centre, FREQUENCY, CARRIER, 0).abs().mean((1, 2))
+    transmitters = receiver.pose.position + 20 * directions
+    responses = respond(HALL, transmitters, receiver, FREQUENCY, CARRIER, 0).abs().mean((1, 2))
     torch.testing.assert_close(responses / responses[0], angles.cos().clamp(min=0).double(), atol=1e-3, rtol=0)
+
+
+def test_isotropic_elements_hear_alike_from_all_around():
+    receiver = Receiver("gateway1", pose((200.0, 200.0, 200.0), (10, 50, 0)), SCATTERED)
+    directions = from_spherical(torch.linspace(-3, 3, 20), torch.linspace(-1.5, 1.5, 20))
+    responses = respond(HALL, receiver.pose.position + 100 * directions, receiver, FREQUENCY, CARRIER, 0).abs()
+    assert responses.flatten().tolist() == pytest.approx([WAVELENGTH / (4 * math.pi * 100)] * 80, rel=2e-3)
 
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (40, 125, 20), (-100, 60, 170)])
 @pytest.mark.parametrize(("azimuth", "elevation"), [(0, 30), (77, 45), (180, 20), (301, 62), (359, 75)])
 def test_spectrum_peaks_at_the_direction_of_arrival(angles, azimuth, elevation):
-    centre = pose((200.0, 200.0, 200.0), angles)
+    receiver = patches((200.0, 200.0, 200.0), angles)
     direction = from_spherical(*torch.tensor([azimuth, elevation]).deg2rad())
-    transmitter = centre.position + 50 * centre.rotation @ direction
+    transmitter = receiver.pose.position + 50 * receiver.pose.rotation @ direction
     grid = Grid.degrees()
-    spectrum = bartlett(respond(HALL, transmitter[None], centre, FREQUENCY, CARRIER, 0), grid)[0]
-    row, column = divmod(int(spectrum.argmax()), 360)
-    assert (column, row + 1) == (azimuth, elevation)
+    for frequency in (FREQUENCY, 0.7 * FREQUENCY):  # the array stays as it is
+        response = respond(HALL, transmitter[None], receiver, frequency, CARRIER, 0)
+        row, column = divmod(int(bartlett(response, grid, PATCHES, frequency)[0].argmax()), 360)
+        assert (column, row + 1) == (azimuth, elevation)
 
 
-def test_spectrum_is_the_sum_over_steered_elements():
+@pytest.mark.parametrize("array", [PATCHES, SCATTERED, Array.single()], ids=["patches", "scattered", "single"])
+@pytest.mark.parametrize("frequency", [FREQUENCY, 1.1e9])
+def test_spectrum_is_the_sum_over_steered_elements(array, frequency):
     """Against the formula of the labels, element by element in the array's own frame."""
-    generator = torch.Generator().manual_seed(0)
-    centre = pose((2.0, 3.0, 1.0), (10, 40, 80))
-    responses = torch.randn(3, 16, 1, dtype=torch.complex128, generator=generator)
+    responses = np.random.default_rng(0).normal(size=(3, len(array), 2)) @ [1, 1j]
     grid = Grid.degrees((1, 37, 90), (0, 123, 359))
-    local = (array_elements(centre, WAVELENGTH) - centre.position.double()) @ centre.rotation.double()
-    for b, (i, el), (j, az) in itertools.product(
-        range(3), enumerate(grid.elevations.tolist()), enumerate(grid.azimuths.tolist())
-    ):
-        delay = local[:, 0] * math.cos(az) * math.cos(el) + local[:, 1] * math.sin(az) * math.cos(el)
-        expected = (responses[b, :, 0] * torch.exp(-2j * math.pi / WAVELENGTH * delay)).sum().abs()
-        assert bartlett(responses, grid)[b, i, j].item() == pytest.approx(expected.item(), rel=1e-5)
+    spectra = bartlett(torch.from_numpy(responses)[..., None], grid, array, frequency)
+    x, y, z = array.elements.double().numpy().T
+    for (i, el), (j, az) in itertools.product(enumerate(np.deg2rad((1, 37, 90))), enumerate(np.deg2rad((0, 123, 359)))):
+        delay = x * np.cos(az) * np.cos(el) + y * np.sin(az) * np.cos(el) + z * np.sin(el)
+        expected = np.abs(responses @ np.exp(-2j * np.pi * frequency / speed_of_light * delay))
+        np.testing.assert_allclose(spectra[:, i, j], expected, rtol=1e-5)
 
 
 def test_band_spectrum_is_the_mean_power_of_its_frequencies():
     generator = torch.Generator().manual_seed(0)
     responses = torch.randn(2, 16, 5, dtype=torch.complex128, generator=generator)
     grid = Grid.degrees(range(5, 90, 20), range(0, 360, 30))
-    single = torch.stack([bartlett(responses[..., k : k + 1], grid) for k in range(5)])
-    torch.testing.assert_close(bartlett(responses, grid), single.square().mean(0).sqrt())
+    single = torch.stack([bartlett(responses[..., k : k + 1], grid, PATCHES, FREQUENCY) for k in range(5)])
+    torch.testing.assert_close(bartlett(responses, grid, PATCHES, FREQUENCY), single.square().mean(0).sqrt())
 
 
 def test_a_wide_band_adds_powers_of_paths_and_a_carrier_their_fields():
     generator = torch.Generator().manual_seed(0)
     transmitters = 0.5 + torch.tensor([6.0, 4.0, 2.0]) * torch.rand(60, 3, generator=generator)
     room, centre = Room(ROOM.size, WALLS), pose(RECEIVER.tolist(), (45, 120, 0))
+    receiver = Receiver("gateway1", centre, Array.planar(4, 4, speed_of_light / 6e9 / 2, "cosine"))
     band, carrier = (
-        rss_dbm(respond(room, transmitters, centre, 6e9, offsets, 2))
+        rss_dbm(respond(room, transmitters, receiver, 6e9, offsets, 2))
         for offsets in (frequency_offsets(room, 2e9, 2), CARRIER)
     )
     paths = trace(room, transmitters, centre.position, 6e9, 2)
@@ -278,13 +292,14 @@ def test_channel_is_reciprocal():
 @pytest.mark.parametrize("angles", [(90, 0, 0), (33, 71, -140)])
 def test_turning_everything_in_free_space_changes_nothing(angles):
     turn = torch.tensor(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix(), dtype=torch.float32)
-    first = pose((200.0, 200.0, 200.0), (40, 125, 20))
-    turned = Pose(first.position, turn @ first.rotation)
+    first = patches((200.0, 200.0, 200.0), (40, 125, 20))
+    position = first.pose.position
+    turned = Receiver("turned", Pose(position, turn @ first.pose.rotation), PATCHES)
     offset = torch.tensor([[1.0, 0.7, -2.0], [3.0, -1.0, 0.5]])
     grid = Grid.degrees(range(1, 91, 4), range(0, 360, 10))
     here, there = (
-        bartlett(respond(HALL, first.position + r, p, FREQUENCY, CARRIER, 0), grid)
-        for r, p in ((offset, first), (offset @ turn.T, turned))
+        bartlett(respond(HALL, position + r, receiver, FREQUENCY, CARRIER, 0), grid, PATCHES, FREQUENCY)
+        for r, receiver in ((offset, first), (offset @ turn.T, turned))
     )
     torch.testing.assert_close(here, there, rtol=1e-3, atol=1e-3 * here.max().item())
 
@@ -304,13 +319,15 @@ def test_turning_room_receiver_and_transmitters_changes_nothing():
     second = Pose(move(first.position).float(), turn.float() @ first.rotation)
     grid = Grid.degrees(range(1, 91, 4), range(0, 360, 10))
     offsets = frequency_offsets(ROOM, 200e6, 2)
-    here = bartlett(respond(ROOM, TRANSMITTERS, first, FREQUENCY, offsets, 2), grid)
-    there = bartlett(respond(turned, move(TRANSMITTERS), second, FREQUENCY, offsets, 2), grid)
+
+    def spectra(room, transmitters, pose):
+        responses = respond(room, transmitters, Receiver("gateway1", pose, PATCHES), FREQUENCY, offsets, 2)
+        return bartlett(responses, grid, PATCHES, FREQUENCY)
+
+    here, there = spectra(ROOM, TRANSMITTERS, first), spectra(turned, move(TRANSMITTERS), second)
     torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4 * here.max().item())
     # The receiver left behind sees something else.
-    other = bartlett(
-        respond(turned, move(TRANSMITTERS), Pose(second.position, first.rotation), FREQUENCY, offsets, 2), grid
-    )
+    other = spectra(turned, move(TRANSMITTERS), Pose(second.position, first.rotation))
     assert (here - other).abs().max() > 0.1 * here.max()
 
 
@@ -360,7 +377,7 @@ def test_labels_span_zero_to_one():
         ({"order": -1}, "order must be the largest number of reflections, 0 or more, got -1"),
         ({"transmitters": torch.tensor([[1.0, 1.0, 3.5]])}, r"inside the room of .* got \[1\.0, 1\.0, 3\.5\]"),
         ({"transmitters": torch.tensor([[3.2, 2.7, 1.0]])}, r"outside its furniture, got \[3\.2, 2\.7, 1\.0\]"),
-        ({"pose": pose((3.2, 2.7, 1.0))}, "outside its furniture"),
+        ({"receiver": patches((3.2, 2.7, 1.0))}, "outside its furniture"),
         ({"transmitters": torch.tensor([[math.nan, 1.0, 1.0]])}, "inside the room"),
     ],
 )
@@ -368,7 +385,7 @@ def test_impossible_scenes_are_refused(change, message):
     scene = {
         "room": ROOM,
         "transmitters": TRANSMITTERS,
-        "pose": pose(RECEIVER.tolist()),
+        "receiver": patches(RECEIVER.tolist()),
         "frequency": FREQUENCY,
         "offsets": CARRIER,
         "order": 1,

@@ -4,27 +4,29 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.data import Links, Receiver, Split
+from gaigs.data import Links, Split
 from gaigs.geometry import Pose
 from gaigs.model.path_loss import PathLoss
-from gaigs.testing import example_links
+from gaigs.query import Query
+from gaigs.scene import Receiver
+from gaigs.task.rssi import Rssi
+from gaigs.task.scalar import Scalar
+from gaigs.testing import check_model, example_links
 
 GATEWAYS = torch.tensor([[0.0, 0.0, 2.5], [6.0, 1.0, 1.0]])
 
 
-def make(transmitters, labels, receiver_index=None):
+def make(transmitters, labels, heard_by=None, task=None):
     """Links to two gateways, each with all transmitters unless told; the last three are held out for the test."""
-    if receiver_index is None:
-        receiver_index = torch.arange(2).repeat_interleave(len(transmitters) // 2)
+    if heard_by is None:
+        heard_by = torch.arange(2).repeat_interleave(len(transmitters) // 2)
     n = len(transmitters)
     return Links(
-        transmitters=transmitters,
+        query=Query(transmitters, heard_by),
         receivers=tuple(Receiver(f"gateway{i}", Pose(position, torch.eye(3))) for i, position in enumerate(GATEWAYS)),
-        receiver_index=receiver_index,
         labels=labels.float(),
+        task=task or Rssi(),
         split=Split("made up", torch.arange(n - 6), torch.arange(n - 6, n - 3), torch.arange(n - 3, n)),
-        grid=None,
-        normalisation="dBm",
     )
 
 
@@ -115,13 +117,29 @@ def test_the_state_dict_has_it_all(places):
         assert torch.equal(model.predict(places, receiver), twin.predict(places, receiver))
 
 
-def test_spectra_are_refused():
-    with pytest.raises(ValueError, match=r"must have one RSSI a link as label, got spectra of 18 x 36 pixels"):
-        PathLoss(example_links().scene)
+class PathGain(Scalar):
+    """One real number a link of another unit."""
+
+    name, quantity, unit, error_unit = "path_gain", "path gain", "dB", "dB"
+
+
+def test_any_real_number_a_link_will_do(places):
+    links = make(places, torch.cat((law(places[:30], 0, -40, 2.7), law(places[30:], 1, -52, 1.6))), task=PathGain())
+    assert fitted(links).exponents.tolist() == pytest.approx([2.7, 1.6], abs=1e-3)
+
+
+@pytest.mark.parametrize(("task", "words"), [("spectrum", r"amplitude of shape \(18, 36\)"), ("csi", "channel of")])
+def test_more_than_a_real_number_is_refused(task, words):
+    with pytest.raises(ValueError, match=f"must have one real number a link as label, got {words}"):
+        PathLoss(example_links(task).scene)
+
+
+def test_it_keeps_the_contract_of_models():
+    check_model(PathLoss, example_links("rssi"))
 
 
 def test_a_receiver_without_known_links_is_refused(places):
     links = make(places, torch.zeros(60), torch.zeros(60, dtype=torch.long))
-    links.receiver_index[-3:] = 1  # heard, but in the test alone
+    links.query.receivers[-3:] = 1  # heard, but in the test alone
     with pytest.raises(ValueError, match="'made up' there are none of gateway1; choose another split"):
         fitted(links)

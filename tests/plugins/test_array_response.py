@@ -7,15 +7,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.constants import speed_of_light
 
-from gaigs.data import Grid
 from gaigs.data.synthetic.image_source import bartlett, min_max
-from gaigs.model import Batch
+from gaigs.directions import Grid, Rays
+from gaigs.query import Batch, Query
 from gaigs.registry import registry
+from gaigs.scene import Array
+from gaigs.task.spectrum import Spectrum
 from gaigs.testing import check_model, example_links
 
 ROOT = Path(__file__).parents[2]
 SCENE = example_links().scene
+GRID = SCENE.task.directions
 SOMEWHERE = torch.tensor([[1.0, 2.0, 0.5], [3.0, 1.0, 1.5]])
 OPTIONS = {"rows": 4, "columns": 4, "pitch": 0.5, "octaves": [-1, 1], "width": 16, "layers": 1}
 
@@ -33,6 +37,11 @@ def build(monkeypatch):
     return build
 
 
+def seen_in(grid):
+    """The scene with labels in other directions."""
+    return replace(SCENE, task=Spectrum(grid.elevations, grid.azimuths, "none"))
+
+
 def answering(model, fields):
     """The model, its network made to answer with given fields (elements,) at every receiver."""
     last = model.network[-1]
@@ -48,15 +57,16 @@ def test_it_keeps_the_contract_of_models(build):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_label_is_the_simulators_for_the_same_fields(build, seed):
-    scene = replace(SCENE, grid=Grid.degrees())
+    grid, array = Grid.degrees(), Array.planar(4, 4, 0.5)
     fields = torch.randn(16, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed))
-    predicted = answering(build(scene), fields).predict(SOMEWHERE[:1])
-    expected = min_max(bartlett(fields[None, :, None], scene.grid)).float()
+    predicted = answering(build(seen_in(grid)), fields).predict(SOMEWHERE[:1])
+    # In units of wavelengths, at the frequency at which a wavelength is 1 m.
+    expected = min_max(bartlett(fields[None, :, None], grid, array, speed_of_light)).float()
     torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-5)
 
 
 def test_columns_lie_along_x_and_rows_along_y(build):
-    scene = replace(SCENE, grid=Grid.degrees(range(1, 90, 8), range(0, 360, 15)))
+    scene = seen_in(Grid.degrees(range(1, 90, 8), range(0, 360, 15)))
     fields = torch.randn(5, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
     along_x, along_y = (
         answering(build(scene, rows=rows, columns=columns), fields).predict(SOMEWHERE[:1])[0]
@@ -70,7 +80,7 @@ def test_columns_lie_along_x_and_rows_along_y(build):
 
 def test_at_a_pitch_of_one_wavelength_lobes_repeat(build):
     # cos az cos el is 1/2 and -1/2 there: one period of the pattern, 1 / pitch, apart.
-    scene = replace(SCENE, grid=Grid.degrees([60, 1, 90], [0, 90, 180]))
+    scene = seen_in(Grid.degrees([60, 1, 90], [0, 90, 180]))
     fields = torch.randn(16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
     spectra = [answering(build(scene, pitch=p), fields).predict(SOMEWHERE[:1])[0] for p in (1.0, 0.5)]
     apart = [abs(float(spectrum[0, 0] - spectrum[0, 2])) for spectrum in spectra]
@@ -79,15 +89,15 @@ def test_at_a_pitch_of_one_wavelength_lobes_repeat(build):
 
 def test_the_gradient_is_that_of_the_plain_formula(build):
     model = build().double()
-    grid = Grid(SCENE.grid.elevations.double(), SCENE.grid.azimuths.double())
-    batch = Batch(SOMEWHERE.double(), 1, grid)
+    grid = GRID.to(torch.float64)
+    batch = Batch(Query(SOMEWHERE.double(), torch.tensor([1, 1])), grid)
     weights = torch.randn(2, *grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
     outputs = []
     hook = model.network.register_forward_hook(lambda module, inputs, output: outputs.append(output))
-    label = model(batch).label
+    value = model(batch).value
     hook.remove()
-    (found,) = torch.autograd.grad((label * weights).sum(), outputs[0])
+    (found,) = torch.autograd.grad((value * weights).sum(), outputs[0])
 
     again = outputs[0].detach().requires_grad_()
     fields = torch.complex(*again.unflatten(1, (2, 2, 16))[:, 1].unbind(1))
@@ -97,7 +107,7 @@ def test_the_gradient_is_that_of_the_plain_formula(build):
     along_y = torch.exp(-1j * math.pi * steps[:, None, None] * azimuths.sin() * elevations.cos())
     plain = min_max(torch.einsum("bij,iac,jac->bac", fields.unflatten(1, (4, 4)), along_x, along_y).abs())
     (expected,) = torch.autograd.grad((plain * weights).sum(), again)
-    torch.testing.assert_close(label, plain, rtol=0, atol=1e-6)
+    torch.testing.assert_close(value, plain, rtol=0, atol=1e-6)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
 
 
@@ -114,6 +124,34 @@ def test_options_out_of_range(build, options, message):
         build(**options)
 
 
-def test_labels_that_are_no_spectra(build):
+@pytest.mark.parametrize("task", ["rssi", "csi"])
+def test_labels_that_are_no_spectra(build, task):
     with pytest.raises(ValueError, match="predicts spectra"):
-        build(replace(SCENE, grid=None))
+        build(example_links(task).scene)
+
+
+def test_an_array_in_wavelengths_has_one_carrier(build):
+    build(replace(SCENE, frequencies=torch.tensor([1e9])))
+    with pytest.raises(ValueError, match="of one carrier, and these links have 2"):
+        build(replace(SCENE, frequencies=torch.tensor([1e9, 2e9])))
+
+
+def test_any_directions_get_the_arrays_answer(build):
+    fields = torch.randn(16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    model = answering(build(), fields)
+    (whole,), query = model.predict(SOMEWHERE[:1]), Query(SOMEWHERE[:1], torch.tensor([0]))
+    chosen = torch.tensor([600, 3, 77, 3])
+    (rays,) = model(Batch(query, GRID.flatten()[chosen])).value
+    torch.testing.assert_close(rays, whole.flatten()[chosen], rtol=0, atol=1e-5)
+    (unasked,) = model(Batch(query)).value
+    assert torch.equal(unasked, whole)
+    # Between pixels, and below the horizon, where a planar array sees the mirror image of what is above.
+    elevations, azimuths = torch.tensor([0.3, -0.3, 1.0]), torch.tensor([0.123, 0.123, 4.0])
+    (between,) = model(Batch(query, Rays(elevations, azimuths))).value
+    steps = torch.cartesian_prod(torch.arange(4) - 1.5, torch.arange(4) - 1.5)
+    cosines = torch.stack((azimuths.cos() * elevations.cos(), azimuths.sin() * elevations.cos()))
+    amplitudes = lambda cosines: (fields[:, None] * torch.exp(-1j * math.pi * (steps @ cosines))).sum(0).abs()
+    pixels = GRID.flatten().vectors()[:, :2].T
+    low, high = amplitudes(pixels).aminmax()
+    torch.testing.assert_close(between, (amplitudes(cosines) - low) / (high - low), rtol=0, atol=1e-4)
+    assert between[0] == between[1]

@@ -5,7 +5,9 @@ import math
 import pytest
 import torch
 
+from gaigs.directions import Grid
 from gaigs.pooling.softmax_attention import SoftmaxAttention
+from gaigs.query import Query
 from gaigs.registry import registry
 
 LEARN = pytest.mark.parametrize("learn", [False, True])
@@ -20,10 +22,19 @@ def paper(image, temperature, prior):
     return 10 * (weights * m).sum(1)
 
 
+def attention(temperature, prior, learn=False):
+    return SoftmaxAttention([6, 9], temperature, prior, learn)
+
+
+def pool(pooling, image):
+    """What the pooling gives for maps; it looks at no query."""
+    return pooling(image, Query(torch.full((len(image), 3), torch.nan), torch.zeros(len(image), dtype=torch.long)))
+
+
 def graded(pooling, image):
     """Label and gradients of a map, in its dtype."""
     image = image.detach().requires_grad_()
-    label = pooling(image)
+    label = pool(pooling, image)
     label.sum().backward()
     return label.detach(), image.grad
 
@@ -38,69 +49,69 @@ def image():
 def test_it_is_the_formula_of_the_paper(image, temperature, prior, learn):
     if learn and prior == 0:
         prior = 1e-3
-    pooling = SoftmaxAttention(temperature, prior, learn)
-    torch.testing.assert_close(pooling(image).double(), paper(image, temperature, prior), rtol=1e-5, atol=1e-5)
+    pooling = attention(temperature, prior, learn)
+    torch.testing.assert_close(pool(pooling, image).double(), paper(image, temperature, prior), rtol=1e-5, atol=1e-5)
 
 
 def test_a_map_in_bels_gives_a_label_in_decibels():
-    assert SoftmaxAttention(0.5, 0.2)(torch.full((2, 1, 4, 5), -3.0)).tolist() == pytest.approx([-30, -30])
+    assert pool(attention(0.5, 0.2), torch.full((2, 1, 4, 5), -3.0)).tolist() == pytest.approx([-30, -30])
 
 
 def test_a_louder_map_is_louder_by_as_much(image):
-    pooling = SoftmaxAttention(0.5, 0.2)
-    torch.testing.assert_close(pooling(image + 2), pooling(image) + 20)
+    pooling = attention(0.5, 0.2)
+    torch.testing.assert_close(pool(pooling, image + 2), pool(pooling, image) + 20)
 
 
 def test_attention_is_proportional_to_power_at_the_default_temperature(image):
     m = image.double().flatten(1)
     expected = 10 * (m * 10**m).sum(1) / (10**m).sum(1)
-    torch.testing.assert_close(SoftmaxAttention(1 / math.log(10), 0)(image).double(), expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(pool(attention(1 / math.log(10), 0), image).double(), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_limits(image):
     mean, most = 10 * image.mean((1, 2, 3)), 10 * image.amax((1, 2, 3))
     for pooling, limit in (
-        (SoftmaxAttention(0.434, 1), mean),
-        (SoftmaxAttention(1e6, 0), mean),
-        (SoftmaxAttention(1e-6, 0), most),
-        (SoftmaxAttention(1e-6, 0.25), 0.75 * most + 0.25 * mean),
+        (attention(0.434, 1), mean),
+        (attention(1e6, 0), mean),
+        (attention(1e-6, 0), most),
+        (attention(1e-6, 0.25), 0.75 * most + 0.25 * mean),
     ):
-        torch.testing.assert_close(pooling(image), limit, rtol=1e-5, atol=1e-4)
+        torch.testing.assert_close(pool(pooling, image), limit, rtol=1e-5, atol=1e-4)
 
 
 def test_the_order_of_pixels_does_not_matter(image):
     order = torch.randperm(54, generator=torch.Generator().manual_seed(1))
-    pooling = SoftmaxAttention(0.434, 0.1)
+    pooling = attention(0.434, 0.1)
     shuffled = image.flatten(1)[:, order].reshape(3, 1, 9, 6)
-    torch.testing.assert_close(pooling(shuffled), pooling(image))
+    torch.testing.assert_close(pool(pooling, shuffled), pool(pooling, image))
 
 
 def test_the_prior_gives_every_pixel_a_gradient():
     image = torch.zeros(1, 1, 3, 4)
     image[..., 0, 0] = 1e3
     for prior in (0, 0.24):
-        _, gradient = graded(SoftmaxAttention(0.434, prior), image)
+        _, gradient = graded(attention(0.434, prior), image)
         assert gradient[0, 0, 1:].flatten().tolist() == pytest.approx([10 * prior / 12] * 8)
 
 
 @LEARN
 def test_gradients_are_the_derivatives(image, learn):
-    pooling = SoftmaxAttention(0.434, 0.1, learn).double()
+    pooling = attention(0.434, 0.1, learn).double()
     leaves = [image[:, :, :3, :4].double().requires_grad_(), *pooling.parameters()]
     assert len(leaves) == (3 if learn else 1)
-    assert torch.autograd.gradcheck(lambda image, *_: pooling(image), leaves)
+    assert torch.autograd.gradcheck(lambda image, *_: pool(pooling, image), leaves)
 
 
 @LEARN
 def test_a_constant_map_pulls_all_pixels_alike(learn):
     for level in (0.0, -7.0, 1e6):
-        label, gradient = graded(SoftmaxAttention(0.434, 0.1, learn), torch.full((2, 1, 4, 5), level))
+        label, gradient = graded(attention(0.434, 0.1, learn), torch.full((2, 1, 4, 5), level))
         torch.testing.assert_close(label, torch.full((2,), 10 * level))
         torch.testing.assert_close(gradient, torch.full((2, 1, 4, 5), 10 / 20))
 
 
 def test_one_pixel_is_its_level():
-    label, gradient = graded(SoftmaxAttention(0.434, 0.1), torch.tensor([-2.0, 0, 1e6]).reshape(3, 1, 1, 1))
+    label, gradient = graded(attention(0.434, 0.1), torch.tensor([-2.0, 0, 1e6]).reshape(3, 1, 1, 1))
     torch.testing.assert_close(label, torch.tensor([-20.0, 0, 1e7]))
     torch.testing.assert_close(gradient, torch.full((3, 1, 1, 1), 10.0))
 
@@ -108,22 +119,22 @@ def test_one_pixel_is_its_level():
 @pytest.mark.parametrize("sign", [1, -1])
 def test_twelve_decades_against_float64(sign):
     image = sign * torch.logspace(-6, 6, 60).reshape(1, 1, 6, 10)
-    pooling = SoftmaxAttention(0.434, 0.1)
+    pooling = attention(0.434, 0.1)
     label, gradient = graded(pooling, image)
-    twin, twin_gradient = graded(SoftmaxAttention(0.434, 0.1).double(), image.double())
+    twin, twin_gradient = graded(attention(0.434, 0.1).double(), image.double())
     torch.testing.assert_close(label.double(), twin, rtol=1e-5, atol=0)
     torch.testing.assert_close(gradient.double(), twin_gradient, rtol=1e-4, atol=1e-6)
 
 
 def test_one_deep_hole_does_not_blur_the_attention():
     image = torch.tensor([0.0, 1.0, 2.0, -1e9]).reshape(1, 1, 2, 2)
-    label, _ = graded(SoftmaxAttention(0.434, 0), image)
-    torch.testing.assert_close(label, SoftmaxAttention(0.434, 0)(image[..., :3].flatten()[None, None, None, :3]))
+    label, _ = graded(attention(0.434, 0), image)
+    torch.testing.assert_close(label, pool(attention(0.434, 0), image[..., :3].flatten()[None, None, None, :3]))
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_averaged_in_float32(image, dtype):
-    pooling = SoftmaxAttention(0.434, 0.1)
+    pooling = attention(0.434, 0.1)
     image = (image - 10).to(dtype)
     label, gradient = graded(pooling, image)
     true, true_gradient = graded(pooling, image.float())
@@ -137,24 +148,24 @@ def test_half_precision_is_averaged_in_float32(image, dtype):
 @pytest.mark.parametrize("target", [-100.0, 100.0])
 @pytest.mark.parametrize("rate", [0.01, 10.0])
 def test_training_moves_temperature_and_prior_within_their_ranges(target, rate):
-    pooling = SoftmaxAttention(0.434, 0.1, learn=True)
+    pooling = attention(0.434, 0.1, learn=True)
     image = torch.tensor([0.0, 1.0, 2.0, 3.0]).reshape(1, 1, 2, 2)
-    before = pooling(image).item(), pooling.temperature.item(), pooling.prior.item()
+    before = pool(pooling, image).item(), pooling.temperature.item(), pooling.prior.item()
     optimizer = torch.optim.SGD(pooling.parameters(), lr=rate)
     for _ in range(20):
         optimizer.zero_grad()
-        (pooling(image) - target).abs().sum().backward()
+        (pool(pooling, image) - target).abs().sum().backward()
         optimizer.step()
         assert 0 < pooling.temperature < torch.inf
         assert 0 <= pooling.prior <= 1
-    label, temperature, prior = pooling(image).item(), pooling.temperature.item(), pooling.prior.item()
+    label, temperature, prior = pool(pooling, image).item(), pooling.temperature.item(), pooling.prior.item()
     louder = target > before[0]
     assert [label > before[0], temperature < before[1], prior < before[2]] == [louder] * 3
 
 
 def test_options_that_are_not_learnt_are_stored_as_well():
-    other = SoftmaxAttention(2.0, 0.5)
-    other.load_state_dict(SoftmaxAttention(0.434, 0.1).state_dict())
+    other = attention(2.0, 0.5)
+    other.load_state_dict(attention(0.434, 0.1).state_dict())
     assert not list(other.parameters())
     assert (other.temperature.item(), other.prior.item()) == pytest.approx((0.434, 0.1))
 
@@ -174,6 +185,20 @@ def test_options_that_are_not_learnt_are_stored_as_well():
     ],
 )
 def test_options_out_of_range_are_refused(options, message):
-    config = {"name": "softmax_attention", "temperature": 0.434, "prior": 0.1, **options}
+    config = {"name": "softmax_attention", "grid": [4, 8], "temperature": 0.434, "prior": 0.1, **options}
     with pytest.raises(ValueError, match=message):
         registry("pooling").build(config)
+
+
+@pytest.mark.parametrize("grid", [4, [4], [4, 8, 2], [4.0, 8.0], [True, 8], "48", None])
+def test_a_grid_is_two_whole_numbers(grid):
+    with pytest.raises(ValueError, match=r"pooling.grid must be \[rows, columns\], two whole numbers, got "):
+        SoftmaxAttention(grid, 0.434, 0.1)
+
+
+def test_its_grid_is_the_sphere_in_equal_pixels():
+    grid = SoftmaxAttention([4, 8], 0.434, 0.1).grid
+    assert grid.shape == (4, 8)
+    torch.testing.assert_close(grid.vectors(), Grid.sphere(4, 8).vectors())
+    with pytest.raises(ValueError, match="at least 2 rows and 3 columns, got 1 x 8"):
+        SoftmaxAttention([1, 8], 0.434, 0.1)

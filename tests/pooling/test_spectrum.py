@@ -4,22 +4,25 @@ import pytest
 import torch
 
 from gaigs.pooling.spectrum import Spectrum
+from gaigs.query import Query
+
+QUERY = Query(torch.zeros(3, 3), torch.zeros(3, dtype=torch.long))
 
 
 def test_two_channels_are_the_magnitude_of_a_complex_number():
     image = torch.randn(3, 2, 4, 5)
-    torch.testing.assert_close(Spectrum(2)(image), torch.complex(image[:, 0], image[:, 1]).abs())
+    torch.testing.assert_close(Spectrum(2)(image, QUERY), torch.complex(image[:, 0], image[:, 1]).abs())
 
 
 def test_one_channel_is_its_magnitude():
     image = torch.randn(3, 1, 4, 5)
-    assert torch.equal(Spectrum(1)(image), image[:, 0].abs())
+    assert torch.equal(Spectrum(1)(image, QUERY), image[:, 0].abs())
 
 
 @pytest.mark.parametrize("channels", [1, 2])
 def test_silence_has_a_finite_gradient(channels):
     image = torch.zeros(2, channels, 3, 3, requires_grad=True)
-    Spectrum(channels)(image).sum().backward()
+    Spectrum(channels)(image, QUERY[:2]).sum().backward()
     assert torch.equal(image.grad, torch.zeros_like(image))
 
 
@@ -27,3 +30,7 @@ def test_silence_has_a_finite_gradient(channels):
 def test_other_numbers_of_channels_are_refused(channels):
     with pytest.raises(ValueError, match=f"1 real or 2 complex channels, got channels={channels}"):
         Spectrum(channels)
+
+
+def test_it_is_rendered_in_the_directions_asked_for():
+    assert Spectrum(2).grid is None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gaigs.directions import Grid
 from gaigs.geometry import Pose, from_spherical
 from gaigs.projection.mercator import Mercator
 
@@ -26,7 +27,7 @@ def test_it_is_the_papers_logarithm_scaled_to_the_limit(limit):
 @pytest.mark.parametrize("limit", [60.0, 85.0511287798066, 89.0])
 def test_the_plane_is_as_high_as_it_is_wide(limit):
     elevations = torch.tensor([-90, -limit, 0, limit, 90], dtype=torch.float64).deg2rad()
-    plane = Mercator(0.01, limit).plane(elevations, torch.zeros(1))
+    plane = Mercator(0.01, limit).plane(Grid(elevations, torch.zeros(1)))
     torch.testing.assert_close(plane.v.flatten(), torch.tensor([-1, -1, 0, 1, 1], dtype=torch.float64) * math.pi)
     assert plane.period == 2 * math.pi
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gaigs.data import Grid
+from gaigs.directions import Grid, Rays
 from gaigs.geometry import Pose, from_spherical
 from gaigs.projection.direction_cosine import DirectionCosine
 from gaigs.projection.equirectangular import Equirectangular
@@ -33,7 +33,7 @@ def draw(projection, means, covariances, pose=HERE, grid=None):
     """The map of Gaussians that all send 1 at opacity 0.5."""
     grid = grid or Grid.degrees()
     n = len(means)
-    plane = projection.plane(grid.elevations, grid.azimuths)
+    plane = projection.plane(grid)
     splats = projection.project(means, covariances, pose)
     image, _ = TorchRasterizer()(splats, torch.ones(1, n, 1), torch.full((1, n), 0.5), None, plane)
     return image[0, 0]
@@ -153,3 +153,59 @@ def test_a_pixel_of_no_width_is_refused(kind, pixel):
 def test_a_limit_at_the_pole_or_beyond_is_refused(kind, limit):
     with pytest.raises(ValueError, match=f"between 0 and 90 degrees, got {limit}"):
         kind(PIXEL, limit)
+
+
+# --- lists of rays ---
+
+
+def scattered(n, dtype=torch.float32):
+    """Rays all over the upper hemisphere, some of them at its edges and at the seam."""
+    generator = torch.Generator().manual_seed(0)
+    azimuths = math.tau * torch.rand(n, generator=generator, dtype=dtype) - math.pi
+    elevations = math.pi / 2 * torch.rand(n, generator=generator, dtype=dtype)
+    azimuths[:3] = torch.tensor([math.pi, -math.pi, 0], dtype=dtype)
+    elevations[:3] = torch.tensor([0.3, 0.0, math.pi / 2], dtype=dtype)
+    return Rays(elevations, azimuths)
+
+
+@every
+def test_rays_lie_where_their_directions_do(kind):
+    rays = scattered(50, torch.float64)
+    plane = kind(PIXEL).plane(rays)
+    assert plane.shape == (1, 50)
+    u, v = kind(PIXEL).coordinates(rays.vectors()).unbind(-1)
+    torch.testing.assert_close(plane.v[0], v)
+    turns = (plane.u[0] - u) / (plane.period or math.inf)
+    torch.testing.assert_close(turns, turns.round())
+    if plane.period is None:
+        torch.testing.assert_close(plane.u[0], u)
+
+
+@every
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_planes_keep_the_directions_dtype(kind, dtype):
+    grid = Grid.degrees(range(5, 80, 20), range(0, 360, 60)).to(dtype)
+    for directions in (grid, grid.flatten()):
+        plane = kind(PIXEL).plane(directions)
+        assert plane.u.dtype == plane.v.dtype == dtype
+
+
+@every
+def test_a_map_of_rays_is_that_of_the_pixels(kind):
+    generator = torch.Generator().manual_seed(0)
+    grid = Grid.degrees(range(2, 91, 8), range(0, 360, 15))
+    n, projection = 30, kind(grid.pitch)
+    means = 3 * torch.randn(n, 3, generator=generator)
+    splats = projection.project(means, ball(n, 0.5), HERE)
+    others = torch.randn(2, n, 3, generator=generator), torch.rand(2, n, generator=generator), None
+    whole, left = TorchRasterizer()(splats, *others, projection.plane(grid))
+    chosen = torch.randperm(12 * 24, generator=generator)[:40]
+    image, passed = TorchRasterizer()(splats, *others, projection.plane(grid.flatten()[chosen]))
+    assert image.shape == (2, 3, 1, 40)
+    torch.testing.assert_close(image[:, :, 0], whole.flatten(2)[:, :, chosen], rtol=0, atol=1e-5)
+    torch.testing.assert_close(passed[:, 0], left.flatten(1)[:, chosen], rtol=0, atol=1e-5)
+
+
+@every
+def test_no_rays_have_an_empty_plane(kind):
+    assert kind(PIXEL).plane(scattered(9)[:0]).shape == (1, 0)

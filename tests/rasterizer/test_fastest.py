@@ -10,6 +10,7 @@ from gaigs.rasterizer.fastest import FastestRasterizer
 from gaigs.rasterizer.torch import TorchRasterizer
 
 opencl = pytest.importorskip("gaigs.rasterizer.opencl", exc_type=ImportError)
+_devices = pytest.importorskip("gaigs.rasterizer._devices", exc_type=ImportError)
 
 
 def scene(n=12, dtype=torch.float32, channels=2, attenuations=None):
@@ -26,6 +27,7 @@ def fastest():
     return rasterizer
 
 
+@pytest.mark.usefixtures("opencl_works")
 def test_is_opencl_where_that_suits(fastest):
     image, _ = fastest(*scene())
     assert fastest.used == f"opencl on {opencl.default_device()}"
@@ -35,13 +37,14 @@ def test_is_opencl_where_that_suits(fastest):
 @pytest.mark.parametrize(
     "options",
     [
-        {"channels": 9},
+        {"channels": 0},
         {"dtype": torch.float64},
         {"attenuations": torch.full((3, 12), 0.5, dtype=torch.float64)},
         {"n": 13},
     ],
     ids=str,
 )
+@pytest.mark.usefixtures("opencl_works")
 def test_is_torch_for_what_opencl_refuses(options, fastest, monkeypatch):
     monkeypatch.setattr(opencl, "SPLATS", 13)  # a scene of 2^24 takes seconds
     arguments = scene(**options)
@@ -56,6 +59,7 @@ def test_is_torch_for_what_opencl_refuses(options, fastest, monkeypatch):
     assert torch.equal(left, same_left)
 
 
+@pytest.mark.usefixtures("opencl_works")
 def test_leaves_what_nobody_can_render_to_who_says_so_best(fastest):
     splats, signal, opacities, *others = scene()
     with pytest.raises(ValueError, match=r"opacities must be \(3, 12\)"):
@@ -66,7 +70,7 @@ def test_is_torch_where_a_driver_is_broken(monkeypatch, caplog):
     def fail(*_):
         raise opencl.cl.LogicError("clCreateContext failed: INVALID_DEVICE")
 
-    opencl._open.cache_clear()
+    _devices._open.cache_clear()
     monkeypatch.setattr(opencl.cl, "Context", fail)
     with caplog.at_level(logging.INFO):
         fastest = FastestRasterizer()
@@ -74,3 +78,11 @@ def test_is_torch_where_a_driver_is_broken(monkeypatch, caplog):
     assert "cannot be opened (clCreateContext failed: INVALID_DEVICE); mend its driver" in caplog.text
     fastest(*scene())
     assert fastest.used == "torch"
+
+
+@pytest.mark.usefixtures("opencl_works")
+@pytest.mark.parametrize("channels", [1, 8, 9, 40])
+def test_is_opencl_for_any_number_of_channels(fastest, channels):
+    image, _ = fastest(*scene(channels=channels))
+    assert fastest.used.startswith("opencl on ")
+    torch.testing.assert_close(image, TorchRasterizer()(*scene(channels=channels))[0], rtol=0, atol=1e-5)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from reference import margin, rasterize
 
-from gaigs.data import Grid
+from gaigs.directions import Grid
 from gaigs.geometry import Pose, from_spherical
 from gaigs.projection import Plane, Splats
 from gaigs.projection.direction_cosine import DirectionCosine
@@ -21,9 +21,13 @@ from gaigs.projection.equirectangular import Equirectangular
 from gaigs.projection.mercator import Mercator
 from gaigs.rasterizer import torch as module
 from gaigs.rasterizer.torch import TorchRasterizer
-from gaigs.testing import rasterize_densely
+from gaigs.testing.rasterizer import rasterize_densely
 
 GRID = Grid.degrees(range(1, 91, 3), [0.3 + 6 * k for k in range(60)])
+DIRECTIONS = {
+    "grid": GRID,
+    "rays": GRID.flatten()[torch.randperm(1800, generator=torch.Generator().manual_seed(0))[:70]],
+}
 HERE = Pose(torch.zeros(3), torch.eye(3))
 PLACES = {
     "anywhere": lambda uniform, n: from_spherical(uniform(0, math.tau, n), uniform(-0.5, 1.57, n)),
@@ -37,7 +41,16 @@ PROJECTIONS = {"mercator": Mercator, "equirectangular": Equirectangular, "direct
 
 
 def scene(
-    place="anywhere", projection="mercator", n=40, b=2, own=False, attenuations=True, opacity=(0.0, 1.0), size=0.3
+    place="anywhere",
+    projection="mercator",
+    n=40,
+    b=2,
+    own=False,
+    attenuations=True,
+    opacity=(0.0, 1.0),
+    size=0.3,
+    directions="grid",
+    channels=2,
 ):
     """Arguments of a rasterizer: Gaussians about a receiver, on its plane."""
     generator = torch.Generator().manual_seed(n)
@@ -46,8 +59,8 @@ def scene(
     means = PLACES[place](uniform, n) * uniform(0.5, 4, n, 1)
     half = size * torch.randn(b if own else 1, n, 3, 3, generator=generator)
     splats = projection.project(means, half @ half.mT, HERE)
-    plane = projection.plane(GRID.elevations, GRID.azimuths)
-    signal = torch.randn(b, n, 2, generator=generator)
+    plane = projection.plane(DIRECTIONS[directions])
+    signal = torch.randn(b, n, channels, generator=generator)
     return splats, signal, uniform(*opacity, b, n), uniform(0.2, 1, b, n) if attenuations else None, plane
 
 
@@ -140,6 +153,9 @@ def test_values_and_gradients_are_those_of_the_formula(place, projection):
         {"opacity": (1.0, 1.0), "size": 1.0},
         {"opacity": (0.0, 0.01)},
         {"n": 120, "size": 0.1},
+        {"channels": 19, "own": True},
+        {"directions": "rays"},
+        {"directions": "rays", "projection": "direction_cosine", "own": True},
     ],
     ids=str,
 )
@@ -232,7 +248,7 @@ def test_nan_shows_in_the_map(name):
 
 MEMORY = """
 import resource, torch
-from gaigs.data import Grid
+from gaigs.directions import Grid
 from gaigs.gaussians import fibonacci_lattice
 from gaigs.geometry import Pose
 from gaigs.projection.mercator import Mercator
@@ -248,7 +264,7 @@ opacities, signal = torch.full((1, n), 0.1, requires_grad=True), torch.randn(1, 
 attenuations = torch.full((1, n), 0.9, requires_grad=True)
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 2**10
 before = peak()
-plane = projection.plane(grid.elevations, grid.azimuths)
+plane = projection.plane(grid)
 image, left = TorchRasterizer()(splats, signal, opacities, attenuations, plane)
 (image.square().sum() + left.sum()).backward()
 assert opacities.grad.isfinite().all() and opacities.grad.any()
@@ -261,3 +277,7 @@ def test_memory_does_not_grow_with_pairs_of_splats_and_pixels():
     done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) < 2 * 2**30  # one float32 for each pair of 20,000 splats and 32,400 pixels would be 2.4 GiB
+
+
+def test_what_drew_a_map_is_known():
+    assert TorchRasterizer().used == "torch"

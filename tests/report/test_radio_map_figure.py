@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.contour import QuadContourSet
 
 from gaigs.radio_map import RadioMap
 from gaigs.report.panels import PANELS
@@ -15,17 +16,17 @@ WALLS = np.array(
 )
 
 
-def maps(count, x=None, y=None, seed=3):
+def maps(count, x=None, y=None, seed=3, scale=1.0, **words):
     x, y = 0.5 * np.arange(-1, 12) if x is None else x, 0.5 * np.arange(-1, 7) if y is None else y
-    values = np.random.default_rng(seed).uniform(-80, -50, (count, len(y), len(x))).astype(np.float32)
-    return RadioMap(values, x, y, 1.25, tuple(f"g{i}" for i in range(count)))
+    values = scale * np.random.default_rng(seed).uniform(-80, -50, (count, len(y), len(x))).astype(np.float32)
+    return RadioMap(values, x, y, 1.25, tuple(f"g{i}" for i in range(count)), **words)
 
 
-def draw(radio_map, readings=None, edges=WALLS, gateways=None):
+def draw(radio_map, readings=None, edges=WALLS, gateways=None, **words):
     names = radio_map.receivers
     readings = {name: np.array([[1.0, 2, -60]]) for name in names} if readings is None else readings
     gateways = {name: np.array([i, 0.5, 2.0]) for i, name in enumerate(names)} if gateways is None else gateways
-    figures = radio_maps(radio_map, gateways, readings, edges)
+    figures = radio_maps(radio_map, gateways, readings, edges, **words)
     for figure in figures:
         figure.draw_without_rendering()
     return figures
@@ -101,6 +102,61 @@ def test_a_flat_map_is_drawn_without_a_warning():
         (figure,) = draw(flat)
     low, high = panels(figure)[0].images[0].get_clim()
     assert low < high
+
+
+def test_levels_have_lines_every_ten_decibels_and_the_scale_ends_on_fives():
+    slope = maps(1)
+    slope.values[0] = -77 + 3 * slope.x  # -78.5 to -60.5 dBm along x
+    (figure,) = draw(slope)
+    (contours,) = (artist for artist in panels(figure)[0].collections if isinstance(artist, QuadContourSet))
+    assert contours.levels.tolist() == [-70]
+    assert figure.get_suptitle().endswith("at z = 1.25 m, a line every 10 dB")
+    assert panels(figure)[0].images[0].get_clim() == (-80, -55)
+    assert figure.axes[-1].get_ylabel() == "RSSI [dBm]"
+
+
+@pytest.mark.parametrize("scale", [-1e-6, -1.0, -1e5])
+def test_lines_and_colours_follow_from_the_data_in_other_units(scale):
+    drawn = maps(1, scale=scale, quantity="delay spread", unit="ns", frequency=2.45e9)  # 50 to 80 times the scale
+    words = {"quantity": "delay spread", "unit": "ns", "error_unit": "ns"}
+    (figure,) = draw(drawn, {"g0": np.array([[1.0, 2, -60 * scale]])}, **words)
+    (ax,) = panels(figure)
+    (contours,) = (artist for artist in ax.collections if isinstance(artist, QuadContourSet))
+    step = np.diff(contours.levels).mean()
+    assert 3 <= len(contours.levels) <= 8
+    np.testing.assert_allclose(contours.levels / step, np.round(contours.levels / step))
+    low, high = ax.images[0].get_clim()
+    assert -48 * scale < low <= 51 * -scale
+    assert -79 * scale <= high < -83 * scale
+    assert figure.get_suptitle() == (
+        f"Predicted delay spread of a transmitter at z = 1.25 m at 2.45 GHz, a line every {step:g} ns"
+    )
+    assert figure.axes[-1].get_ylabel() == "delay spread [ns]"
+
+
+def test_a_flat_map_of_zeros_has_colours():
+    flat = maps(1, unit="ns")
+    flat.values[:] = 0
+    (figure,) = draw(flat, {"g0": np.array([[1.0, 2, 0]])}, unit="ns", error_unit="ns")
+    low, high = panels(figure)[0].images[0].get_clim()
+    assert low <= 0 < high
+
+
+def test_a_wild_map_has_no_endless_lines():
+    wild = maps(1)
+    wild.values[0, 2, 2] = 1e9
+    (figure,) = draw(wild)
+    (contours,) = (artist for artist in panels(figure)[0].collections if isinstance(artist, QuadContourSet))
+    assert len(contours.levels) < 40
+
+
+def test_a_file_is_drawn_too_and_must_be_in_the_unit_of_the_readings(tmp_path):
+    maps(1).save(tmp_path / "map.npz")
+    readings, gateways = {"g0": np.array([[1.0, 2, -60]])}, {"g0": np.zeros(3)}
+    (figure,) = radio_maps(tmp_path / "map.npz", gateways, readings, WALLS)
+    np.testing.assert_array_equal(panels(figure)[0].images[0].get_array(), maps(1).values[0])
+    with pytest.raises(ValueError, match="in the unit of the readings, 'ns', got one of RSSI in 'dBm'"):
+        radio_maps(tmp_path / "map.npz", gateways, readings, WALLS, "delay spread", "ns", "ns")
 
 
 @pytest.mark.parametrize("count", [1, 5, PANELS, 2 * PANELS + 1])

@@ -5,34 +5,57 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
+from gaigs.registry import registry
 from gaigs.report.table import metrics_table, verdict, written
+from gaigs.task.csi import Csi
 
 
-def run(**models):
-    return {"split": "runs of 20 [hard]", "seed": 7, "device": "cpu, 2 cores", "models": models}
+def run(task, **models):
+    facts = {"split": "runs of 20 [hard]", "seed": 7, "device": "cpu, 2 cores"}
+    return facts | ({} if task is None else {"task": task}) | {"models": models}
 
 
-def printed(table, styles=False):
-    console = Console(width=120, record=True, force_terminal=True, color_system="standard", file=StringIO())
+def printed(table, styles=False, width=120):
+    console = Console(width=width, record=True, force_terminal=True, color_system="standard", file=StringIO())
     console.print(table)
     return console.export_text(styles=styles)
 
 
-SPECTRA = run(
-    gaigs={"ssim_median": 0.912, "mae": 0.05},
-    mean={"ssim_median": 0.667, "mae": 0.2},
-    knn={"ssim_median": 0.962, "mae": 0.04},
-)
-RSSI = run(gaigs={"mae_db": 3.25, "rmse_db": 14.0}, mean={"mae_db": 6.25, "rmse_db": 14.0})
+def heads(metrics):
+    """Of the columns, their words in a row."""
+    lines = printed(metrics_table(metrics), width=80).splitlines()
+    columns = zip(*(line.split("┃")[1:-1] for line in lines if line.startswith("┃")), strict=True)
+    return [" ".join(" ".join(words).split()) for words in columns]
+
+
+def spectrum(median, mae):
+    return {"ssim_median": median, "ssim_mean": 0.5, "ssim_p10": 0.25, "ssim_p90": 0.75, "mae": mae}
+
+
+def rssi(mae, rmse=14.0):
+    return {"mae_db": mae, "median_ae_db": 1.5, "rmse_db": rmse}
+
+
+def csi(median, aligned):
+    return {name: float(i) for i, name in enumerate(Csi.metrics())} | {
+        "snr_db_median": median, "snr_aligned_db_median": aligned
+    }  # fmt: skip
+
+
+SPECTRA = run("spectrum", gaigs=spectrum(0.912, 0.05), mean=spectrum(0.667, 0.2), knn=spectrum(0.962, 0.04))
+RSSI = run("rssi", gaigs=rssi(3.25), mean=rssi(6.25))
+MODELS = ("gaigs", "mean", "knn", "friis", "path_loss", "gaussian_process")
 
 
 def test_best_of_each_metric_is_bold():
     bold = printed(metrics_table(SPECTRA), styles=True)
     assert "\x1b[1m0.962\x1b[0m" in bold
     assert "\x1b[1m0.040\x1b[0m" in bold
-    assert bold.count("\x1b[1m0.") == 2
+    for score in ("0.912", "0.667", "0.050", "0.200"):
+        assert f"\x1b[1m{score}\x1b[0m" not in bold
     errors = printed(metrics_table(RSSI), styles=True)
     assert "\x1b[1m3.250\x1b[0m" in errors
+    assert "\x1b[1m6.250\x1b[0m" not in errors
     assert errors.count("\x1b[1m14.0\x1b[0m") == 2  # a tie
 
 
@@ -40,12 +63,40 @@ def test_table_says_where_the_numbers_come_from():
     text = " ".join(printed(metrics_table(SPECTRA)).split())
     assert "split runs of 20 [hard]" in text
     assert "run with seed 7 on cpu, 2 cores" in text
-    assert "median SSIM" in text
-    assert "MAE [dB]" in printed(metrics_table(RSSI))
+    assert heads(SPECTRA) == ["model", "median SSIM", "mean SSIM", "p10 SSIM", "p90 SSIM", "MAE"]
+    assert heads(RSSI) == ["model", "MAE [dB]", "median AE [dB]", "RMSE [dB]"]
+
+
+@pytest.mark.parametrize(
+    ("task", "scores", "shown"),
+    [
+        ("spectrum", spectrum(0.9125, 0.1), ["ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae"]),
+        ("rssi", rssi(13.25), ["mae_db", "median_ae_db", "rmse_db"]),
+        ("csi", csi(-11.5, 21.5), ["snr_db_median", "snr_db_mean", "snr_aligned_db_median"]),
+    ],
+)
+def test_all_models_and_the_validation_score_fit_eighty_columns(task, scores, shown):
+    first = shown[0]
+    metrics = run(task, **dict.fromkeys(MODELS, scores))
+    metrics["validation"] = {model: scores | {first: 77.25 + i} for i, model in enumerate(MODELS)}
+    known = registry("task").get(task).metrics()
+    lines = printed(metrics_table(metrics), width=80).splitlines()
+    assert max(map(len, lines)) <= 80
+    assert not any("…" in line for line in lines)
+    for i, model in enumerate(MODELS):
+        (row,) = (line.replace("│", " ").split() for line in lines if line.startswith(f"│ {model} "))
+        assert row == [model, *(written(scores[name]) for name in shown), written(77.25 + i)]
+    titles = [known[name].title for name in shown]
+    assert heads(metrics) == ["model", *titles, f"{titles[0]}, validation"]
+
+
+def test_a_run_without_validation_has_no_column_for_it():
+    for validation in ({}, None):
+        assert "validation" not in printed(metrics_table(RSSI | {"validation": validation}))
 
 
 def test_receivers_stand_below_with_the_first_metric_of_each_model():
-    at = lambda gaigs, mean: {"gaigs": {"mae_db": gaigs, "rmse_db": 77.0}, "mean": {"mae_db": mean, "rmse_db": 66.0}}
+    at = lambda gaigs, mean: {"gaigs": rssi(gaigs, 77.0), "mean": rssi(mean, 66.0)}
     metrics = RSSI | {"receivers": {"[attic]": at(2.125, 7.5), "cellar": at(4.5, 3.875)}}
     bold = printed(metrics_table(metrics), styles=True)
     assert "\x1b[1m2.125\x1b[0m" in bold
@@ -71,20 +122,33 @@ def test_one_receiver_has_no_table_of_its_own():
         (SPECTRA, "gaigs is 0.245 above mean and 0.050 below knn in median SSIM on split runs of 20 [hard]."),
         (RSSI, "gaigs is 3.00 dB below mean in MAE (lower is better) on split runs of 20 [hard]."),
         (
-            run(gaigs={"ssim_median": 0.9}, knn={"ssim_median": 0.9004}, mean={"ssim_median": 0.8996}),
+            run("spectrum", gaigs=spectrum(0.9, 0), knn=spectrum(0.9004, 0), mean=spectrum(0.8996, 0)),
             "gaigs is level with knn and level with mean in median SSIM on split runs of 20 [hard].",
         ),
         (
-            run(gaigs={"mae_db": 3.961}, mean={"mae_db": 6.28}, knn={"mae_db": 3.76}, path_loss={"mae_db": 3.964}),
+            run("rssi", gaigs=rssi(3.961), mean=rssi(6.28), knn=rssi(3.76), path_loss=rssi(3.964)),
             "gaigs is 2.32 dB below mean, 0.20 dB above knn and level with path_loss in MAE (lower is better) on split "
             "runs of 20 [hard].",
         ),
-        (run(knn={"mae_db": 4.158}), "knn is at 4.16 dB in MAE (lower is better) on split runs of 20 [hard]."),
-        (run(knn={"fit": 0.9}), "knn is at 0.900 in fit (lower is better) on split runs of 20 [hard]."),
+        (run("rssi", knn=rssi(4.158)), "knn is at 4.16 dB in MAE (lower is better) on split runs of 20 [hard]."),
+        (run("spectrum", knn=spectrum(0.9, 0)), "knn is at 0.900 in median SSIM on split runs of 20 [hard]."),
+        (
+            run("csi", gaigs=csi(12.25, 13), friis=csi(-3.5, 20)),
+            "gaigs is 15.75 dB above friis in median SNR on split runs of 20 [hard].",
+        ),
     ],
 )
 def test_verdict(metrics, sentence):
     assert verdict(metrics) == sentence
+
+
+def test_a_run_of_an_earlier_version_is_told():
+    with pytest.raises(
+        ValueError, match="must have the key 'task', got split, seed, device, models; one without is of"
+    ):
+        metrics_table(run(None, gaigs=rssi(3.0)))
+    with pytest.raises(ValueError, match=r"unknown task 'rsi' \(did you mean 'rssi'"):
+        verdict(run("rsi", gaigs=rssi(3.0)))
 
 
 @pytest.mark.parametrize(

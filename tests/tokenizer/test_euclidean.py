@@ -6,10 +6,24 @@ import numpy as np
 import pytest
 import torch
 
+from gaigs.placement import Placed
+from gaigs.query import Query
+from gaigs.task.rssi import Rssi
 from gaigs.testing import example_links
-from gaigs.tokenizer.euclidean import PERIOD, EuclideanTokenizer, fourier_features, learnable_octaves, octaves
+from gaigs.tokenizer.euclidean import (
+    BAND_FREQUENCIES,
+    PERIOD,
+    EuclideanTokenizer,
+    fourier_features,
+    learnable_octaves,
+    octaves,
+)
 
 OPTIONS = {"gaussian_octaves": (-3, 2), "transmitter_octaves": (-2, 4), "hidden": 16, "width": 8}
+
+
+def ask(places, frequencies=None):
+    return Query(places, torch.zeros(len(places), dtype=torch.long), frequencies)
 
 
 @pytest.fixture
@@ -36,7 +50,7 @@ def test_features_are_position_sine_and_cosine_of_whole_octaves():
 def test_a_gaussians_token_is_its_features_about_the_receivers_middle(scene):
     tokenizer = EuclideanTokenizer(scene, **OPTIONS)
     means = torch.randn(7, 3)
-    tokens = tokenizer(means, torch.rand(7), torch.rand(2, 3))
+    tokens = tokenizer(Placed(means[None]), torch.rand(7), ask(torch.rand(2, 3)))
     middle = (scene.receivers[0].pose.position + scene.receivers[1].pose.position) / 2
     assert torch.equal(tokens.gaussians, fourier_features(means - middle, octaves("gaussian_octaves", -3, 2)))
     assert tokens.gaussians.shape == (7, tokenizer.gaussian_width) == (7, 39)
@@ -51,7 +65,8 @@ def test_moving_the_whole_scene_changes_no_token(scene):
     here, there = EuclideanTokenizer(scene, **OPTIONS), EuclideanTokenizer(moved, **OPTIONS)
     there.network.load_state_dict(here.network.state_dict())
     means, opacities, transmitters = torch.randn(7, 3), torch.rand(7), torch.rand(2, 3)
-    expected, found = here(means, opacities, transmitters), there(means + shift, opacities, transmitters + shift)
+    expected = here(Placed(means[None]), opacities, ask(transmitters))
+    found = there(Placed(means[None] + shift), opacities, ask(transmitters + shift))
     for token, other in zip(expected, found, strict=True):
         torch.testing.assert_close(other, token, rtol=0, atol=1e-4)
 
@@ -60,13 +75,19 @@ def test_a_checkpoint_brings_the_middles_along(scene):
     moved = replace(scene, lower=scene.lower + 1, receivers=scene.receivers[:1])
     tokenizer, other = EuclideanTokenizer(scene, **OPTIONS), EuclideanTokenizer(moved, **OPTIONS)
     other.load_state_dict(tokenizer.state_dict())
-    inputs = torch.randn(7, 3), torch.rand(7), torch.rand(2, 3)
+    inputs = Placed(torch.randn(1, 7, 3)), torch.rand(7), ask(torch.rand(2, 3))
     assert all(map(torch.equal, tokenizer(*inputs), other(*inputs)))
 
 
 def test_an_empty_range_of_octaves_is_refused(scene):
     with pytest.raises(ValueError, match=r"transmitter_octaves must be \[lowest, highest\], got \[3, 2\]"):
         EuclideanTokenizer(scene, **(OPTIONS | {"transmitter_octaves": (3, 2)}))
+
+
+@pytest.mark.parametrize("option", ["hidden", "width"])
+def test_networks_without_width_are_refused(scene, option):
+    with pytest.raises(ValueError, match=f"{option} must be at least 1, got 0"):
+        EuclideanTokenizer(scene, **(OPTIONS | {option: 0}))
 
 
 @pytest.mark.parametrize("spacing", [0.001, 0.03, 0.2, 5.0])
@@ -83,12 +104,64 @@ def test_octaves_span_the_box_and_stop_well_above_the_spacing(scene, spacing, ed
 @pytest.mark.parametrize(
     ("spacing", "edge", "expected"), [(0.02, 9.0, (-5, -4)), (0.02, 4.0, (-4, -4)), (5.0, 90.0, (-8, -6))]
 )
-def test_rssi_bears_out_wide_features_alone(scene, spacing, edge, expected):
+def test_labels_that_scatter_bear_out_wide_features_alone(scene, spacing, edge, expected):
     upper = scene.lower + torch.tensor([0.3, 1.0, 0.2]) * edge
-    assert learnable_octaves(replace(scene, upper=upper, spacing=spacing, grid=None)) == expected
+    assert learnable_octaves(replace(scene, upper=upper, spacing=spacing, task=Rssi())) == expected
 
 
 def test_octaves_not_given_are_those_that_can_be_learnt(scene):
     free = EuclideanTokenizer(scene, **(OPTIONS | {"transmitter_octaves": None}))
     given = octaves("transmitter_octaves", *learnable_octaves(scene))
     assert torch.equal(free.transmitter_frequencies, given)
+
+
+def test_gaussians_that_stand_elsewhere_for_each_query_have_tokens_of_their_own(scene):
+    tokenizer = EuclideanTokenizer(scene, **OPTIONS)
+    means, query = torch.randn(2, 7, 3), ask(torch.rand(2, 3))
+    tokens = tokenizer(Placed(means), torch.rand(7), query)
+    assert tokens.gaussians.shape == (2, 7, 39)
+    for i in range(2):
+        alone = tokenizer(Placed(means[i : i + 1]), torch.rand(7), query[i : i + 1])
+        torch.testing.assert_close(alone.gaussians, tokens.gaussians[i])
+
+
+# --- the carrier ---
+
+
+def test_a_band_is_seen_through_features_of_its_logarithm(scene):
+    scene = replace(scene, frequencies=torch.tensor([2e9, 4e9, 8e9]))
+    tokenizer = EuclideanTokenizer(scene, **OPTIONS)
+    seen = []
+    tokenizer.network.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    places = torch.rand(1, 3).expand(3, 3)
+    tokenizer(Placed(torch.randn(1, 7, 3)), torch.rand(7), ask(places, torch.tensor([2e9, 4e9, 8e9])))
+    x = np.array([-1.0, 0.0, 1.0])[:, None]  # an octave each
+    phases = x * BAND_FREQUENCIES.numpy()
+    expected = np.concatenate((x, np.sin(phases), np.cos(phases)), 1)
+    np.testing.assert_allclose(seen[0][:, -expected.shape[1] :], expected, atol=1e-5)
+    assert seen[0].shape == (3, 3 * 15 + expected.shape[1])
+
+
+def test_carriers_tell_transmitters_of_one_place_apart(scene):
+    scene = replace(scene, frequencies=torch.tensor([2.4e9, 5e9]))
+    tokenizer = EuclideanTokenizer(scene, **OPTIONS)
+    places = torch.rand(1, 3).expand(2, 3)
+    tokens = tokenizer(Placed(torch.randn(1, 7, 3)), torch.rand(7), ask(places, torch.tensor([2.4e9, 5e9])))
+    assert (tokens.transmitters[0] - tokens.transmitters[1]).abs().max() > 1e-3
+
+
+def test_a_single_carrier_changes_nothing(scene):
+    torch.manual_seed(1)
+    plain = EuclideanTokenizer(scene, **OPTIONS)
+    torch.manual_seed(1)
+    single = EuclideanTokenizer(replace(scene, frequencies=torch.tensor([2.4e9])), **OPTIONS)
+    inputs = Placed(torch.randn(1, 7, 3)), torch.rand(7)
+    places = torch.rand(2, 3)
+    expected, found = plain(*inputs, ask(places)), single(*inputs, ask(places, torch.full((2,), 2.4e9)))
+    assert all(map(torch.equal, expected, found))
+
+
+def test_a_band_needs_a_frequency(scene):
+    tokenizer = EuclideanTokenizer(replace(scene, frequencies=torch.tensor([2.4e9, 5e9])), **OPTIONS)
+    with pytest.raises(ValueError, match="so a frequency must be given"):
+        tokenizer(Placed(torch.randn(1, 7, 3)), torch.rand(7), ask(torch.rand(2, 3)))

@@ -1,9 +1,16 @@
+"""The scene token: what it depends on and what it does not, its sizes, and what is refused."""
+
+from dataclasses import replace
+
 import pytest
 import torch
 
-from gaigs.data import Receiver, Scene
 from gaigs.geometry import Pose
+from gaigs.placement import Placed
+from gaigs.query import Query
 from gaigs.registry import registry
+from gaigs.scene import Receiver, Scene
+from gaigs.task.rssi import Rssi
 from gaigs.tokenizer.ga import GATokenizer
 
 N, B = 40, 3
@@ -13,7 +20,13 @@ both = pytest.mark.parametrize("algebra", ["projective", "spacetime"])
 def make_scene(shift=0.0, scale=1.0):
     place = lambda *coordinates: scale * torch.tensor(coordinates) + shift
     receiver = Receiver("gateway", Pose(place(5.0, 0.3, 1.0), torch.eye(3)))
-    return Scene((receiver,), place(0.0, 0.0, 0.0), place(4.0, 3.0, 2.0), 0.1, None, "none")
+    return Scene((receiver,), place(0.0, 0.0, 0.0), place(4.0, 3.0, 2.0), 0.1, Rssi())
+
+
+def tokens_of(tokenizer, means, opacities, transmitters, frequencies=None):
+    """Of Gaussians that stand still, unless their means are (b, n, 3)."""
+    placed = Placed(means if means.ndim == 3 else means[None])
+    return tokenizer(placed, opacities, Query(transmitters, torch.zeros(len(transmitters)).long(), frequencies))
 
 
 @pytest.fixture(autouse=True)
@@ -30,7 +43,7 @@ def room():
 @both
 def test_widths_are_those_of_the_tokens(room, algebra):
     tokenizer = registry("tokenizer").build({"name": "ga", "width": 7, "algebra": algebra}, scene=make_scene())
-    tokens = tokenizer(*room)
+    tokens = tokens_of(tokenizer, *room)
     assert tokens.scene.shape == (B, tokenizer.scene_width) == (B, 7)
     assert tokens.gaussians.shape == (N, tokenizer.gaussian_width) == (N, 0)
     assert tokens.transmitters.shape == (B, tokenizer.transmitter_width) == (B, 0)
@@ -41,15 +54,15 @@ def test_widths_are_those_of_the_tokens(room, algebra):
 def test_only_the_most_opaque_gaussians_count(room, algebra):
     tokenizer = GATokenizer(make_scene(), anchors=5, algebra=algebra)
     means, opacities, transmitters = room
-    scene = tokenizer(*room).scene
+    scene = tokens_of(tokenizer, *room).scene
     ranks = opacities.argsort(descending=True)
     for moved, counts in ((ranks[5:], False), (ranks[4], True)):
         other = means.clone()
         other[moved] += 1
-        assert torch.equal(tokenizer(other, opacities, transmitters).scene, scene) != counts
+        assert torch.equal(tokens_of(tokenizer, other, opacities, transmitters).scene, scene) != counts
     raised = opacities.clone()
     raised[ranks[20]] = 2  # chosen anew at every call
-    assert not torch.allclose(tokenizer(means, raised, transmitters).scene, scene)
+    assert not torch.allclose(tokens_of(tokenizer, means, raised, transmitters).scene, scene)
 
 
 @both
@@ -58,7 +71,10 @@ def test_the_order_of_gaussians_does_not_count(room, algebra):
     means, opacities, transmitters = room
     order = torch.randperm(N)
     torch.testing.assert_close(
-        tokenizer(means[order], opacities[order], transmitters).scene, tokenizer(*room).scene, rtol=1e-4, atol=1e-5
+        tokens_of(tokenizer, means[order], opacities[order], transmitters).scene,
+        tokens_of(tokenizer, *room).scene,
+        rtol=1e-4,
+        atol=1e-5,
     )
 
 
@@ -66,9 +82,9 @@ def test_the_order_of_gaussians_does_not_count(room, algebra):
 def test_each_transmitter_has_a_token_of_its_own(room, algebra):
     tokenizer = GATokenizer(make_scene(), algebra=algebra)
     means, opacities, transmitters = room
-    scene = tokenizer(*room).scene
+    scene = tokens_of(tokenizer, *room).scene
     for transmitter, token in zip(transmitters, scene, strict=True):
-        alone = tokenizer(means, opacities, transmitter[None]).scene
+        alone = tokens_of(tokenizer, means, opacities, transmitter[None]).scene
         torch.testing.assert_close(alone[0], token, rtol=1e-4, atol=1e-5)
     assert torch.pdist(scene).min() > 1e-3
 
@@ -81,8 +97,8 @@ def test_the_origin_and_the_unit_of_length_do_not_count(room, algebra):
         tokenizers.append(GATokenizer(scene, algebra=algebra).double())
     means, opacities, transmitters = (x.double() for x in room)
     torch.testing.assert_close(
-        tokenizers[1](3 * means + 20, opacities, 3 * transmitters + 20).scene,
-        tokenizers[0](means, opacities, transmitters).scene,
+        tokens_of(tokenizers[1], 3 * means + 20, opacities, 3 * transmitters + 20).scene,
+        tokens_of(tokenizers[0], means, opacities, transmitters).scene,
         rtol=1e-5,  # the scene's corners are float32
         atol=1e-6,
     )
@@ -91,18 +107,18 @@ def test_the_origin_and_the_unit_of_length_do_not_count(room, algebra):
 def test_fewer_gaussians_than_anchors_are_all_anchors(room):
     tokenizer = GATokenizer(make_scene(), anchors=16)
     means, opacities, transmitters = room
-    scene = tokenizer(means[:3], opacities[:3], transmitters).scene
+    scene = tokens_of(tokenizer, means[:3], opacities[:3], transmitters).scene
     assert scene.shape == (B, 16)
     few = GATokenizer(make_scene(), anchors=3)
     few.load_state_dict(tokenizer.state_dict())
-    torch.testing.assert_close(few(means[:3], opacities[:3], transmitters).scene, scene)
+    torch.testing.assert_close(tokens_of(few, means[:3], opacities[:3], transmitters).scene, scene)
 
 
 @both
 def test_gradients_reach_every_parameter_but_not_the_anchors(room, algebra):
     tokenizer = GATokenizer(make_scene(), blocks=2, algebra=algebra)
     means, opacities, transmitters = (x.requires_grad_() for x in room)
-    tokenizer(means, opacities, transmitters).scene.square().sum().backward()
+    tokens_of(tokenizer, means, opacities, transmitters).scene.square().sum().backward()
     assert means.grad is None
     assert opacities.grad is None
     assert transmitters.grad.any()
@@ -117,12 +133,12 @@ def test_a_network_of_other_size(room, algebra):
     tokenizer = GATokenizer(
         make_scene(), anchors=1, blocks=2, multivectors=6, scalars=2, heads=2, width=3, algebra=algebra
     )
-    assert tokenizer(*room).scene.shape == (B, 3)
+    assert tokens_of(tokenizer, *room).scene.shape == (B, 3)
     assert len(tokenizer.blocks) == 2
 
 
 def test_tokens_have_the_dtype_of_the_input(room):
-    tokens = GATokenizer(make_scene()).double()(*(x.double() for x in room))
+    tokens = tokens_of(GATokenizer(make_scene()).double(), *(x.double() for x in room))
     assert {tensor.dtype for tensor in tokens} == {torch.float64}
 
 
@@ -142,6 +158,29 @@ def test_impossible_options_are_refused(options, message):
 
 def test_a_room_of_one_point_is_refused():
     receiver = Receiver("gateway", Pose(torch.ones(3), torch.eye(3)))
-    scene = Scene((receiver,), torch.ones(3), torch.ones(3), 0.1, None, "none")
+    scene = Scene((receiver,), torch.ones(3), torch.ones(3), 0.1, Rssi())
     with pytest.raises(ValueError, match="one point"):
         GATokenizer(scene)
+
+
+@both
+def test_gaussians_that_stand_elsewhere_for_each_query_are_its_anchors(room, algebra):
+    tokenizer = GATokenizer(make_scene(), anchors=5, algebra=algebra)
+    means, opacities, transmitters = room
+    own = means + torch.randn(B, 1, 3)
+    scene = tokens_of(tokenizer, own, opacities, transmitters).scene
+    for i in range(B):
+        alone = tokens_of(tokenizer, own[i], opacities, transmitters[i : i + 1]).scene
+        torch.testing.assert_close(alone[0], scene[i], rtol=1e-4, atol=1e-5)
+    assert (scene - tokens_of(tokenizer, *room).scene).abs().max() > 1e-3
+
+
+@both
+def test_carriers_tell_transmitters_of_one_place_apart(room, algebra):
+    band = replace(make_scene(), frequencies=torch.tensor([2.4e9, 5e9]))
+    means, opacities, transmitters = room
+    places = transmitters[:1].expand(2, 3)
+    scene = tokens_of(GATokenizer(band, algebra=algebra), means, opacities, places, torch.tensor([2.4e9, 5e9])).scene
+    assert (scene[0] - scene[1]).abs().max() > 1e-4
+    with pytest.raises(ValueError, match="so a frequency must be given"):
+        tokens_of(GATokenizer(band, algebra=algebra), means, opacities, places)

@@ -3,6 +3,8 @@
 import pytest
 import torch
 
+from gaigs.placement import Placed
+from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.testing import example_links
 from gaigs.tokenizer.multiview import MultiviewTokenizer
@@ -17,6 +19,12 @@ EUCLIDEAN = {
 }
 
 
+def draw():
+    """Thirty Gaussians and two transmitters."""
+    query = Query(torch.rand(2, 3), torch.zeros(2, dtype=torch.long))
+    return Placed(torch.randn(1, 30, 3)), torch.rand(30), query
+
+
 @pytest.fixture
 def tokenizer():
     torch.manual_seed(0)
@@ -24,7 +32,7 @@ def tokenizer():
 
 
 def test_it_takes_the_scene_of_the_one_and_the_positions_of_the_other(tokenizer):
-    inputs = torch.randn(30, 3), torch.rand(30), torch.rand(2, 3)
+    inputs = draw()
     tokens = tokenizer(*inputs)
     assert torch.equal(tokens.scene, tokenizer.ga(*inputs).scene)
     assert torch.equal(tokens.gaussians, tokenizer.euclidean(*inputs).gaussians)
@@ -33,7 +41,7 @@ def test_it_takes_the_scene_of_the_one_and_the_positions_of_the_other(tokenizer)
 
 
 def test_both_are_trained(tokenizer):
-    tokens = tokenizer(torch.randn(30, 3), torch.rand(30), torch.rand(2, 3))
+    tokens = tokenizer(*draw())
     sum(token.square().sum() for token in tokens).backward()
     assert all(parameter.grad.any() for parameter in tokenizer.parameters())
 

@@ -3,12 +3,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gaigs.data import Grid, Links, Receiver, Split
+from gaigs.data import Links, Split
+from gaigs.directions import Grid
 from gaigs.geometry import Pose
-from gaigs.training.batches import Batches, Pass, take
+from gaigs.query import Query
+from gaigs.scene import Receiver
+from gaigs.task.spectrum import Spectrum
+from gaigs.training import batches as module
+from gaigs.training.batches import Batches, InOrder, process
 
 PLACES = 22
 """Where transmitters train; links 22 to 25 test."""
+
+PASS = -(-PLACES // 5)
+"""Batches of 5 that a pass takes."""
 
 
 @pytest.fixture(scope="module")
@@ -17,30 +25,32 @@ def links():
     n = PLACES + 4
     numbers = torch.arange(n, dtype=torch.float32)
     pose = Pose.from_xyzw((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    grid = Grid.degrees(range(4), range(6))
+    receivers = torch.randint(3, (n,), generator=torch.Generator().manual_seed(0))
     return Links(
-        transmitters=numbers[:, None].expand(n, 3),
+        query=Query(numbers[:, None].expand(n, 3), receivers),
         receivers=tuple(Receiver(f"gateway{i}", pose) for i in range(3)),
-        receiver_index=torch.randint(3, (n,), generator=torch.Generator().manual_seed(0)),
         labels=numbers[:, None, None].expand(n, 4, 6),
+        task=Spectrum(grid.elevations, grid.azimuths, "none"),
         split=Split("all but four", torch.arange(n - 4), torch.arange(0), torch.arange(n - 4, n)),
-        grid=Grid.degrees(range(4), range(6)),
-        normalisation="none",
     )
 
 
+def at(links, places, frequencies=None):
+    """The links moved to numbered places."""
+    transmitters = places.float()[:, None].expand(len(links), 3)
+    return replace(links, query=replace(links.query, transmitters=transmitters, frequencies=frequencies))
+
+
 def numbers(batch):
-    """Which links a batch holds, where positions are numbers of links."""
-    return batch.transmitters[:, 0].long().tolist()
+    """Which links a batch holds, as their labels say."""
+    return batch.labels[:, 0, 0].long().tolist()
 
 
 def draw(links, steps, size=5, seed=0, start=0):
     batches = Batches(links, links.split.train, size, seed, steps)
     batches.load_state_dict({"position": start})
     return list(batches)
-
-
-PASS = -(-PLACES // 5)
-"""Batches of 5 that a pass takes."""
 
 
 def test_a_pass_goes_through_every_link_once(links):
@@ -51,22 +61,40 @@ def test_a_pass_goes_through_every_link_once(links):
 
 def test_receivers_and_labels_belong_to_their_transmitters(links):
     for batch in draw(links, 2 * PASS):
-        assert (links.receiver_index[numbers(batch)] == batch.receivers).all()
-        assert batch.labels.shape == (len(numbers(batch)), 4, 6)
-        assert batch.labels[:, 0, 0].long().tolist() == numbers(batch)
-        assert len(numbers(batch)) <= 5
+        held = numbers(batch)
+        assert batch.query.transmitters[:, 0].tolist() == held
+        assert torch.equal(batch.query.receivers, links.query.receivers[held])
+        assert batch.query.frequencies is None
+        assert batch.labels.shape == (len(held), 4, 6)
+        assert batch.directions.shape == (4, 6)
+        assert batch.shares == (1.0, 1.0)
+        assert len(held) <= 5
 
 
 def test_links_of_one_transmitter_come_together(links):
-    """Each place is heard three times; the labels still say which link it is."""
-    shared = replace(links, transmitters=(links.transmitters // 3).clone())
-    drawn = draw(shared, 2)
-    assert [len(batch.transmitters) for batch in drawn] == [13, 9] or [len(b.transmitters) for b in drawn] == [15, 7]
+    """Each place is heard three times, the last one once."""
+    drawn = draw(at(links, torch.arange(len(links)) // 3), 2)
+    assert [len(batch) for batch in drawn] in ([13, 9], [15, 7])
     for batch in drawn:
-        assert len(batch.transmitters.unique(dim=0)) <= 5
-        held = batch.labels[:, 0, 0].long()
-        places = set((held // 3).tolist())
-        assert sorted(held.tolist()) == [n for n in range(PLACES) if n // 3 in places]
+        assert len(batch.query.transmitters.unique(dim=0)) <= 5
+        held = numbers(batch)
+        places = {n // 3 for n in held}
+        assert sorted(held) == [n for n in range(PLACES) if n // 3 in places]
+
+
+def test_a_place_is_a_position_and_a_frequency(links):
+    """Four links share a position, two of them a carrier: a batch counts carriers apart."""
+    carrier = torch.arange(len(links)) // 2 % 2
+    several = at(links, torch.arange(len(links)) // 4, 1e9 + 1e8 * carrier)
+    drawn = draw(several, 3)
+    assert [len(batch) for batch in drawn] == [10, 10, 2], "11 pairs of a position and a carrier"
+    for batch in drawn:
+        held = numbers(batch)
+        assert torch.equal(batch.query.frequencies, several.query.frequencies[held])
+        pairs = {n // 2 for n in held}
+        assert sorted(held) == [n for n in range(PLACES) if n // 2 in pairs]
+    apart = [{n // 4 for n in numbers(batch)} for batch in drawn]
+    assert any(a & b for a in apart for b in apart if a is not b), "carriers of one position need not come together"
 
 
 def test_passes_differ_and_so_do_seeds(links):
@@ -97,21 +125,88 @@ def test_one_batch_may_hold_all(links):
 
 
 def test_a_pass_for_scores_keeps_the_order(links):
-    batches = Pass(links, links.split.train, 5)
+    batches = InOrder(links, links.split.train, 5)
     assert len(batches) == PASS
-    drawn = [numbers(batch) for batch in batches]
-    assert drawn == [part.tolist() for part in batches.parts]
-    assert [n for part in drawn for n in part] == links.split.train.tolist()
-    assert len(list(Pass(links, links.split.validation, 5))) == 0
-
-
-def test_take(links):
-    batch = take(links, torch.tensor([22, 24]))
-    assert (numbers(batch), batch.grid.shape) == ([22, 24], (4, 6))
-    assert torch.equal(batch.receivers, links.receiver_index[[22, 24]])
+    drawn = list(batches)
+    assert [len(batch) for batch in drawn] == [5, 5, 5, 5, 2]
+    assert [n for batch in drawn for n in numbers(batch)] == links.split.train.tolist()
+    assert all(batch.shares == (1.0, 1.0) for batch in drawn)
+    none = InOrder(links, links.split.validation, 5)
+    assert len(none) == len(list(none)) == 0
 
 
 @pytest.mark.parametrize(("size", "steps", "option"), [(0, 1, "training.batch_size"), (1, -1, "trainer.max_steps")])
 def test_refuses(links, size, steps, option):
     with pytest.raises(ValueError, match=f"{option} must be at least 1, got"):
         Batches(links, links.split.train, size, 0, steps)
+
+
+# --- several processes ---
+
+
+def on_each(monkeypatch, processes, work):
+    """What each of several pretended processes makes."""
+    results = []
+    for rank in range(processes):
+        monkeypatch.setattr(module, "process", lambda rank=rank: (rank, processes))
+        results.append(work())
+    return results
+
+
+def test_alone_there_is_one_process():
+    assert process() == (0, 1)
+
+
+PLACED = {
+    "a place a link": torch.arange(PLACES + 4),
+    "places of 1, 2, 3 ... links": torch.repeat_interleave(torch.arange(1, 8), torch.arange(1, 8))[: PLACES + 4],
+}
+"""Numbers of the links' places."""
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+@pytest.mark.parametrize("size", [1, 2, 4, 5, 100])  # 1 and 2: fewer places than processes, 4 and 5: an uneven rest
+@pytest.mark.parametrize("places", PLACED)
+def test_processes_share_each_batch_and_their_mean_is_that_of_the_batch(links, monkeypatch, processes, size, places):
+    links = at(links, PLACED[places])
+    steps = 2 * -(-len(links.query.transmitters[:PLACES].unique(dim=0)) // size)
+    whole = draw(links, steps, size)
+    shared = on_each(monkeypatch, processes, lambda: draw(links, steps, size))
+    # Of each link a value, and of each place: what a loss and a penalty are means of.
+    of_link = torch.randn(PLACES + 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    of_place = torch.randn(PLACES + 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    of_places = lambda batch: of_place[batch.query.transmitters[:, 0].unique().long()].mean()
+    assert {len(batches) for batches in shared} == {steps}
+    for batch, *parts in zip(whole, *shared, strict=True):
+        held = [part for part in parts if part.shares != (0, 0)]
+        assert sorted(n for part in held for n in numbers(part)) == sorted(numbers(batch))
+        where = [place for part in held for place in part.query.transmitters[:, 0].unique().tolist()]
+        assert len(where) == len({*where}), "no place is parted"
+        assert len(held) == min(processes, len(where))
+        assert all(len(part) > 0 for part in parts), "each process has a loss to take part with"
+        mean = sum(part.shares[0] * of_link[numbers(part)].mean() for part in parts) / processes
+        torch.testing.assert_close(mean, of_link[numbers(batch)].mean())
+        mean = sum(part.shares[1] * of_places(part) for part in parts) / processes
+        torch.testing.assert_close(mean, of_places(batch))
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+@pytest.mark.parametrize("start", [0, 1, PASS])
+def test_each_process_goes_on_with_its_own_share(links, monkeypatch, processes, start):
+    whole = on_each(monkeypatch, processes, lambda: draw(links, 2 * PASS))
+    rest = on_each(monkeypatch, processes, lambda: draw(links, 2 * PASS, start=start))
+    for own, later in zip(whole, rest, strict=True):
+        assert [numbers(batch) for batch in later] == [numbers(batch) for batch in own[start:]]
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+@pytest.mark.parametrize("size", [1, 2, 5, 100])
+def test_processes_share_what_is_scored(links, monkeypatch, processes, size):
+    """Every link counts once, and all processes go through as many batches, none of them empty."""
+    drawn = on_each(monkeypatch, processes, lambda: list(InOrder(links, links.split.train, size)))
+    length = on_each(monkeypatch, processes, lambda: len(InOrder(links, links.split.train, size)))
+    assert [len(batches) for batches in drawn] == length == [-(-PLACES // size)] * processes
+    assert all(len(batch) > 0 and len(batch) <= size for batches in drawn for batch in batches)
+    assert {share for batches in drawn for batch in batches for share in batch.shares} <= {0.0, 1.0}
+    counted = [n for batches in drawn for batch in batches if batch.shares[0] for n in numbers(batch)]
+    assert sorted(counted) == links.split.train.tolist()

@@ -1,69 +1,82 @@
 import math
+import os
 import re
 import signal
+import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
-from torch import nn
+from fitting import make_links
 
-from gaigs.data import Grid, Receiver, Scene
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Pose
+from gaigs.processes import STOPPING
+from gaigs.scene import Receiver
+from gaigs.task.rssi import Rssi
 from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine, save
-from gaigs.training.metrics import scoring
 
 MIDDLE = (1.0, 2.0, 0.5)
 
 
+@pytest.fixture(autouse=True)
+def handlers():
+    """Signals are handled behind each test as before it."""
+    before = {number: signal.getsignal(number) for number in STOPPING}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture(scope="module")
+def links():
+    return make_links()
+
+
 @pytest.fixture
-def module():
+def module(links):
     """What density control sees of it: six Gaussians 2 m from the receiver, the third wide, the sixth faint."""
-    scene = Scene(
-        receivers=(Receiver("gateway1", Pose.from_xyzw(MIDDLE, (0.0, 0.0, 0.0, 1.0))),),
-        lower=torch.zeros(3),
-        upper=torch.ones(3),
-        spacing=0.1,
-        grid=Grid.degrees(),
-        normalisation="none",
-    )
-    gaussians = Gaussians(scene, channels=2, count=6, near=2.0, far=2.0, spread=1.0, opacity=0.5, signal=1.0)
+    scene = replace(links.scene, receivers=(Receiver("gateway1", Pose.from_xyzw(MIDDLE, (0.0, 0.0, 0.0, 1.0))),))
+    options = {"count": 6, "near": 2.0, "far": 2.0, "spread": 1.0, "opacity": 0.5, "signal": 1.0}
+    gaussians = Gaussians(scene, zone=(0.0, math.pi / 2), channels=2, **options)
     with torch.no_grad():
         gaussians.log_scales.fill_(math.log(0.1))
         gaussians.log_scales[2, 1] = math.log(1.0)
         gaussians.opacity_logits[5] = -9
     optimizer = torch.optim.AdamW(gaussians.parameters(), lr=1e-9)
-    return SimpleNamespace(model=SimpleNamespace(gaussians=gaussians, scene=scene), optimizer=optimizer)
+    return SimpleNamespace(model=SimpleNamespace(primitives=gaussians, scene=scene), optimizer=optimizer)
 
 
 def control(**options):
-    given = {"every": 2, "start": 2, "stop": 6, "gradient": 1.0, "wide": 0.2, "opacity": 0.01, "most": 100, "seed": 0}
-    return DensityControl(**(given | options))
+    given = {"every": 2, "start": 2, "stop": 6, "gradient": 1.0, "split_angle": 0.2, "opacity": 0.01}
+    return DensityControl(**(given | {"max_count": 100, "seed": 0} | options))
 
 
 def step(callback, module, number, pulls):
     """One optimizer step at which the loss pulls at the Gaussians' means with these gradients [loss/m]."""
-    gaussians = module.model.gaussians
+    gaussians = module.model.primitives
     for parameter in gaussians.parameters():
         parameter.grad = torch.zeros_like(parameter)
     gaussians.means.grad[: len(pulls), 1] = torch.tensor(pulls)
     callback.on_before_optimizer_step(None, module, module.optimizer)
     module.optimizer.step()
-    callback.on_train_batch_end(SimpleNamespace(global_step=number, optimizers=[module.optimizer]), module)
+    trainer = SimpleNamespace(global_step=number, optimizers=[module.optimizer], world_size=1)
+    callback.on_train_batch_end(trainer, module)
     return len(gaussians)
 
 
 def test_density_control_clones_the_narrow_splits_the_wide_and_prunes_the_faint(module):
     callback = control()
-    before = module.model.gaussians.scales.detach().clone()
+    before = module.model.primitives.scales.detach().clone()
     # The bound is 1 per radian, 0.5 per metre at 2 m: the mean pull counts, so of the two steps 0.6 is what decides.
     assert step(callback, module, 1, [0.0, 0.9, 0.9, 0.45, 0.0, 0.0]) == 6
     assert step(callback, module, 2, [0.0, 0.3, 0.3, 0.45, 0.0, 0.0]) == 7
-    scales = module.model.gaussians.scales
+    scales = module.model.primitives.scales
     assert torch.equal(scales[[0, 1, 3, 4]], before[[0, 1, 3, 4]])
     assert torch.equal(scales[5], before[1]), "the clone"
     torch.testing.assert_close(scales[[2, 6]], before[[2, 2]] / 1.6)
-    for parameter in module.model.gaussians.parameters():
+    for parameter in module.model.primitives.parameters():
         assert module.optimizer.state[parameter]["exp_avg"].shape == parameter.shape
 
 
@@ -82,11 +95,11 @@ def test_density_control_forgets_the_pull_after_a_round(module):
 
 
 def test_density_control_grows_to_the_bound_by_the_hardest_pulled(module):
-    module.model.gaussians.opacity_logits.data[5] = 0
+    module.model.primitives.opacity_logits.data[5] = 0
     marks = torch.arange(6.0)
-    module.model.gaussians.signal.data[:, 0, 0] = marks
-    step(control(every=1, start=1, most=8), module, 1, [2.0, 5.0, 1.0, 4.0, 3.0, 0.0])
-    assert sorted(module.model.gaussians.signal[:, 0, 0].tolist()) == sorted([*marks.tolist(), 1, 3])
+    module.model.primitives.signal.data[:, 0, 0] = marks
+    step(control(every=1, start=1, max_count=8), module, 1, [2.0, 5.0, 1.0, 4.0, 3.0, 0.0])
+    assert sorted(module.model.primitives.signal[:, 0, 0].tolist()) == sorted([*marks.tolist(), 1, 3])
 
 
 def test_density_control_goes_on_from_its_state(module):
@@ -100,12 +113,14 @@ def test_density_control_refuses():
     with pytest.raises(ValueError, match=r"density\.every must be at least 1 step, got 0"):
         control(every=0)
     with pytest.raises(ValueError, match="density needs a model with Gaussians"):
-        control().on_fit_start(None, SimpleNamespace(model=nn.Linear(1, 1)))
+        control().on_fit_start(None, SimpleNamespace(model=SimpleNamespace(primitives=None)))
 
 
 # --- checkpoints ---
 
-SPECTRA, RSSI = scoring(Grid.degrees()), scoring(None)
+SPECTRA, RSSI = make_links().task, Rssi()
+ALONE = SimpleNamespace(reduce_boolean_decision=lambda decision, all: decision, barrier=lambda: None)
+"""The strategy of one process."""
 
 
 class Trainer(SimpleNamespace):
@@ -113,26 +128,27 @@ class Trainer(SimpleNamespace):
 
     def __init__(self, **state):
         state = {"enable_validation": True, "val_check_batch": 5, "loggers": []} | state
+        state = {"strategy": ALONE, "is_global_zero": True} | state
         super().__init__(global_step=0, should_stop=False, sanity_checking=False, **state)
 
     def save_checkpoint(self, path, weights_only):
         assert not weights_only, "the optimizer's state belongs to it"
         path.write_text(str(self.global_step))
 
-    def validate(self, callback, score, scoring=SPECTRA):
+    def validate(self, callback, score, task=SPECTRA):
         self.global_step += 1
-        self.callback_metrics = {f"validation/{scoring.watched}": torch.tensor(score)}
-        callback.on_validation_end(self, SimpleNamespace(scoring=scoring))
+        self.callback_metrics = {f"validation/{task.watched}": torch.tensor(score)}
+        callback.on_validation_end(self, SimpleNamespace(task=task))
 
 
-@pytest.mark.parametrize(("scoring", "sign"), [(SPECTRA, 1), (RSSI, -1)])
-def test_the_best_checkpoint_is_that_of_the_best_score(tmp_path, scoring, sign):
+@pytest.mark.parametrize(("task", "sign"), [(SPECTRA, 1), (RSSI, -1)])
+def test_the_best_checkpoint_is_that_of_the_best_score(tmp_path, task, sign):
     """The highest similarity, or the smallest error."""
     path, trainer = tmp_path / "best.ckpt", Trainer()
     callback = KeepBest(path, patience=None)
     saved = []
     for score in (0.3, 0.5, 0.4, 0.5, 0.6, float("nan"), 0.1):
-        trainer.validate(callback, sign * score, scoring)
+        trainer.validate(callback, sign * score, task)
         saved.append(path.read_text())
     callback.on_fit_end(trainer, None)
     assert saved == ["1", "2", "2", "2", "5", "5", "5"]
@@ -218,8 +234,9 @@ def test_the_last_checkpoint_waits_for_its_time(tmp_path, monkeypatch):
     assert written == [4, 8], "at 116 s and 132 s, the first steps 15 s after the start and after the write before"
 
 
+@pytest.mark.parametrize("number", STOPPING)
 @pytest.mark.parametrize(("step", "moments"), [(1, ["within"]), (4, ["within"]), (5, ["within", "step"])])
-def test_ctrl_c_finishes_the_step_and_its_validation(tmp_path, step, moments):
+def test_a_signal_finishes_the_step_and_its_validation(tmp_path, step, moments, number):
     path, trainer = tmp_path / "last.ckpt", Trainer()
     callback = KeepLast(path, every=1e9)
     seen = []
@@ -229,20 +246,70 @@ def test_ctrl_c_finishes_the_step_and_its_validation(tmp_path, step, moments):
             if trainer.global_step == step:
                 seen.append(moment)
                 if moment == "within":
-                    callback.interrupt(signal.SIGINT, None)
+                    os.kill(os.getpid(), number)
 
-    with pytest.raises(Interrupted, match=f"stopped after step {step}$"):
+    with pytest.raises(Interrupted, match=f"stopped after step {step}$") as stop:
         go_on()
+    assert stop.value.number == number
     assert seen == moments
     assert path.read_text() == str(step)
 
 
-def test_a_second_ctrl_c_stops_at_once(tmp_path):
+@pytest.mark.parametrize("second", STOPPING)
+def test_a_second_signal_stops_at_once(tmp_path, second):
     callback = KeepLast(tmp_path / "last.ckpt", every=0)
-    callback.interrupt(signal.SIGINT, None)
-    with pytest.raises(Interrupted, match="within a step"):
-        callback.interrupt(signal.SIGINT, None)
+    callback.on_train_start(Trainer(), None)
+    os.kill(os.getpid(), signal.SIGINT)
+    with pytest.raises(Interrupted, match="within a step") as stop:
+        os.kill(os.getpid(), second)
+    assert stop.value.number == second
     assert not list(tmp_path.iterdir())
+
+
+def test_a_thread_sets_no_handlers(tmp_path):
+    """Which Python would refuse: a training may run in a thread of another program."""
+    before, errors = signal.getsignal(signal.SIGTERM), []
+
+    def start():
+        try:
+            KeepLast(tmp_path / "last.ckpt", every=0).on_train_start(Trainer(), None)
+        except ValueError as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    assert not errors
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize(("first", "hears"), [(True, False), (False, True)])
+def test_of_several_processes_all_stop_when_one_is_told_to(tmp_path, first, hears):
+    """The one that got no signal hears of it from the others, which are pretended here."""
+    path, told = tmp_path / "last.ckpt", []
+    strategy = SimpleNamespace(reduce_boolean_decision=lambda decision, all: told.append(decision) or True)
+    strategy.barrier = lambda: None
+    trainer = Trainer(strategy=strategy, is_global_zero=first, enable_validation=False)
+    path.with_suffix(".part").write_text("another process's")
+    callback = KeepLast(path, every=1e9)
+
+    def go_on():
+        for moment in run(callback, trainer, 3):
+            if hears and moment == "within":
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    with pytest.raises(Interrupted, match=r"stopped after step 1$") as stop:
+        go_on()
+    assert stop.value.number == (signal.SIGTERM if hears else signal.SIGINT)
+    assert told == [hears, hears]
+    assert path.is_file() == first, "the first alone puts the checkpoint in its place"
+
+
+@pytest.mark.parametrize(("first", "saves"), [(True, True), (False, False)])
+def test_of_several_processes_the_clock_of_the_first_counts(tmp_path, first, saves):
+    path, trainer = tmp_path / "last.ckpt", Trainer(is_global_zero=first, enable_validation=False)
+    list(run(KeepLast(path, every=0), trainer, 1))
+    assert path.is_file() == saves
 
 
 def test_a_checkpoint_is_written_whole_or_not_at_all(tmp_path):
@@ -267,21 +334,32 @@ def test_a_checkpoint_is_written_whole_or_not_at_all(tmp_path):
 
 def test_the_progress_line_fits_80_columns_and_counts_from_where_the_training_goes_on(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    trainer = SimpleNamespace(global_step=1200, max_steps=1500, progress_bar_metrics={"train/loss": 0.25, "v_num": 3})
-    line = ProgressLine()
+    metrics = {"train/loss": 0.25, "v_num": 3}
+    trainer = SimpleNamespace(global_step=1200, max_steps=1500, progress_bar_metrics=metrics, is_global_zero=True)
+    line, module = ProgressLine(), SimpleNamespace(task=SPECTRA)
     line.on_train_start(trainer, None)
     trainer.global_step = 1499
     trainer.progress_bar_metrics["validation/ssim"] = 0.5
-    line.on_train_batch_end(trainer, None)
-    line.on_train_end(trainer, None)
+    line.on_train_batch_end(trainer, module)
+    line.on_train_end(trainer, module)
     (shown,) = capsys.readouterr().out.strip().splitlines()
     assert len(shown) <= 80
-    assert re.fullmatch(r"training \S+ +1499/1500 [\d.]+ steps/s \S+ loss 0\.250 SSIM 0\.500", shown), shown
+    assert re.fullmatch(r"training \S+ +1499/1500 [\d.]+ steps/s \S+ loss 0\.250 ssim 0\.500", shown), shown
 
 
 def test_the_progress_line_gives_the_terminal_back_after_an_error():
     line = ProgressLine()
     line.on_exception(None, None, ValueError())
-    line.on_train_start(SimpleNamespace(global_step=0, max_steps=3), None)
+    line.on_train_start(SimpleNamespace(global_step=0, max_steps=3, is_global_zero=True), None)
     line.on_exception(None, None, ValueError())
     assert not line.line.live.is_started
+
+
+def test_of_several_processes_the_first_alone_shows_a_line(capsys):
+    line, module = ProgressLine(), SimpleNamespace(task=SPECTRA)
+    trainer = SimpleNamespace(global_step=0, max_steps=3, progress_bar_metrics={}, is_global_zero=False)
+    line.setup(trainer, module, "fit")
+    line.on_train_start(trainer, module)
+    line.on_train_batch_end(trainer, module)
+    line.on_train_end(trainer, module)
+    assert capsys.readouterr().out == ""

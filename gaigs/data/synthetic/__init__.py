@@ -1,19 +1,24 @@
 """The built-in scene: a furnished room, simulated by the image-source method."""
 
 import itertools
-from collections.abc import Mapping
+import math
+from collections.abc import Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
+from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.data import Grid, Links, Receiver
+from gaigs.data import Links, Parts
 from gaigs.data.nerf2_spectrum import NORMALISATION
-from gaigs.data.splits import TEST
-from gaigs.data.splits import split as split_links
 from gaigs.data.synthetic.image_source import Box, Room, bartlett, frequency_offsets, is_free, min_max, respond
+from gaigs.directions import Grid
 from gaigs.geometry import Pose
-from gaigs.registry import register
+from gaigs.query import Query
+from gaigs.registry import check_type, register
+from gaigs.scene import Array, Receiver
+from gaigs.task.spectrum import Spectrum
 
 ROOM = Room(
     size=(7.0, 5.0, 3.0),
@@ -30,8 +35,11 @@ ROOM = Room(
 )
 """The default room; its corner is the world's origin, z points up."""
 
-RECEIVER = Receiver("gateway1", Pose.from_xyzw((0.2, 0.2, 2.5), (-0.15403, 0.87354, 0.23087, 0.39989)))
-"""High in the corner at the origin, facing down into the room, and turned about its normal."""
+POSE = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.15403, 0.87354, 0.23087, 0.39989))
+"""Of the receiver: high in the corner at the origin, facing down into the room, and turned about its normal."""
+
+SIDE = 4
+"""Elements along each side of its square array, as in the NeRF² spectra."""
 
 REGION = (0.3, 0.3, 0.3), (6.7, 4.7, 2.0)
 """Corners of the box in which transmitters stand [m]."""
@@ -39,59 +47,78 @@ REGION = (0.3, 0.3, 0.3), (6.7, 4.7, 2.0)
 
 @register("data", "synthetic")
 def furnished_room(
-    split: Mapping,
     spectrum: str = "band",
     transmitters: int = 500,
-    frequency: float = 6.4896e9,
+    frequency: float | Sequence[float] = 6.4896e9,
     bandwidth: float = 499.2e6,
     order: int = 2,
     seed: int = 0,
 ) -> Links:
     """Spectra of transmitters at random places in the default room; the official split tests on the last fifth of them.
 
+    Each place sends at each carrier, and these links share a row.
+
     Args:
-        split: Options of ``gaigs.data.splits.split``.
         spectrum: ``band`` or ``carrier``, see ``spectra``.
-        transmitters: How many.
-        frequency: Of the carrier [Hz].
-        bandwidth: Of the band around the carrier [Hz].
+        transmitters: How many places.
+        frequency: Of the carrier, or of several [Hz]. The array is that of the highest, see ``patch_array``.
+        bandwidth: Of the band around each carrier [Hz].
         order: Largest number of reflections of a path.
         seed: Of the transmitters' places.
 
     Raises:
+        TypeError: A frequency is no number.
         ValueError: An option is out of range.
 
     Source: the defaults for frequency and bandwidth are those of channel 5 of IEEE 802.15.4 (ultra-wideband).
     """
-    official = last_fifth(transmitters)
+    carriers = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
+    for carrier in carriers:
+        check_type("frequency", carrier, float)
+    if not carriers or len(set(carriers)) < len(carriers):
+        raise ValueError(f"frequency must be a carrier or several different ones [Hz], got {frequency}")
     positions = place(transmitters, seed)
+    receiver = patch_array(max(carriers))
     grid = Grid.degrees()
+    labels = [spectra(ROOM, positions, receiver, grid, spectrum, carrier, bandwidth, order) for carrier in carriers]
+    rows = torch.arange(transmitters).repeat_interleave(len(carriers))
+    frequencies = torch.tensor(carriers, dtype=torch.float32).repeat(transmitters)
     return Links(
-        transmitters=positions,
-        receivers=(RECEIVER,),
-        receiver_index=torch.zeros(transmitters, dtype=torch.long),
-        labels=spectra(ROOM, positions, RECEIVER.pose, grid, spectrum, frequency, bandwidth, order),
-        split=split_links(positions, official=official, **split),
-        grid=grid,
-        normalisation=NORMALISATION,
+        query=Query(positions[rows], torch.zeros_like(rows), frequencies),
+        receivers=(receiver,),
+        labels=torch.stack(labels, 1).flatten(0, 1),
+        task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
+        rows=rows,
+        official=partial(last_fifth, transmitters, rows),
         edges=edges(ROOM),
     )
 
 
-def last_fifth(transmitters: int) -> tuple[Int[Tensor, "train"], Int[Tensor, "test"]]:
-    """The official split of so many transmitters: the last fifth of them tests.
+def patch_array(frequency: float) -> Receiver:
+    """The default room's receiver: a square array of patches, half a wavelength of the frequency [Hz] apart.
+
+    Raises:
+        ValueError: The frequency is not positive.
+    """
+    if not 0 < frequency < math.inf:
+        raise ValueError(f"frequency must be positive [Hz], got {frequency}")
+    return Receiver("gateway1", POSE, Array.planar(SIDE, SIDE, speed_of_light / frequency / 2, "cosine"))
+
+
+def last_fifth(transmitters: int, rows: Int[Tensor, "n"]) -> Parts:
+    """The official parts of links from so many transmitters, given that of each: the last fifth of them tests."""
+    training = transmitters - max(1, round(transmitters / 5))
+    return (rows < training).nonzero()[:, 0], (rows >= training).nonzero()[:, 0]
+
+
+def place(count: int, seed: int) -> Float[Tensor, "count 3"]:
+    """Random places in the default room [m], uniform over what the furniture leaves free of ``REGION``.
 
     Raises:
         ValueError: There are fewer than 2.
     """
-    if transmitters < 2:
-        raise ValueError(f"transmitters must be at least 2, one to train and one to test on, got {transmitters}")
-    testing = max(1, round(TEST * transmitters))
-    return torch.arange(transmitters).split((transmitters - testing, testing))
-
-
-def place(count: int, seed: int) -> Float[Tensor, "count 3"]:
-    """Random places in the default room [m], uniform over what the furniture leaves free of ``REGION``."""
+    if count < 2:
+        raise ValueError(f"transmitters must be at least 2, one to train and one to test on, got {count}")
     lower, upper = torch.tensor(REGION)
     generator = torch.Generator().manual_seed(seed)
     positions = torch.zeros(0, 3)
@@ -104,7 +131,7 @@ def place(count: int, seed: int) -> Float[Tensor, "count 3"]:
 def spectra(
     room: Room,
     transmitters: Float[Tensor, "n 3"],
-    pose: Pose,
+    receiver: Receiver,
     grid: Grid,
     spectrum: str,
     frequency: float,
@@ -116,7 +143,7 @@ def spectra(
     Args:
         room: Walls and furniture.
         transmitters: Positions [m].
-        pose: Of the array.
+        receiver: Pose and array.
         grid: Directions of the pixels.
         spectrum: ``band``: power averaged over the band, as a channel sounder reports it; paths whose lengths differ by
             more than speed of light / bandwidth do not interfere, so lobes follow the room's geometry. ``carrier``: one
@@ -134,7 +161,9 @@ def spectra(
     # In parts, because the float64 spectra of all transmitters would need several times the memory of the labels.
     return torch.cat(
         [
-            min_max(bartlett(respond(room, part, pose, frequency, offsets, order), grid)).float()
+            min_max(
+                bartlett(respond(room, part, receiver, frequency, offsets, order), grid, receiver.array, frequency)
+            ).float()
             for part in transmitters.split(64)
         ]
     )

@@ -3,8 +3,9 @@
 import argparse
 from pathlib import Path
 
+from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
-from gaigs.data.synthetic import ROOM, furnished_room, wavefront_obj
+from gaigs.data.synthetic import ROOM, wavefront_obj
 
 
 def main() -> None:
@@ -17,14 +18,14 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="folder to write; must not exist, or be empty")
     parser.add_argument("--spectrum", choices=("band", "carrier"), help="averaged over the band, or one frequency")
     parser.add_argument("--transmitters", type=int, help="how many; the last fifth of them tests")
-    parser.add_argument("--frequency", type=float, help="carrier frequency [Hz]")
-    parser.add_argument("--bandwidth", type=float, help="width of the band around it [Hz]")
+    parser.add_argument("--frequency", type=float, action="append", help="carrier [Hz]; give it again for several")
+    parser.add_argument("--bandwidth", type=float, help="width of the band around each [Hz]")
     parser.add_argument("--order", type=int, help="largest number of reflections of a path")
     parser.add_argument("--seed", type=int, help="of the transmitters' places")
     options = vars(parser.parse_args())
     folder = options.pop("folder")
     try:
-        links = furnished_room(split={"protocol": "official", "validation": 0}, **options)
+        links = load({"name": "synthetic", **options}, {"name": "official", "validation": 0})
         write(folder, links)
     except (ValueError, FileExistsError) as error:
         parser.error(str(error))

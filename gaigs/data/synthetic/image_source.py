@@ -1,4 +1,4 @@
-"""The image-source method in a furnished box room: paths, the response of a planar array, spectra and signal strength.
+"""The image-source method in a furnished box room: paths, responses of antenna arrays, spectra and signal strength.
 
 Everything is computed in float64. The formulas and what they leave out stand in docs/data.md.
 """
@@ -12,8 +12,8 @@ from jaxtyping import Complex, Float, Int
 from scipy.constants import epsilon_0, speed_of_light
 from torch import Tensor
 
-from gaigs.data import Grid
-from gaigs.geometry import Pose, from_spherical
+from gaigs.directions import Grid
+from gaigs.scene import Array, Receiver
 
 MATERIALS = {
     "concrete": (5.24, 0.0462, 0.7822),
@@ -25,9 +25,6 @@ MATERIALS = {
     "metal": (1.0, 1e7, 0.0),
 }
 """Relative permittivity, and c and d of the conductivity c (f / GHz)^d [S/m]; ITU-R P.2040-3, table 3, 1 to 40 GHz."""
-
-SIDE = 4
-"""Elements along each side of the square array, as in the NeRF² spectra."""
 
 
 @dataclass(frozen=True)
@@ -221,32 +218,24 @@ def frequency_offsets(room: Room, bandwidth: float, order: int) -> Float[Tensor,
     return torch.linspace(-bandwidth / 2, bandwidth / 2, count, dtype=torch.float64)
 
 
-def array_elements(pose: Pose, wavelength: float) -> Float[Tensor, "elements 3"]:
-    """Positions of the square array's elements, half a wavelength apart, world frame [m]."""
-    steps = (torch.arange(SIDE, dtype=torch.float64) - (SIDE - 1) / 2) * wavelength / 2
-    x, y = torch.meshgrid(steps, steps, indexing="ij")
-    return pose.position.double() + torch.stack((x, y, 0 * x), -1).flatten(0, 1) @ pose.rotation.double().T
-
-
 def respond(
     room: Room,
     transmitters: Float[Tensor, "b 3"],
-    pose: Pose,
+    receiver: Receiver,
     frequency: float,
     offsets: Float[Tensor, "f"],
     order: int,
 ) -> Complex[Tensor, "b elements f"]:
-    """What each element of the array receives from a unit-power isotropic transmitter.
+    """What each element of a receiver's array receives from a unit-power isotropic transmitter.
 
     The phase is that of a spherical wave from each image to each element; reflection, penetration and the elements'
-    pattern are those at the array's centre. The elements are patches with a field pattern of the cosine from the
-    array's normal, 1 there and 0 behind.
+    pattern are those at the array's centre.
 
     Args:
         room: Walls and furniture.
         transmitters: Positions [m].
-        pose: The array's; its z axis is the normal.
-        frequency: Of the carrier [Hz]; the elements stand half its wavelength apart.
+        receiver: Pose and array.
+        frequency: Of the carrier [Hz].
         offsets: Frequencies to evaluate, relative to the carrier [Hz].
         order: Largest number of reflections.
 
@@ -255,67 +244,44 @@ def respond(
 
     Source: Friis, A note on a simple transmission formula, 1946.
     """
-    paths = trace(room, transmitters, pose.position, frequency, order)
-    local = (paths.images - pose.position.double()) @ pose.rotation.double()
-    pattern = (local[..., 2] / local.norm(dim=-1)).clamp(min=0)
-    elements = array_elements(pose, speed_of_light / frequency)
-    distances = (paths.images[:, :, None] - elements).norm(dim=-1)
-    return _add_up(paths.gains * pattern, distances, frequency + offsets.double())
-
-
-def respond_isotropic(
-    room: Room,
-    transmitters: Float[Tensor, "b 3"],
-    receiver: Float[Tensor, "3"],
-    frequency: float,
-    offsets: Float[Tensor, "f"],
-    order: int,
-) -> Complex[Tensor, "b 1 f"]:
-    """What a single antenna that hears all directions alike receives from a unit-power isotropic transmitter.
-
-    Args:
-        room: Walls and furniture.
-        transmitters: Positions [m].
-        receiver: Position of the antenna [m].
-        frequency: Of the carrier [Hz].
-        offsets: Frequencies to evaluate, relative to the carrier [Hz].
-        order: Largest number of reflections.
-
-    Raises:
-        ValueError: A frequency is not positive, or as for ``trace``.
-    """
-    paths = trace(room, transmitters, receiver, frequency, order)
-    distances = (paths.images - receiver.double()).norm(dim=-1, keepdim=True)
-    return _add_up(paths.gains, distances, frequency + offsets.double())
-
-
-def _add_up(
-    gains: Complex[Tensor, "b p"], distances: Float[Tensor, "b p elements"], frequencies: Float[Tensor, "f"]
-) -> Complex[Tensor, "b elements f"]:
-    """The sum of spherical waves over all paths, by path length [m] and frequency [Hz]."""
+    frequencies = frequency + offsets.double()
     if frequencies.min() <= 0:
         raise ValueError(f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth")
+    pose, array = receiver.pose, receiver.array
+    paths = trace(room, transmitters, pose.position, frequency, order)
+    rays = paths.images - pose.position.double()
+    directions = (rays @ pose.rotation.double()) / rays.norm(dim=-1, keepdim=True)
+    elements = pose.position.double() + array.elements.double() @ pose.rotation.double().T
+    distances = (paths.images[:, :, None] - elements).norm(dim=-1)
     phases = distances[..., None] * (2 * math.pi * frequencies / speed_of_light)
     # Friis: wavelength / (4 pi distance), which is 1 / (2 phase).
-    return torch.einsum("bp,bpnf->bnf", gains, torch.polar(0.5 / phases, -phases))
+    waves = torch.polar(0.5 / phases, -phases)
+    return torch.einsum("bp,bpnf->bnf", paths.gains * array.gain(directions), waves)
 
 
-def bartlett(responses: Complex[Tensor, "b elements f"], grid: Grid) -> Float[Tensor, "b rows columns"]:
+def bartlett(
+    responses: Complex[Tensor, "b elements f"], grid: Grid, array: Array, frequency: float
+) -> Float[Tensor, "b rows columns"]:
     """Amplitude of the conventional beamformer's output, root mean square over the frequencies.
 
-    At one frequency it is |sum_n y_n exp(-j pi (i_n cos az cos el + k_n sin az cos el))| with the elements' places
-    (i, k) in half wavelengths of the carrier. Its square depends on the covariance of the y_n only through the sums
-    over pairs of elements with the same difference of places; 49 of them instead of 256 pairs make it cheap.
+    At one frequency it is |sum_n y_n exp(-j 2 pi / lambda (r_n . u))| for element n at r_n and the direction u. Its
+    square is a sum over the covariance of the y_n, half of which says all: one pass for all frequencies of a band.
+
+    Args:
+        responses: Of the array's elements.
+        grid: Directions to look into.
+        array: Its elements' places.
+        frequency: Of the carrier, which the weights are those of [Hz].
 
     Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
     """
     covariances = responses @ responses.mH / responses.shape[-1]
-    places = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE))
-    steps, pair = torch.unique((places[:, None] - places).flatten(0, 1), dim=0, return_inverse=True)
-    lags = covariances.new_zeros(len(responses), len(steps)).index_add(1, pair, covariances.flatten(1))
-    elevations, azimuths = torch.meshgrid(grid.elevations.double(), grid.azimuths.double(), indexing="ij")
-    phases = math.pi * steps.double() @ from_spherical(azimuths, elevations)[..., :2].flatten(0, 1).T
-    power = lags.real @ torch.cos(phases) + lags.imag @ torch.sin(phases)
+    first, second = torch.triu_indices(len(array), len(array), 1)
+    steps = array.elements[first].double() - array.elements[second].double()
+    directions = Grid(grid.elevations.double(), grid.azimuths.double()).flatten().vectors()
+    phases = 2 * math.pi * frequency / speed_of_light * steps @ directions.T
+    pairs, own = 2 * covariances[:, first, second], covariances.diagonal(dim1=1, dim2=2).real.sum(1, keepdim=True)
+    power = own + pairs.real @ torch.cos(phases) + pairs.imag @ torch.sin(phases)
     # In a null of the pattern rounding may leave the power a little below zero.
     return power.clamp(min=0).sqrt().unflatten(1, grid.shape)
 

@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs.data import Grid, Scene
-from gaigs.model import Batch, Model, Prediction
+from gaigs.directions import Directions
+from gaigs.model import Model, Prediction
+from gaigs.query import Batch
+from gaigs.scene import Scene
 from gaigs.tokenizer.euclidean import fourier_features, learnable_octaves
 
 
@@ -20,11 +22,11 @@ class ArrayResponse(Model):
         s(az, el) = | sum_n f_n exp(-j 2 pi (x_n cos az cos el + y_n sin az cos el)) |
         label = (s - min s) / (max s - min s)
 
-    The extremes are those over the scene's whole grid, whatever directions a batch asks for, so that a direction's
+    The extremes are those over the label's whole grid, whatever directions a batch asks for, so that a direction's
     value does not depend on which others are asked for.
 
     Args:
-        scene: Receivers and grid; positions are taken relative to the middle of the transmitters' box.
+        scene: Receivers and task; positions are taken relative to the middle of the transmitters' box.
         rows, columns: Elements along the array's y and x axis.
         pitch: Distance between neighbouring elements [wavelengths].
         octaves: Lowest and highest octave k of the Fourier features, 2^k cycles a metre; None takes those that the
@@ -32,7 +34,7 @@ class ArrayResponse(Model):
         width, layers: Of the network's hidden layers.
 
     Raises:
-        ValueError: The labels are no spectra, or an option is out of range.
+        ValueError: The labels are no spectra or of several carriers, or an option is out of range.
 
     Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
     """
@@ -48,8 +50,13 @@ class ArrayResponse(Model):
         layers: int,
     ):
         super().__init__(scene)
-        if scene.grid is None:
+        if scene.task.name != "spectrum":
             raise ValueError("model 'array_response' predicts spectra, and these labels are none; use another model")
+        if scene.has_band:
+            raise ValueError(
+                f"model 'array_response' measures its array in wavelengths, of one carrier, and these links have "
+                f"{len(scene.frequencies)}; use another model"
+            )
         if rows < 1 or columns < 1 or rows * columns < 2:
             raise ValueError(f"an array must have at least 2 elements, got model.rows={rows}, model.columns={columns}")
         lowest, highest = octaves or learnable_octaves(scene)
@@ -58,7 +65,7 @@ class ArrayResponse(Model):
         x = pitch * (torch.arange(columns) - (columns - 1) / 2)
         y = pitch * (torch.arange(rows) - (rows - 1) / 2)
         self.register_buffer("elements", torch.cartesian_prod(x, y), persistent=False)
-        self.register_buffer("steering", self.steer(scene.grid), persistent=False)
+        self.register_buffer("steering", self.steer(scene.task.directions), persistent=False)
         self.register_buffer("middle", (scene.lower + scene.upper) / 2)
         self.register_buffer("frequencies", 2 * math.pi * 2.0 ** torch.arange(lowest, highest + 1))
         self.fields = (len(scene.receivers), 2 * len(self.elements))
@@ -67,22 +74,22 @@ class ArrayResponse(Model):
         self.network = nn.Sequential(*hidden, nn.Linear(widths[-1], math.prod(self.fields)))
 
     def forward(self, batch: Batch) -> Prediction:
-        features = fourier_features(batch.transmitters - self.middle, self.frequencies)
+        query, directions = batch.query, batch.directions or self.scene.task.directions
+        features = fourier_features(query.transmitters - self.middle, self.frequencies)
         fields = self.network(features).unflatten(-1, self.fields)
-        fields = fields[torch.arange(len(fields), device=fields.device), batch.receivers]
+        fields = fields[torch.arange(len(fields), device=fields.device), query.receivers]
         # A minimum's gradient is that of one pixel: where it lies is searched without the gradients of all the others.
         with torch.no_grad():
             powers = torch.einsum("bf,fcp->bcp", fields, self.steering).square().sum(1)
             extremes = torch.stack((powers.argmin(1), powers.argmax(1)), 1)
         low, high = magnitudes(torch.einsum("bf,fcbp->bcp", fields, self.steering[..., extremes])).split(1, 1)
-        spectra = magnitudes(torch.einsum("bf,fcp->bcp", fields, self.steer(batch.grid)))
-        return Prediction(((spectra - low) / (high - low)).unflatten(1, batch.grid.shape), {})
+        spectra = magnitudes(torch.einsum("bf,fcp->bcp", fields, self.steer(directions)))
+        return Prediction(((spectra - low) / (high - low)).unflatten(1, directions.shape), {})
 
-    def steer(self, grid: Grid) -> Float[Tensor, "fields 2 pixels"]:
+    def steer(self, directions: Directions) -> Float[Tensor, "fields 2 pixels"]:
         """What the real and imaginary parts of the fields, one behind the other, add to those of the sum."""
-        elevations, azimuths = torch.meshgrid(grid.elevations, grid.azimuths, indexing="ij")
-        cosines = torch.stack((azimuths.cos() * elevations.cos(), azimuths.sin() * elevations.cos()))
-        phases = 2 * math.pi * self.elements @ cosines.flatten(1)
+        vectors = directions.to(self.elements).flatten().vectors()
+        phases = 2 * math.pi * self.elements @ vectors[:, :2].T
         cos, sin = phases.cos(), phases.sin()
         return torch.cat((torch.stack((cos, -sin), 1), torch.stack((sin, cos), 1)))
 

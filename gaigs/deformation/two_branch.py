@@ -1,0 +1,148 @@
+"""The paper's scene mapping network: an attenuation branch and a signal branch."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gaigs.deformation import Deformation, Residuals
+from gaigs.placement import Placed
+from gaigs.query import Query
+from gaigs.registry import register
+from gaigs.tokenizer import Tokens
+
+HEADS = ("rotation", "scale", "signal", "opacity", "attenuation")
+"""In the order of ``Residuals``."""
+
+CLEAR = 0.98
+"""The attenuation delta that training starts from: nearly transparent."""
+
+DARKEST = 1e-6
+"""The least attenuation delta, -120 dB: its logarithm, which is what is rendered with, stays finite."""
+
+
+class TokenLinear(nn.Module):
+    """A linear layer on the concatenation [hidden, E(P_x), E(P_TX), CLS] of every (transmitter, Gaussian) pair.
+
+    It is the sum of one linear map of each part, so the part that depends on the Gaussian alone is computed n times,
+    the transmitter's and the scene's b times, and only ``hidden`` b x n times; the concatenation never exists.
+    """
+
+    def __init__(self, tokens: tuple[int, int, int], width: int, hidden: int = 0):
+        super().__init__()
+        scene, gaussian, transmitter = tokens
+        self.bias = nn.Parameter(torch.empty(width))
+        self.links, self.gaussians, self.hidden = (
+            nn.Linear(part, width, bias=False) if part else None for part in (scene + transmitter, gaussian, hidden)
+        )
+        bound = max(scene + gaussian + transmitter + hidden, 1) ** -0.5
+        for parameter in self.parameters():  # as one layer over the whole concatenation would start
+            nn.init.uniform_(parameter, -bound, bound)
+
+    def forward(self, tokens: Tokens, hidden: Float[Tensor, "b n h"] | None = None) -> Float[Tensor, "b n width"]:
+        result = self.bias
+        if self.links is not None:
+            result = result + self.links(torch.cat((tokens.scene, tokens.transmitters), -1))[:, None]
+        if self.gaussians is not None:
+            result = result + self.gaussians(tokens.gaussians)
+        if self.hidden is not None:
+            result = result + self.hidden(hidden)
+        return result.expand(len(tokens.scene), tokens.gaussians.shape[-2], -1)
+
+
+class ResidualLayer(nn.Module):
+    """h + GELU(W h): keeps what earlier layers know of the geometry."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.linear = nn.Linear(width, width)
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        return hidden + functional.gelu(self.linear(hidden))
+
+
+@register("deformation", "two_branch")
+class TwoBranch(Deformation):
+    """The paper's two branches, from the tokens of b queries and n Gaussians to residuals.
+
+    Attenuation branch: f = residual layers on [E(P_x), E(P_TX), CLS]; heads for the opacity residual and delta.
+    Signal branch: h = residual layers on [f, E(P_x), E(P_TX), CLS]. Heads on [f, h]: rotation, scale, signal.
+    Heads other than the signal's start at zero residual, delta at ``CLEAR``.
+
+    Args:
+        tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens.
+        channels: Signal channels of a Gaussian.
+        width: Of both branches.
+        attenuation_layers, signal_layers: Residual layers of each branch, behind its first layer.
+        heads: Which of ``HEADS`` exist; what only a head left out would need has no parameters.
+
+    Raises:
+        ValueError: There is no such head, or a width or number of layers is out of range.
+
+    Source: GAI-GS, "Scene Mapping Network".
+    """
+
+    def __init__(
+        self,
+        tokenizer_widths: tuple[int, int, int],
+        channels: int,
+        width: int,
+        attenuation_layers: int,
+        signal_layers: int,
+        heads: list[str],
+    ):
+        super().__init__()
+        unknown = set(heads) - set(HEADS)
+        if unknown:
+            raise ValueError(f"deformation.heads must be among {', '.join(HEADS)}, got {', '.join(sorted(unknown))}")
+        for option, count, least in (
+            ("width", width, 1),
+            ("attenuation_layers", attenuation_layers, 0),
+            ("signal_layers", signal_layers, 0),
+        ):
+            if count < least:
+                raise ValueError(f"deformation.{option} must be at least {least}, got {count}")
+        self.heads = nn.ModuleDict()
+        if not heads:
+            return
+        self.attenuation_first = TokenLinear(tokenizer_widths, width)
+        self.attenuation_rest = nn.Sequential(*(ResidualLayer(width) for _ in range(attenuation_layers)))
+        if "opacity" in heads:
+            self.heads["opacity"] = nn.Linear(width, 1)
+        if "attenuation" in heads:
+            self.heads["attenuation"] = nn.Linear(width, 1)
+        self.has_signal_branch = not set(heads).isdisjoint(("rotation", "scale", "signal"))
+        if self.has_signal_branch:
+            self.signal_first = TokenLinear(tokenizer_widths, width, hidden=width)
+            self.signal_rest = nn.Sequential(*(ResidualLayer(width) for _ in range(signal_layers)))
+        for head, size in (("rotation", 4), ("scale", 3), ("signal", channels)):
+            if head in heads:
+                self.heads[head] = nn.Linear(2 * width, size)
+        for name, head in self.heads.items():
+            if name != "signal":
+                nn.init.zeros_(head.weight)
+                nn.init.zeros_(head.bias)
+        if "attenuation" in heads:
+            nn.init.constant_(self.heads["attenuation"].bias, math.log(CLEAR / (1 - CLEAR)))
+
+    def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
+        """Residuals for every pair of a query and a Gaussian."""
+        results = dict.fromkeys(HEADS)
+        if not self.heads:
+            return Residuals()
+        attenuation = self.attenuation_rest(functional.gelu(self.attenuation_first(tokens)))
+        features = {"opacity": attenuation, "attenuation": attenuation}
+        if self.has_signal_branch:
+            signal = self.signal_rest(functional.gelu(self.signal_first(tokens, attenuation)))
+            features |= dict.fromkeys(("rotation", "scale", "signal"), torch.cat((attenuation, signal), -1))
+        for name, head in self.heads.items():
+            results[name] = head(features[name])
+        if results["signal"] is not None:
+            results["signal"] = results["signal"][..., None]
+        if results["opacity"] is not None:
+            results["opacity"] = results["opacity"].squeeze(-1)
+        if results["attenuation"] is not None:
+            results["attenuation"] = DARKEST + (1 - DARKEST) * results["attenuation"].squeeze(-1).sigmoid()
+        return Residuals(*results.values())

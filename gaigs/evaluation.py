@@ -1,0 +1,211 @@
+"""What a run reports of a trained model and its baselines: scores, times, predictions, figures."""
+
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from gaigs.data import Links, Split
+from gaigs.gaussians import SH_DC, Gaussians
+from gaigs.model import Model
+from gaigs.registry import registry
+from gaigs.scene import Scene
+
+BATCH = 64
+"""Links predicted at a time."""
+
+Scores = dict[str, dict[str, Tensor]]
+"""Scores of every link, by the model's name and the score's."""
+
+
+def baseline_configurations(configurations: Sequence[Mapping], own: str, scene: Scene) -> dict[str, Mapping]:
+    """Configurations of the models that a run is held against, by name; without the run's own.
+
+    Raises:
+        ValueError: One has no name, an unknown one, or options that do not fit; two have the same name; or one is a
+            model that has to be trained.
+    """
+    found: dict[str, Mapping] = {}
+    for config in configurations:
+        if not isinstance(config, Mapping) or "name" not in config:
+            raise ValueError(f"baselines must be a list of model configurations with a name, got {config!r}")
+        name = config["name"]
+        if name in found:
+            raise ValueError(f"baselines must have different names, got {name!r} twice")
+        if is_trained(registry("model").build(config, scene=scene)):
+            raise ValueError(f"baselines are models without a training, and {name!r} has one; take it as model={name}")
+        found[name] = config
+    return {name: config for name, config in found.items() if name != own}
+
+
+def is_trained(model: Model) -> bool:
+    """Whether a model has parameters to be trained, beside what ``fit`` takes from the links."""
+    return any(parameter.requires_grad for parameter in model.parameters())
+
+
+def fit(config: Mapping, links: Links) -> Model:
+    """A model that learns by ``fit`` alone, fitted."""
+    model = registry("model").build(config, scene=links.scene)
+    model.fit(links)
+    return model
+
+
+def predict(model: Model, links: Links, index: Int[Tensor, "k"]) -> Tensor:
+    """Predictions for some links, on the CPU."""
+    return torch.cat([model.predict(links.query[part], batch_size=BATCH).cpu() for part in index.split(BATCH)])
+
+
+def test(model: Model, name: str, baselines: Mapping[str, Mapping], links: Links, folder: Path) -> Scores:
+    """Scores of the model and its baselines on every test link; writes ``predictions.npz``."""
+    task, index = links.task, links.split.test
+    labels = torch.cat([links.labels[part] for part in index.split(BATCH)])
+    query = links.query[index]
+    content = {
+        "link": index.numpy(),
+        "transmitters": query.transmitters.numpy(),
+        "receiver": query.receivers.numpy(),
+        "labels": task.packed(labels),
+    }
+    if query.frequencies is not None:
+        content["frequencies"] = query.frequencies.numpy()
+    scores = {}
+    for key, candidate in ({name: model} | dict.fromkeys(baselines)).items():
+        values = predict(candidate or fit(baselines[key], links), links, index)
+        scores[key] = task.scores(labels, values)
+        if candidate is model:
+            content["prediction"] = task.packed(values)
+        content |= {f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()}
+    np.savez_compressed(folder / "predictions.npz", **content)
+    return scores
+
+
+def validate(model: Model, config: Mapping, baselines: Mapping[str, Mapping], links: Links) -> Scores:
+    """Scores on the validation links of the model as it was trained, and of baselines that have not seen them.
+
+    A model that learns by ``fit`` alone is fitted anew without them, too. There are none where nothing validates.
+    """
+    split = links.split
+    if not len(split.validation):
+        return {}
+    unseen = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
+    labels = torch.cat([links.labels[part] for part in split.validation.split(BATCH)])
+    scores = {}
+    for name, candidate in {config["name"]: config, **baselines}.items():
+        fitted = model if candidate is config and is_trained(model) else fit(candidate, unseen)
+        scores[name] = links.task.scores(labels, predict(fitted, unseen, split.validation))
+    return scores
+
+
+def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
+    """The numbers of a table for each receiver that has test links, by its name and the model's."""
+    receivers = links.query.receivers[links.split.test]
+    return {
+        receiver.name: {
+            name: links.task.summarise({key: score[receivers == i] for key, score in values.items()})
+            for name, values in scores.items()
+        }
+        for i, receiver in enumerate(links.receivers)
+        if (receivers == i).any()
+    }
+
+
+def inference_ms(model: Model, links: Links) -> float:
+    """Milliseconds from a query to its value, everything included."""
+    query = links.query[links.split.test[:1]]
+    return median_ms(lambda: model.predict(query))
+
+
+def render_ms(model: Model, links: Links) -> float | None:
+    """Milliseconds of rendering alone; None for a model that renders nothing."""
+    work = model.rendering(links.batch(links.split.test[:1]).to(device_of(model)))
+    if work is None:
+        return None
+    with torch.no_grad():
+        return median_ms(work)
+
+
+def median_ms(work: Callable, warm_up: int = 5, repeats: int = 25) -> float:
+    """Median duration of a call [ms], after warm-up."""
+    wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
+    seconds = []
+    for _ in range(warm_up + repeats):
+        wait()
+        start = time.perf_counter()
+        work()
+        wait()
+        seconds.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(seconds[warm_up:])
+
+
+def device_of(model: Model) -> torch.device:
+    """Where a model computes."""
+    return next((tensor.device for tensor in model.state_dict().values()), torch.device("cpu"))
+
+
+def device_name(device: torch.device) -> str:
+    """What the numbers were computed on."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    threads = torch.get_num_threads()
+    return f"{names[0] if names else platform.processor() or platform.machine()}, {threads} thread{'s' * (threads > 1)}"
+
+
+def write_figures(folder: Path, links: Links, gaussians: Gaussians | None) -> list[Path]:
+    """Draws a run: its room, its losses, and what its task shows of the predictions.
+
+    Args:
+        folder: Of the run. What ``test`` and the task wrote is read from it, and ``log/*/metrics.csv`` where the model
+            was trained; the figures go to ``figures/``.
+        links: What the run was trained and tested on.
+        gaussians: The Gaussians it learnt; None for a model without.
+
+    Returns:
+        The files, as PNG.
+
+    Raises:
+        FileNotFoundError: The folder lacks what its task draws from.
+    """
+    from gaigs.report.curves import loss_curves, read_curves  # matplotlib is slow to import
+    from gaigs.report.style import DPI
+
+    figures = {"room": _room(links, gaussians)}
+    if losses := sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime):
+        figures["loss"] = loss_curves(read_curves(losses))
+    figures |= links.task.figures(folder, links)
+    (folder / "figures").mkdir(exist_ok=True)
+    files = {folder / "figures" / f"{name}.png": figure for name, figure in figures.items()}
+    for file, figure in files.items():
+        figure.savefig(file, dpi=DPI)
+    return list(files)
+
+
+@torch.no_grad()
+def _room(links: Links, gaussians: Gaussians | None):
+    from gaigs.report.room import Cloud, room
+
+    poses = [receiver.pose for receiver in links.receivers]
+    rotations = np.stack([pose.rotation.numpy() for pose in poses])
+    has_axes = [len(receiver.array) > 1 or links.task.directions is not None for receiver in links.receivers]
+    cloud = None
+    if gaussians is not None:
+        strengths = gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)
+        cloud = Cloud(*(values.cpu().numpy() for values in (gaussians.means, gaussians.covariances, strengths)))
+    places = links.query.transmitters
+    return room(
+        places[links.split.train].numpy(),
+        places[links.split.test].numpy(),
+        np.stack([pose.position.numpy() for pose in poses]),
+        rotations[: sum(has_axes)] if all(has_axes) else rotations[:0],
+        links.edges.numpy(),
+        cloud,
+    )

@@ -1,0 +1,32 @@
+"""Huber's loss."""
+
+from torch import Tensor
+from torch.nn.functional import huber_loss
+
+from gaigs.loss._errors import MeanError
+from gaigs.registry import register
+from gaigs.task import Task
+
+
+@register("loss", "huber")
+class Huber(MeanError):
+    """Half the square of an error up to ``delta``, and linear beyond.
+
+    Args:
+        task: Whose labels are compared.
+        delta: Where it turns, in the label's unit (dB for RSSI).
+
+    Raises:
+        ValueError: ``delta`` is not positive, or the labels are complex.
+
+    Source: Huber, Robust estimation of a location parameter, 1964.
+    """
+
+    def __init__(self, task: Task, delta: float):
+        super().__init__(task)
+        if not delta > 0:
+            raise ValueError(f"loss.delta must be more than 0, got {delta}")
+        self.delta = delta
+
+    def mean(self, values: Tensor, labels: Tensor) -> Tensor:
+        return huber_loss(values, labels, delta=self.delta)

@@ -1,0 +1,78 @@
+"""The paper's loss of spectra: mean absolute error and structural similarity."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from gaigs.directions import Grid
+from gaigs.query import Batch
+from gaigs.registry import register
+from gaigs.task import Task
+from gaigs.task.spectrum import SSIM_WINDOW
+
+
+@register("loss", "l1_ssim")
+class L1Ssim:
+    """(1 - ssim) L_MAE + ssim (1 - SSIM) on a grid, or on every so many rows and columns of one.
+
+    The uniform SSIM window spans the angle that the reported score's 7 pixels span on the label's own grid, though not
+    less than 3 of the pixels looked at, nor more than there are.
+
+    Args:
+        task: Its grid is the one that windows are measured on.
+        ssim: Weight of the SSIM term, the paper's 1 - beta.
+
+    Raises:
+        ValueError: The weight is out of range, or the labels have no grid.
+
+    Source: GAI-GS, "Results": L_MAE and L_SSIM.
+    """
+
+    def __init__(self, task: Task, ssim: float):
+        if not 0 <= ssim <= 1:
+            raise ValueError(f"loss.ssim must be in [0, 1], got {ssim}")
+        if task.directions is None:
+            raise ValueError(f"loss 'l1_ssim' compares spectra, and labels of task {task.name!r} are none")
+        self.ssim, self.pitch = ssim, task.directions.pitch
+
+    def __call__(self, values: Float[Tensor, "b rows columns"], batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss, and its terms ``l1`` and ``ssim``; see ``gaigs.loss.Loss``.
+
+        Raises:
+            ValueError: The batch asks for a list of directions, which has no windows, or for fewer than 3 x 3.
+        """
+        if not isinstance(batch.directions, Grid):
+            raise ValueError(
+                "loss 'l1_ssim' needs rows and columns, and training.thinning.rays draws single directions; take "
+                "loss=absolute or loss=squared"
+            )
+        smallest = min(batch.directions.shape)
+        if smallest < 3:
+            raise ValueError(f"loss 'l1_ssim' needs at least 3 x 3 directions, got {batch.directions.shape}")
+        step = max(1, round(batch.directions.pitch / self.pitch))
+        window = min(max(3, round((SSIM_WINDOW - 1) / step / 2) * 2 + 1), (smallest - 1) // 2 * 2 + 1)
+        terms = {
+            "l1": (values - batch.labels).abs().mean(),
+            "ssim": 1 - structural_similarity(values, batch.labels, window),
+        }
+        return (1 - self.ssim) * terms["l1"] + self.ssim * terms["ssim"], terms
+
+
+def structural_similarity(
+    values: Float[Tensor, "b rows columns"], labels: Float[Tensor, "b rows columns"], window: int
+) -> Float[Tensor, ""]:
+    """Mean SSIM over all windows that lie within the image: uniform weights, sample covariances, data range 1.
+
+    With a window of 7 on the full grid it is the reported score, scikit-image's; mean pooling makes it differentiable.
+    torchmetrics' convolutions would take a quarter of a training step here, and leave five rows out at each border.
+
+    Source: Wang et al., Image Quality Assessment, 2004, with the constants 0.01² and 0.03².
+    """
+    products = (values, labels, values.square(), labels.square(), values * labels)
+    x, y, xx, yy, xy = avg_pool2d(torch.stack(products, 1), window, stride=1).unbind(1)
+    unbiased = window**2 / (window**2 - 1)
+    variances = unbiased * (xx - x.square() + yy - y.square())
+    covariance = unbiased * (xy - x * y)
+    numerator = (2 * x * y + 0.01**2) * (2 * covariance + 0.03**2)
+    return (numerator / ((x.square() + y.square() + 0.01**2) * (variances + 0.03**2))).mean()

@@ -1,0 +1,14 @@
+"""Mean squared error."""
+
+from torch import Tensor
+
+from gaigs.loss._errors import MeanError
+from gaigs.registry import register
+
+
+@register("loss", "squared")
+class Squared(MeanError):
+    """The mean of the labels at a place is what it is least for."""
+
+    def mean(self, values: Tensor, labels: Tensor) -> Tensor:
+        return (values - labels).square().mean()

@@ -1,0 +1,115 @@
+"""What a run shares a machine with: its threads, the signals that stop it, other runs, and its own other processes."""
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+STOPPING = (signal.SIGINT, signal.SIGTERM)
+"""Signals at which a run stops where it can go on: Ctrl-C, and what schedulers send before they kill."""
+
+POCL_THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
+"""Environment variables that limit the threads of OpenCL on the processor: PoCL up to version 3, and later ones."""
+
+
+received: list[int] = []
+"""Signals at which runs of this process have stopped: a launcher's worker starts no other then."""
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal has stopped a run.
+
+    Args:
+        message: Where it stopped.
+        number: Of the signal.
+    """
+
+    def __init__(self, message: str, number: int):
+        super().__init__(message)
+        self.number = number
+
+
+def limit_threads(count: int | None, jobs: int = 1) -> None:
+    """Has torch and PoCL take so many threads; to be called before OpenCL is first used.
+
+    Args:
+        count: Threads; None leaves everything as it is, but shares the processors where several jobs run at a time.
+        jobs: How many jobs run at a time on this machine; -1 is one for each processor.
+
+    Raises:
+        ValueError: The count is less than 1.
+    """
+    if count is None and jobs in (0, 1):
+        return
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if count is None:
+        count = max(1, processors // (processors if jobs < 0 else jobs))
+    if count < 1:
+        raise ValueError(f"threads must be at least 1, or null for all, got {count}")
+    import torch  # slow to import
+
+    for name in ("OMP_NUM_THREADS", *POCL_THREADS):
+        os.environ[name] = str(count)
+    torch.set_num_threads(count)
+
+
+def is_first() -> bool:
+    """Whether this is the first of the processes that train together, which alone writes files."""
+    from lightning.pytorch.utilities import rank_zero_only  # slow to import
+
+    return rank_zero_only.rank == 0
+
+
+@contextlib.contextmanager
+def only_run(folder: Path) -> Iterator[None]:
+    """Holds a run's folder against other runs, as long as this process lives; nothing is written there.
+
+    Raises:
+        ValueError: Another run holds it.
+    """
+    try:
+        import fcntl
+    except ImportError:  # no such locks on this system
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(
+                f"{folder} must be free, and another run is at work there; wait for it, or choose another folder with "
+                "hydra.run.dir=DIR"
+            ) from None
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def stopping() -> Iterator[None]:
+    """Has SIGTERM stop a run as Ctrl-C does; what handlers there were come back."""
+    if threading.current_thread() is not threading.main_thread():  # others may set no handlers
+        yield
+        return
+    handlers = {number: signal.getsignal(number) for number in STOPPING}
+
+    def stop(number: int, _) -> None:
+        raise Stopped("stopped", number)
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def forward_to_children(number: int) -> None:
+    """Sends a signal to the processes that this one has started, as far as the system tells."""
+    for task in Path("/proc/self/task").glob("*/children"):
+        for child in task.read_text().split():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(child), number)

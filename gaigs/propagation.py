@@ -1,0 +1,138 @@
+"""Free space: the wave that would arrive if there were nothing but transmitter and receiver."""
+
+import math
+
+import torch
+from jaxtyping import Complex, Float, Int
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.query import Query
+from gaigs.scene import Scene
+
+NEAREST = 1e-2
+"""Smaller distances count as this one [m]: at 0 a spherical wave has no value."""
+
+KEPT = 0.01
+"""Share of the channels' power that must follow the direct distance for a sign to be told, beside what chance keeps."""
+
+
+def free_space(
+    distances: Float[Tensor, "*batch"], frequencies: Float[Tensor, "*batch"], sign: int = -1
+) -> Complex[Tensor, "*batch"]:
+    """lambda / (4 pi d) exp(sign j 2 pi f d / c): unit power between isotropic antennas, computed in float64.
+
+    Args:
+        distances: Between transmitter and receiver [m].
+        frequencies: To be broadcast against the distances [Hz].
+        sign: -1 for the time dependence exp(+j omega t), +1 for exp(-j omega t), 0 for the amplitude alone.
+
+    Source: Friis, A note on a simple transmission formula, 1946.
+    """
+    phases = distances.double().clamp(min=NEAREST) * (2 * math.pi / speed_of_light) * frequencies.double()
+    return torch.polar(0.5 / phases, sign * phases)
+
+
+def check_elements(what: str, scene: Scene) -> None:
+    """Sees to it that labels are channels, and that each receiver's array has as many elements as they.
+
+    Args:
+        what: Who takes nothing else, as errors call it.
+        scene: Its task and receivers.
+
+    Raises:
+        ValueError: They are not, or one has not.
+    """
+    task = scene.task
+    if not task.dtype.is_complex or len(task.shape) != 2:
+        raise ValueError(f"{what} gives complex channels, and labels of task {task.name!r} are none; take another")
+    for receiver in scene.receivers:
+        if len(receiver.array) != task.shape[0]:
+            raise ValueError(
+                f"the labels have {task.shape[0]} elements, and the array of {receiver.name} {len(receiver.array)}; "
+                "give the data's elements"
+            )
+
+
+def direct_waves(
+    scene: Scene, query: Query, frequencies: Float[Tensor, "s"], sign: int = -1, at_elements: bool = True
+) -> Complex[Tensor, "b e s"]:
+    """Free space from each transmitter to the elements of its receiver, or to its middle alone (e = 1).
+
+    Args:
+        scene: Its receivers' arrays have the same number of elements.
+        query: The links.
+        frequencies: [Hz].
+        sign: Of phases, as for ``free_space``.
+        at_elements: Whether to each element.
+    """
+    # In float64: some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz 1e-4 rad.
+    places = []
+    for receiver in scene.receivers:
+        pose, elements = receiver.pose.to(torch.zeros((), dtype=torch.float64)), receiver.array.elements.double().cpu()
+        places.append(pose.world(elements) if at_elements else pose.position[None])
+    places = torch.stack(places).to(query.transmitters.device)[query.receivers]
+    distances = (query.transmitters.double()[:, None] - places).norm(dim=-1)
+    return free_space(distances[..., None], frequencies.to(distances.device), sign)
+
+
+def direct_gains(scene: Scene, query: Query) -> Float[Tensor, "b"]:
+    """Field gain of each receiver's elements towards the transmitter, seen from the array's middle; float64.
+
+    On the very middle no direction is seen, and the gain is that along the array's normal.
+    """
+    gains = torch.ones(len(query), dtype=torch.float64, device=query.transmitters.device)
+    for receiver in query.receivers.unique().tolist():
+        own, antenna = query.receivers == receiver, scene.receivers[receiver]
+        points = antenna.pose.to(gains).local(query.transmitters[own].double())
+        lengths = points.norm(dim=-1, keepdim=True)
+        gains[own] = antenna.array.gain(torch.where(lengths > 0, points / lengths, points.new_tensor([0.0, 0.0, 1.0])))
+    return gains
+
+
+def phase_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, "k"]) -> int:
+    """The sign with which the phases of channels follow the direct distance.
+
+    The direct path alone, over free space, would be one number at all links of a receiver. What the mean over links
+    keeps of the power is compared for both signs; by chance alone it is about one part in the number of links.
+
+    Args:
+        channels: Measured.
+        waves: ``direct_waves`` of the same links, with the sign -1.
+        receivers: Of each link.
+
+    Returns:
+        -1 or 1; 0 where neither keeps ``KEPT`` more than four times what chance does.
+    """
+    relative, phases = channels / waves.abs(), waves.angle()
+    kept = {-1: 0.0, 1: 0.0}
+    for receiver in receivers.unique().tolist():
+        own = receivers == receiver
+        for sign in kept:
+            # waves.angle() is that of the sign -1, which it undoes where the channels have it.
+            still = relative[own] * torch.polar(torch.ones_like(phases[own]), sign * phases[own])
+            kept[sign] += int(own.sum()) * still.mean(0).abs().square().mean().item()
+    total = relative.abs().square().mean().item() * len(receivers)
+    best = max(kept, key=kept.get)
+    chance = len(receivers.unique()) / len(receivers)
+    return best if kept[best] > (KEPT + 4 * chance) * total else 0
+
+
+def array_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"]) -> int:
+    """The sign with which phases follow the direct distance from one element or subcarrier of a link to another.
+
+    It can be told where the links' common phases are random.
+
+    Args:
+        channels: Measured.
+        waves: ``direct_waves`` of the same links, with the sign -1.
+
+    Returns:
+        -1 or 1, whichever keeps more power in the mean over elements and subcarriers; -1 where neither does.
+    """
+    relative, phases = channels / waves.abs(), waves.angle()
+    kept = [
+        (relative * torch.polar(torch.ones_like(phases), sign * phases)).mean((1, 2)).abs().square().sum()
+        for sign in (-1, 1)
+    ]
+    return 1 if kept[1] > kept[0] else -1

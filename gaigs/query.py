@@ -1,0 +1,91 @@
+"""What a model is asked: who sends, who hears, at which frequency; and a batch of such questions with their labels."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gaigs.directions import Directions
+
+
+@dataclass
+class Query:
+    """Links, each of one transmitter to one receiver. Two are alike only if all their fields are.
+
+    Attributes:
+        transmitters: Positions, world frame (b, 3) [m].
+        receivers: Indices into the scene's receivers (b,).
+        frequencies: Of the carrier (b,) [Hz]; None where it is unknown.
+    """
+
+    transmitters: Float[Tensor, "b 3"]
+    receivers: Int[Tensor, "b"]
+    frequencies: Float[Tensor, "b"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.transmitters)
+
+    def __getitem__(self, index: slice | Int[Tensor, "k"]) -> "Query":
+        """Some of the links."""
+        frequencies = None if self.frequencies is None else self.frequencies[index]
+        return Query(self.transmitters[index], self.receivers[index], frequencies)
+
+    def to(self, device: torch.device | str) -> "Query":
+        """The same query on another device."""
+        frequencies = None if self.frequencies is None else self.frequencies.to(device)
+        return Query(self.transmitters.to(device), self.receivers.to(device), frequencies)
+
+    def parts(self, size: int) -> Iterator["Query"]:
+        """The links in their order, so many at a time."""
+        return (self[start : start + size] for start in range(0, len(self), size))
+
+    def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, "b"]]:
+        """The different places and frequencies, or the different links.
+
+        Args:
+            with_receivers: Whether links to two receivers differ. Where they do not, each place has one of its
+                receivers, whichever.
+
+        Returns:
+            One link of each kind, sorted by position, frequency and receiver; and which of them each link is.
+        """
+        columns = self.transmitters
+        others = [self.frequencies] if self.frequencies is not None else []
+        others += [self.receivers] if with_receivers else []
+        if others:
+            # Positions and frequencies are float32 or float64, which double holds exactly; so is an index.
+            columns = torch.cat((columns.double(), *(other.double()[:, None] for other in others)), 1)
+        _, which = columns.unique(dim=0, return_inverse=True)
+        count = int(which.max()) + 1 if len(which) else 0
+        numbers = torch.arange(len(which), device=which.device)
+        first = numbers.new_full((count,), len(which)).scatter_reduce(0, which, numbers, "amin")
+        return self[first], which
+
+
+@dataclass
+class Batch:
+    """A query with the directions asked for and what was measured.
+
+    Attributes:
+        query: The links.
+        directions: Those to predict, for all links the same; None where the label has none.
+        labels: What was measured (b, ...), of the task's shape; None when predicting.
+        shares: Weights of the mean over these links, and of that over their places, in the mean over all processes
+            that train together; 1 where there is a single one.
+    """
+
+    query: Query
+    directions: Directions | None = None
+    labels: Tensor | None = None
+    shares: tuple[float, float] = (1.0, 1.0)
+
+    def __len__(self) -> int:
+        return len(self.query)
+
+    def to(self, device: torch.device | str) -> "Batch":
+        """The same batch on another device."""
+        directions = None if self.directions is None else self.directions.to(device)
+        labels = None if self.labels is None else self.labels.to(device)
+        return Batch(self.query.to(device), directions, labels, self.shares)

@@ -1,0 +1,110 @@
+"""OpenCL devices: which there are, which is taken, and whether it can build kernels."""
+
+import functools
+import os
+
+import pyopencl as cl
+
+PROBE = "kernel void probe(global int *value) { value[0] = 1; }"
+"""The least that a device must be able to build."""
+
+
+def devices() -> list[str]:
+    """The OpenCL devices of this machine, each as "platform: device (kind)".
+
+    Raises:
+        RuntimeError: There is no OpenCL driver, or it is broken.
+    """
+    return [name_of(device) for device in _devices()]
+
+
+def default_device() -> str:
+    """The one of ``devices`` that is taken where none is asked for.
+
+    Raises:
+        RuntimeError: There is no OpenCL driver, or it is broken.
+        ValueError: No device has the name in GAIGS_OPENCL_DEVICE.
+    """
+    return name_of(_choose(os.environ.get("GAIGS_OPENCL_DEVICE")))
+
+
+def _devices() -> list[cl.Device]:
+    """The devices of all drivers; one that is broken hurts only where it is the only one."""
+    found, causes = [], []
+    try:
+        for platform in cl.get_platforms():
+            try:
+                found += platform.get_devices()
+            except cl.Error as error:
+                causes.append(f"; {platform.name} lists no devices ({error})")
+    except cl.Error as error:  # with no platform, too
+        causes.append(f" ({error})")
+    if not found:
+        needs = "rasterizer 'opencl' needs an OpenCL driver: pip install 'pyopencl[pocl]', or use rasterizer=torch"
+        raise RuntimeError(needs + "".join(causes))
+    return found
+
+
+def name_of(device: cl.Device) -> str:
+    """As ``devices`` lists it."""
+    kinds = (kind for kind in ("CPU", "GPU", "ACCELERATOR") if device.type & getattr(cl.device_type, kind))
+    return f"{device.platform.name}: {device.name} ({' '.join(kinds)})"
+
+
+def open_queue(name: str | None) -> cl.CommandQueue:
+    """The queue of a device, the same for all who ask.
+
+    Args:
+        name: Part of a name that ``devices`` lists; None takes what GAIGS_OPENCL_DEVICE says, and without it the first
+            CPU.
+
+    Raises:
+        RuntimeError: There is no OpenCL driver, or it is broken.
+        ValueError: No device has such a name.
+    """
+    return _open(name or os.environ.get("GAIGS_OPENCL_DEVICE"))
+
+
+@functools.cache
+def _open(name: str | None) -> cl.CommandQueue:
+    device = _choose(name)
+    try:
+        return cl.CommandQueue(cl.Context([device]))
+    except cl.Error as error:
+        raise RuntimeError(
+            f"rasterizer 'opencl': {name_of(device)} cannot be opened ({error}); mend its driver, take another device "
+            "with GAIGS_OPENCL_DEVICE, or use rasterizer=torch"
+        ) from error
+
+
+def _choose(name: str | None) -> cl.Device:
+    """The first device whose name has such a part; without one the first CPU, or the first device of any kind."""
+    found = _devices()
+    if name:
+        chosen = [device for device in found if name.lower() in name_of(device).lower()]
+    else:
+        chosen = [device for device in found if device.type & cl.device_type.CPU] or found
+    if not chosen:
+        listed = "; ".join(map(name_of, found))
+        raise ValueError(f"rasterizer 'opencl': no OpenCL device is called {name!r}; there are: {listed}")
+    return chosen[0]
+
+
+@functools.cache
+def find_fault(queue: cl.CommandQueue) -> str | None:
+    """Why a device cannot build kernels, in its driver's words; None where it can.
+
+    A driver may list a processor that its compiler does not know.
+    """
+    try:
+        cl.Program(queue.context, PROBE).build()
+    except cl.Error as error:
+        return cause_of(error)
+    return None
+
+
+def cause_of(error: cl.Error) -> str:
+    """The first error in the log of a build that failed, or else the log's last line."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    lines = [line for line in lines if line and not line.startswith("(")]  # pyopencl's notes on options and source
+    return next((line for line in lines if "error:" in line), lines[-1])

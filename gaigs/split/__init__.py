@@ -1,0 +1,98 @@
+"""Splits say which links train, validate and test. docs/data.md says what each of them measures.
+
+A component of kind ``split`` is a function of the links and its own options. Validation links are taken out of the
+training links in the way that the test links were taken out of all links, so that they predict the test error. Links of
+one row are never parted but by the official parts: they have their place in common, and so mostly what shadows it.
+"""
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from gaigs.data import Links, Split
+
+TEST = 0.2
+"""Fraction of the links that test where none is given; the published s23 split has 0.20 too."""
+
+
+def rows_of(links: Links) -> Int[Tensor, "n"]:
+    """Row of each link in the order of measurement."""
+    return torch.arange(len(links)) if links.rows is None else links.rows
+
+
+def part(
+    name: str,
+    links: Links,
+    groups: Int[Tensor, "n"],
+    test: float,
+    validation: float,
+    seed: int,
+) -> Split:
+    """Holds out whole groups of links, for the test and of the rest for validation.
+
+    Args:
+        name: Of the protocol, with its own options.
+        links: All of them.
+        groups: Number of each link's group, which is never parted.
+        test: Fraction of the links to test on.
+        validation: Fraction of the training links to validate on; 0 for none.
+        seed: Of everything drawn at random.
+
+    Raises:
+        ValueError: An option is out of range, or there are too few groups.
+    """
+    check_fractions(test, validation)
+    generator = torch.Generator().manual_seed(seed)
+    train, testing = hold_out(torch.arange(len(links)), groups, test, generator)
+    train, validating = hold_out(train, groups, validation, generator)
+    words = [name, f"test {test:g}", *([f"validation {validation:g}"] if validation else []), f"seed {seed}"]
+    return Split(", ".join(words), train, validating, testing)
+
+
+def hold_out(
+    links: Int[Tensor, "k"], groups: Int[Tensor, "n"], fraction: float, generator: torch.Generator
+) -> tuple[Int[Tensor, "kept"], Int[Tensor, "held"]]:
+    """Parts links into those kept and those held out: random whole groups, as near to the fraction as they come.
+
+    Args:
+        links: Numbers of the links to part, ascending.
+        groups: Number of the group of every link there is.
+        fraction: Of ``links`` to hold out; 0 for none.
+        generator: Draws the groups.
+
+    Raises:
+        ValueError: There are fewer than two groups.
+    """
+    if not fraction:
+        return links, links[:0]
+    present, sizes = torch.unique(groups[links], return_counts=True)
+    if len(present) < 2:
+        raise ValueError(
+            f"to hold out {fraction:g} of {len(links)} links takes two groups of them or more, got {len(present)}; "
+            "choose smaller runs or cubes, or fewer parts"
+        )
+    order = torch.randperm(len(present), generator=generator)
+    surplus = sizes[order].cumsum(0)[:-1] - fraction * len(links)
+    chosen = present[order[: int(surplus.abs().argmin()) + 1]]
+    held = torch.isin(groups[links], chosen)
+    return links[~held], links[held]
+
+
+def check_fractions(test: float, validation: float) -> None:
+    """Sees to it that both are in range.
+
+    Raises:
+        ValueError: One is not.
+    """
+    check("test", test, 0 < test < 1, "in (0, 1)")
+    check("validation", validation, 0 <= validation < 1, "in [0, 1)")
+
+
+def check(name: str, value: float, holds: bool, bounds: str) -> None:
+    """Sees to it that an option is within its bounds.
+
+    Raises:
+        ValueError: It is not.
+    """
+    if not holds:
+        raise ValueError(f"split.{name} must be {bounds}, got {value}")

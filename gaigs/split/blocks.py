@@ -1,0 +1,29 @@
+"""Cubes of space are held out."""
+
+import math
+
+import torch
+
+from gaigs.data import Links, Split
+from gaigs.registry import register
+from gaigs.split import TEST, check, part
+
+
+@register("split", "blocks")
+def blocks(links: Links, edge: float, test: float = TEST, validation: float = 0.1, seed: int = 0) -> Split:
+    """Random cubes test: places where nothing was measured.
+
+    Args:
+        links: All of them.
+        edge: Of a cube [m]; cubes are counted from the lower corner of all transmitters.
+        test: Fraction of the links to test on.
+        validation: Fraction of the training links to validate on; 0 for none.
+        seed: Of everything drawn at random.
+
+    Raises:
+        ValueError: An option is out of range, or there are too few cubes.
+    """
+    check("edge", edge, 0 < edge < math.inf, "positive [m]")
+    places = links.query.transmitters.double()
+    cubes = ((places - places.amin(0)) / edge).floor().long()
+    return part(f"blocks {edge:g} m", links, torch.unique(cubes, dim=0, return_inverse=True)[1], test, validation, seed)

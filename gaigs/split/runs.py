@@ -1,0 +1,23 @@
+"""Contiguous runs of rows are held out."""
+
+from gaigs.data import Links, Split
+from gaigs.registry import register
+from gaigs.split import TEST, check, part, rows_of
+
+
+@register("split", "runs")
+def runs(links: Links, length: int, test: float = TEST, validation: float = 0.1, seed: int = 0) -> Split:
+    """Random runs test: a trajectory with gaps.
+
+    Args:
+        links: All of them; their rows are in the order of measurement.
+        length: Rows in a run.
+        test: Fraction of the links to test on.
+        validation: Fraction of the training links to validate on; 0 for none.
+        seed: Of everything drawn at random.
+
+    Raises:
+        ValueError: An option is out of range, or there are too few runs.
+    """
+    check("length", length, length >= 1, "a whole number of rows, at least 1")
+    return part(f"runs of {length}", links, rows_of(links) // length, test, validation, seed)

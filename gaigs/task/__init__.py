@@ -1,0 +1,138 @@
+"""Tasks say what a label is: its shape, unit and scores, how it is drawn, and what a run keeps of it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaigs.directions import Grid
+from gaigs.query import Batch
+
+Thinning = Callable[[Batch, torch.Generator], Batch]
+"""A batch of whole labels -> the part of it that a training step looks at."""
+
+
+class Metric(NamedTuple):
+    """A number of a table.
+
+    Attributes:
+        title: What a reader calls it, with its unit in brackets.
+        larger_is_better: Whether it is a similarity; else it is an error.
+        is_brief: Whether a terminal's table shows it too, which has little room.
+    """
+
+    title: str
+    larger_is_better: bool
+    is_brief: bool = True
+
+
+class Task(ABC):
+    """The contract of kind ``task``. A data set makes its task, and a checkpoint stores it with the scene.
+
+    Attributes:
+        name: The registered name.
+        quantity: What a label is, in a word or two.
+        unit: Of a label; empty for a ratio.
+        watched: The score by whose mean over the validation links the best checkpoint is chosen.
+        larger_is_better: Whether that is a similarity; else it is an error.
+        dtype: Of labels and predictions.
+        is_noisy: Whether labels scatter however near to each other they were taken, so that fine detail is not learnt.
+        directions: Those of a label's pixels; None where a label has none.
+    """
+
+    name: str
+    quantity: str
+    unit: str = ""
+    watched: str
+    larger_is_better: bool
+    dtype: torch.dtype = torch.float32
+    is_noisy: bool = False
+    directions: Grid | None = None
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Of one label."""
+
+    @property
+    def normalisation(self) -> str:
+        """How labels were scaled, in words of docs/data.md; by default their unit."""
+        return self.unit
+
+    @abstractmethod
+    def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
+        """Scores of every sample (k,) by name, float64 on the CPU; ``watched`` among them.
+
+        Raises:
+            ValueError: Labels or values are not (k, *shape), or not finite.
+        """
+
+    @abstractmethod
+    def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
+        """The numbers of a table, the names of ``metrics`` in their order, from what ``scores`` gives.
+
+        Raises:
+            ValueError: There is no sample.
+        """
+
+    @classmethod
+    @abstractmethod
+    def metrics(cls) -> dict[str, Metric]:
+        """What ``summarise`` gives; the first is what runs are compared by."""
+
+    def options(self) -> dict:
+        """What the constructor takes, in plain tensors, lists, numbers and strings; by default nothing."""
+        return {}
+
+    def state(self) -> dict:
+        """The task as a checkpoint stores it: ``registry("task").build(state)`` makes it anew."""
+        return {"name": self.name, **self.options()}
+
+    def thinning(self) -> Thinning:
+        """What a training step looks at; parameters are options of ``training.thinning``. By default: whole labels."""
+        return lambda batch, generator: batch
+
+    def packed(self, values: Tensor) -> np.ndarray:
+        """Labels or predictions as ``predictions.npz`` holds them; by default as they are."""
+        return values.numpy()
+
+    def stored(self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        """What ``predictions.npz`` holds of each model, by the key before ``_<model>``; by default all scores."""
+        return {name: score.numpy() for name, score in scores.items()}
+
+    def keep(self, folder: Path, model) -> None:  # noqa: B027
+        """Writes what a run keeps of the trained model beside its predictions; by default nothing."""
+
+    def figures(self, folder: Path, links) -> dict:
+        """Figures of a run by file name, from what is in its folder; by default none."""
+        return {}
+
+
+def need_samples(scores: Tensor) -> None:
+    """Raises a ``ValueError`` where there is no sample to summarise."""
+    if not len(scores):
+        raise ValueError("a summary needs at least one sample, got none; the split leaves nothing to test on")
+
+
+def check_values(labels: Tensor, values: Tensor, shape: tuple[int, ...], samples: str) -> None:
+    """Sees to it that labels and values are (k, *shape) and finite.
+
+    Raises:
+        ValueError: They are not.
+    """
+    if labels.shape != values.shape or labels.ndim < 1 or tuple(labels.shape[1:]) != tuple(shape):
+        wanted = ", ".join(("k", *map(str, shape))) + ("," if not shape else "")
+        raise ValueError(
+            f"labels and predictions must both be ({wanted}), got {tuple(labels.shape)} and {tuple(values.shape)}"
+        )
+    for name, tensor in (("labels", labels), ("predictions", values)):
+        broken = ~tensor.isfinite()[..., None].flatten(1).all(1)
+        if broken.any():
+            raise ValueError(
+                f"{name} must be finite, got NaN or infinity in {int(broken.sum())} of {len(tensor)} {samples}, first "
+                f"in number {int(broken.int().argmax())}; see whether the training diverged or the file is damaged"
+            )

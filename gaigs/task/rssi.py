@@ -1,0 +1,14 @@
+"""Received signal strength: one level a link."""
+
+from gaigs.registry import register
+from gaigs.task.scalar import Scalar
+
+
+@register("task", "rssi")
+class Rssi(Scalar):
+    """RSSI [dBm] as read, neither scaled nor shifted; errors are in dB.
+
+    Source: the protocol of GAI-GS, "Evaluation".
+    """
+
+    name, quantity, unit, error_unit = "rssi", "RSSI", "dBm", "dB"

@@ -1,0 +1,154 @@
+"""Spatial spectra: an amplitude in each direction of a grid."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from gaigs.directions import Grid
+from gaigs.query import Batch
+from gaigs.registry import register
+from gaigs.task import Metric, Task, Thinning, check_values, need_samples
+
+SSIM_WINDOW = 7
+"""Edge of scikit-image's default uniform window [pixels]."""
+
+EXAMPLES = {"10th percentile": 0.1, "median": 0.5, "90th percentile": 0.9}
+"""Which spectra are shown, by their rank in SSIM."""
+
+
+@register("task", "spectrum")
+class Spectrum(Task):
+    """Amplitudes in [0, 1], one a pixel: row = elevation, column = azimuth.
+
+    Args:
+        elevations: Of the rows, in the array's frame [rad].
+        azimuths: Of the columns, in the array's frame [rad].
+        normalisation: How labels were scaled, in words of docs/data.md.
+
+    Source: the protocol of GAI-GS, "Evaluation"; Wang et al., Image Quality Assessment, 2004.
+    """
+
+    name, quantity = "spectrum", "amplitude"
+    watched, larger_is_better = "ssim", True
+    normalisation = ""
+
+    def __init__(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"], normalisation: str):
+        self.directions = Grid(elevations, azimuths)
+        self.normalisation = normalisation
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.directions.shape
+
+    def options(self) -> dict:
+        grid = self.directions
+        return {"elevations": grid.elevations, "azimuths": grid.azimuths, "normalisation": self.normalisation}
+
+    @classmethod
+    def metrics(cls) -> dict[str, Metric]:
+        return {
+            "ssim_median": Metric("median SSIM", True),
+            "ssim_mean": Metric("mean SSIM", True, is_brief=False),
+            "ssim_p10": Metric("p10 SSIM", True, is_brief=False),
+            "ssim_p90": Metric("p90 SSIM", True, is_brief=False),
+            "mae": Metric("MAE", False),
+        }
+
+    def scores(
+        self, labels: Float[Tensor, "k rows columns"], values: Float[Tensor, "k rows columns"]
+    ) -> dict[str, Tensor]:
+        """SSIM and mean absolute error of each predicted spectrum.
+
+        SSIM is scikit-image's with its default window and ``data_range=1``, computed in float64; the training loss
+        uses another window, so the two differ and bear different names. Values outside [0, 1] are scored as they are.
+
+        Raises:
+            ValueError: As for every task; or spectra are smaller than the SSIM's window.
+        """
+        if min(self.shape) < SSIM_WINDOW:
+            raise ValueError(
+                f"SSIM needs spectra of at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {self.shape}; "
+                "use a finer grid"
+            )
+        check_values(labels, values, self.shape, "spectra")
+        labels, values = labels.detach().cpu().double(), values.detach().cpu().double()
+        pairs = zip(labels.numpy(), values.numpy(), strict=True)
+        ssim = [structural_similarity(label, value, data_range=1.0) for label, value in pairs]
+        return {"ssim": torch.tensor(ssim, dtype=torch.float64), "mae": (labels - values).abs().mean((1, 2))}
+
+    def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
+        """Median, mean and percentiles of SSIM over the samples (linear interpolation), and the mean of MAE."""
+        ssim, mae = scores["ssim"], scores["mae"]
+        need_samples(ssim)
+        p10, median, p90 = torch.quantile(ssim, ssim.new_tensor([0.1, 0.5, 0.9])).tolist()
+        numbers = median, ssim.mean().item(), p10, p90, mae.mean().item()
+        return dict(zip(self.metrics(), numbers, strict=True))
+
+    def thinning(self, stride: int = 1, rays: int | None = None) -> Thinning:
+        """Every ``stride``-th row and column from random first ones on, or so many random pixels of all.
+
+        Neighbouring pixels of a spectrum are far closer than the array resolves.
+
+        Args:
+            stride: Rows and columns from one looked at to the next.
+            rays: Random pixels, anew in each step and for all links of a batch the same; None for a grid.
+
+        Raises:
+            ValueError: An option is out of range, or both are given.
+        """
+        rows, columns = self.shape
+        coarsest = min(rows, columns) // 3  # which leaves the SSIM loss its smallest window
+        if not 1 <= stride <= coarsest:
+            raise ValueError(f"training.thinning.stride must be in 1..{coarsest} for this grid, got {stride}")
+        if rays is not None and not (1 <= rays <= rows * columns and stride == 1):
+            raise ValueError(
+                f"training.thinning.rays must be in 1..{rows * columns} for this grid, with stride=1, got {rays} and "
+                f"stride {stride}"
+            )
+
+        def grid(batch: Batch, generator: torch.Generator) -> Batch:
+            row, column = torch.randint(stride, (2,), generator=generator).tolist()
+            rows, columns = slice(row, None, stride), slice(column, None, stride)
+            return Batch(
+                batch.query, batch.directions.thin(rows, columns), batch.labels[:, rows, columns], batch.shares
+            )
+
+        def scattered(batch: Batch, generator: torch.Generator) -> Batch:
+            chosen = torch.randperm(rows * columns, generator=generator)[:rays].to(batch.labels.device)
+            return Batch(
+                batch.query, batch.directions.flatten()[chosen], batch.labels.flatten(1)[:, chosen], batch.shares
+            )
+
+        return grid if rays is None else scattered
+
+    def packed(self, values: Float[Tensor, "k rows columns"]) -> np.ndarray:
+        """Half of a float's digits are enough for an image, and half of the room."""
+        return values.half().numpy()
+
+    def stored(self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        """``ssim``."""
+        return {"ssim": scores["ssim"].numpy()}
+
+    def figures(self, folder: Path, links) -> dict:
+        """Spectra of the 10th, 50th and 90th percentile beside their labels, and how SSIM is distributed."""
+        from gaigs.report.curves import cdf  # matplotlib is slow to import
+        from gaigs.report.spectra import spectra
+
+        with np.load(folder / "predictions.npz") as run:
+            scores = {name.removeprefix("ssim_"): run[name] for name in run.files if name.startswith("ssim_")}
+            labels, predictions = run["labels"], run["prediction"]
+        own = next(iter(scores.values()))
+        order = np.argsort(own)
+        names = {order[round(rank * (len(own) - 1))]: name for name, rank in EXAMPLES.items()}
+        shown = list(names)
+        grid = (np.rad2deg(angles.numpy()) for angles in (self.directions.elevations, self.directions.azimuths))
+        examples = labels[shown], predictions[shown], own[shown], list(names.values()), *grid
+        return {
+            "spectra": spectra(*examples),
+            "spectra_polar": spectra(*examples, polar=True),
+            "ssim_cdf": cdf(scores, "SSIM", "spectra", links.split.name, (None, 1)),
+        }

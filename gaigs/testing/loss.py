@@ -1,0 +1,72 @@
+"""The check of kind ``loss``."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gaigs.data import Links
+from gaigs.loss import Loss
+from gaigs.query import Batch
+from gaigs.testing._checks import PRECISION, require, require_close, require_gradients, require_tensor
+
+
+def check_loss(loss: Loss, links: Links, device: torch.device | str = "cpu") -> None:
+    """A loss: least at the labels, a mean over the links, with finite gradients everywhere and terms by name.
+
+    Labels on a grid are also compared on every second row and column of it.
+
+    Args:
+        loss: Made with the task of the links.
+        links: With labels to compare.
+        device: Where it works.
+
+    Raises:
+        AssertionError: It breaks the contract of ``gaigs.loss.Loss``.
+    """
+    batch = links.batch(links.split.train[:6])
+    batches = [batch]
+    if batch.directions is not None:
+        rows = columns = slice(1, None, 2)
+        thinned = batch.directions.thin(rows, columns)
+        batches.append(replace(batch, directions=thinned, labels=batch.labels[:, rows, columns]))
+    for batch in batches:
+        for dtype in PRECISION:
+            kind = dtype.to_complex() if links.task.dtype.is_complex else dtype
+            _check_batch(loss, replace(batch, labels=batch.labels.to(kind)).to(device), dtype)
+
+
+def _check_batch(loss: Loss, batch: Batch, dtype: torch.dtype) -> None:
+    labels = batch.labels
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(labels.shape, dtype=labels.dtype, generator=generator).to(labels.device)
+    least, terms = loss(labels, batch)
+    require_tensor("the loss", least, (), dtype, labels.device)
+    require(isinstance(terms, dict) and bool(terms), f"terms must be a dictionary of at least one, got {terms!r}")
+    for name, term in terms.items():
+        named = isinstance(name, str) and isinstance(term, Tensor)
+        require(named, f"terms must be numbers by name, got {type(term).__name__} as {name!r}")
+        require_tensor(f"the term {name}", term, (), dtype, labels.device)
+    for scale in (1e-2, 0.3, -0.3, 10.0):
+        values, what = labels + scale * noise, f"with errors of about {scale:g}"
+        total, terms_there = loss(values, batch)
+        require_tensor(f"the loss {what}", total, (), dtype, labels.device)
+        require([*terms_there] == [*terms], "terms must be the same wherever the values lie")
+        require(bool(total > least), f"the loss must be least at the labels, got {least:g} there and {total:g} {what}")
+        each = torch.stack([loss(values[i : i + 1], _only(batch, i))[0] for i in range(len(batch))])
+        require_close(each.mean(), total, PRECISION[dtype], "the loss must be the mean of those of its links")
+    hard = {"at the labels": labels, "next to the labels": labels + 1e-12 * noise, "at zero": 0 * labels}
+    hard["far off"] = 1e3 * noise
+    for what, values in hard.items():
+        leaf = values.clone().requires_grad_()
+        total, _ = loss(leaf, batch)
+        require(total.requires_grad, "the loss must carry a gradient")
+        require_gradients([total], {f"the values {what}": leaf})
+    leaf = (labels + 0.1 * noise).requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(leaf, batch)[0], leaf)
+    require(bool(gradient[..., None].flatten(1).any(1).all()), "each link must pull at its value")
+
+
+def _only(batch: Batch, i: int) -> Batch:
+    """One link by itself."""
+    return replace(batch, query=batch.query[i : i + 1], labels=batch.labels[i : i + 1])

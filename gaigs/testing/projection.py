@@ -1,0 +1,99 @@
+"""The check of kind ``projection``."""
+
+import torch
+from torch import Tensor
+
+from gaigs.directions import Directions, Grid, Rays
+from gaigs.geometry import Pose, from_spherical, quaternions_to_rotations
+from gaigs.projection import NEAR, Projection
+from gaigs.testing._checks import require, require_close, require_gradients, require_tensor
+
+
+def check_projection(projection: Projection, device: torch.device | str = "cpu") -> None:
+    """A projection: ``jacobian`` and ``plane`` agree with ``coordinates``; nothing breaks at pole, horizon and seam.
+
+    Raises:
+        AssertionError: It breaks the contract of ``gaigs.projection.Projection``.
+    """
+    degrees = lambda *range_: torch.arange(*range_, dtype=torch.float64, device=device).deg2rad()
+    azimuths, elevations = torch.cartesian_prod(degrees(-175, 180, 25), degrees(-55, 60, 10)).unbind(1)
+    directions = from_spherical(azimuths, elevations)
+    points = 3 * directions
+    coordinates = projection.coordinates(points)
+    require_tensor("coordinates", coordinates, (len(points), 2), torch.float64, device)
+    require_close(projection.coordinates(directions), coordinates, 1e-12, "coordinates must not depend on the distance")
+    require_close(
+        projection.coordinates(points[:1]), coordinates[:1], 1e-12, "coordinates must not depend on other points"
+    )
+    jacobian = projection.jacobian(points)
+    require_tensor("the jacobian", jacobian, (len(points), 2, 3), torch.float64, device)
+    derivative = torch.autograd.functional.jacobian(lambda p: projection.coordinates(p).sum(0), points).transpose(0, 1)
+    require_close(jacobian, derivative, 1e-9, "jacobian must be the derivative of coordinates")
+    single = projection.jacobian(points.float())
+    require_tensor("the jacobian of float32 points", single, jacobian.shape, torch.float32)
+
+    grids = Grid(degrees(-80, 81, 20), degrees(0, 360, 30)), Grid(degrees(30, 31), degrees(350, 351))
+    for grid in grids:
+        _check_plane(projection, grid)
+        _check_plane(projection, grid.flatten())
+    _check_plane(projection, grids[0].flatten()[:0])
+    _check_footprints(projection, device)
+    _check_frames(projection, points)
+
+
+def _check_plane(projection: Projection, directions: Directions) -> None:
+    rows, columns = directions.shape if isinstance(directions, Grid) else (1, *directions.shape)
+    plane = projection.plane(directions)
+    what = "a list of rays" if isinstance(directions, Rays) else "a grid"
+    shapes = {"u": ((1, columns), (rows, columns)), "v": ((rows, 1), (rows, columns))}
+    for name, allowed in shapes.items():
+        given = tuple(getattr(plane, name).shape)
+        words = " or ".join(map(str, dict.fromkeys(allowed)))
+        require(given in allowed, f"plane.{name} of {what} must be of shape {words}, got {given}")
+    require(plane.shape == (rows, columns), f"the plane of {what} must be of shape {rows, columns}, got {plane.shape}")
+    require(plane.u.dtype == plane.v.dtype == directions.azimuths.dtype, "a plane must be of its directions' dtype")
+    require(plane.period == projection.period, "a plane must have the projection's period")
+    u, v = projection.coordinates(directions.vectors().reshape(rows, columns, 3)).unbind(-1)
+    off = plane.u - u
+    if plane.period is not None:
+        off = off - plane.period * (off / plane.period).round()
+    require_close(off, torch.zeros_like(off), 1e-9, "plane.u must be coordinates' u at the pixels' directions")
+    require_close(plane.v.expand_as(v), v, 1e-9, "plane.v must be coordinates' v at the pixels' directions")
+
+
+def _check_footprints(projection: Projection, device: torch.device | str) -> None:
+    """Values and gradients at hard places, among them the receiver's own."""
+    places = [(0, 0, 3), (0, 0, -3), (1e-5, 0, 3), (3, 0, 0), (-3, 0, 0), (-3, -1e-6, 0), (0, -3, 0)]
+    places += [(3 * NEAR, 0, 4 * NEAR), (-3e4, 2e4, 1e4), (0, 0, 0)]
+    identity = Pose(torch.zeros(3), torch.eye(3))
+    for dtype in (torch.float64, torch.float32):
+        means = torch.tensor(places, dtype=dtype, device=device).requires_grad_()
+        covariances = (0.01 * torch.eye(3, dtype=dtype, device=device)).repeat(2, len(places), 1, 1).requires_grad_()
+        splats = projection.project(means, covariances, identity)
+        shapes = {"means2d": (len(places), 2), "covariances2d": (2, len(places), 2, 2), "depths": (len(places),)}
+        for name, shape in shapes.items():
+            require_tensor(f"{name} at hard places", getattr(splats, name), shape, dtype, device)
+        require(
+            splats.visible.tolist() == [True] * (len(places) - 1) + [False], "only what sits on the receiver is hidden"
+        )
+        require_close(splats.depths, means.norm(dim=-1), 1e-5, "depths must be distances to the receiver")
+        require_gradients([splats.means2d, splats.covariances2d], {"means": means, "covariances": covariances})
+        if dtype == torch.float64:
+            smallest = torch.linalg.eigvalsh(splats.covariances2d)[..., 0]
+            require(bool(smallest.gt(0).all()), "covariances2d must be positive definite")
+        shared = projection.project(means, covariances[:1], identity).covariances2d
+        require_close(shared, splats.covariances2d[:1], 1e-6, "covariances2d must not depend on the other transmitters")
+
+
+def _check_frames(projection: Projection, points: Tensor) -> None:
+    """A turned and moved receiver sees what it saw where everything turns and moves with it."""
+    n, exact = len(points), {"dtype": points.dtype, "device": points.device}
+    turn = quaternions_to_rotations(torch.tensor([0.4, -0.2, 0.7, 0.1], **exact))
+    receiver = Pose(torch.tensor([1.0, -2.0, 0.5], **exact), turn)
+    covariances = torch.diag(torch.tensor([0.01, 0.02, 0.05], **exact))
+    here = projection.project(points, covariances.expand(1, n, 3, 3), Pose(torch.zeros(3), torch.eye(3)))
+    turned = (turn @ covariances @ turn.mT).expand(1, n, 3, 3)
+    there = projection.project(receiver.world(points), turned, receiver)
+    for name in ("means2d", "covariances2d", "depths"):
+        rule = f"{name} must be those in the receiver's own frame"
+        require_close(getattr(there, name), getattr(here, name), 1e-9, rule)

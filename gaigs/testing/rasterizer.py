@@ -1,0 +1,176 @@
+"""The check of kind ``rasterizer``, against the formula over all pairs of splat and pixel."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gaigs.projection import Plane, Splats
+from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, Rasterizer
+from gaigs.testing._checks import PRECISION, fixed_sum, require, require_close, require_tensor
+
+
+def check_rasterizer(rasterizer: Rasterizer, device: torch.device | str = "cpu") -> None:
+    """A rasterizer: map, transmittance and gradients against ``rasterize_densely``, on easy scenes and hard ones.
+
+    float64 may be refused by a ``TypeError``.
+
+    Raises:
+        AssertionError: It breaks the contract of ``gaigs.rasterizer.Rasterizer``.
+    """
+    for title, arguments in _scenes():
+        # Where A meets one of its bounds to within rounding, the two may rightly decide differently.
+        away = _distance_to_jumps(*arguments) > 1e-4
+        truth = _render(rasterize_densely, _cast(arguments, "cpu", torch.float64), away)
+        for dtype, tolerance in PRECISION.items():
+            moved = _cast(arguments, device, dtype)
+            try:
+                found = _render(rasterizer, moved, away.to(device))
+            except TypeError:
+                require(dtype != torch.float32, "float32 must be supported")
+                continue
+            for name, true in truth.items():
+                require_tensor(f"{title}: {name}", found[name], true.shape, dtype, device)
+                require_close(found[name].cpu(), true, tolerance, f"{title}: {name} must be that of the formula")
+            again = _render(rasterizer, moved, away.to(device))
+            for name in ("map", "transmittance"):
+                require(torch.equal(found[name], again[name]), f"{title}: two runs must give the same {name}")
+            require(isinstance(rasterizer.used, str), f"used must say what drew the map, got {rasterizer.used!r}")
+            alone = _render(rasterizer, _only_last(moved), away[-1:].to(device))
+            rule = f"{title}: a map must not depend on other transmitters"
+            require_close(alone["map"], found["map"][-1:], tolerance, rule)
+    _check_nan_shows(rasterizer, device)
+
+
+def rasterize_densely(
+    splats: Splats,
+    signal: Float[Tensor, "b n c"],
+    opacities: Float[Tensor, "b n"],
+    attenuations: Float[Tensor, "b n"] | None,
+    plane: Plane,
+) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
+    """The formula of ``gaigs.rasterizer.Rasterizer`` over all pairs of splat and pixel, in float64: slow, but plain."""
+    order, footprints = _footprints(splats, plane)
+    product = opacities[:, order, None, None].double() * footprints
+    acts = product >= ALPHA_MIN
+    alpha = torch.where(acts, product.clamp(max=ALPHA_MAX), 0)
+    passed = 1 - alpha
+    if attenuations is not None:
+        passed = passed * torch.where(acts, attenuations[:, order, None, None].double() ** footprints, 1)
+    reached = torch.cat((torch.ones_like(passed[:, :1]), passed), 1).cumprod(1) if len(order) else passed
+    image = torch.einsum("bnc,bnrs->bcrs", signal[:, order].double(), alpha * reached[:, : len(order)])
+    return image, passed.prod(1)
+
+
+def _footprints(splats: Splats, plane: Plane) -> tuple[Tensor, Float[Tensor, "b n rows columns"]]:
+    """Indices of visible splats front to back, and exp(-x' C^-1 x / 2) of each at every pixel, float64."""
+    order = splats.depths.argsort(stable=True)
+    order = order[splats.visible[order]]
+    u, v = splats.means2d[order].double()[..., None, None].unbind(1)
+    du, dv = plane.u.double() - u, plane.v.double() - v
+    if plane.period is not None:
+        du = torch.remainder(du + plane.period / 2, plane.period) - plane.period / 2
+    x = torch.stack(torch.broadcast_tensors(du, dv), -1)
+    precisions = torch.linalg.inv(splats.covariances2d[:, order].double())
+    return order, torch.exp(-0.5 * torch.einsum("nrsi,bnij,nrsj->bnrs", x, precisions, x))
+
+
+@torch.no_grad()
+def _distance_to_jumps(splats, signal, opacities, attenuations, plane) -> Float[Tensor, "b rows columns"]:
+    """How far, relatively, each pixel is from the nearest jump of value or gradient, a G = ALPHA_MIN or ALPHA_MAX."""
+    order, footprints = _footprints(splats, plane)
+    product = opacities[:, order, None, None].double() * footprints
+    bounds = product.new_tensor([ALPHA_MIN, ALPHA_MAX])[:, None, None, None, None]
+    distances = (product / bounds - 1).abs().amin(0)
+    return torch.cat((distances, torch.full_like(product.sum(1, keepdim=True), torch.inf)), 1).amin(1)
+
+
+def _scenes() -> Iterator[tuple[str, tuple]]:
+    """Arguments of a rasterizer, each with a title."""
+    generator = torch.Generator().manual_seed(0)
+    azimuths, elevations = torch.arange(-180.0, 180, 9).deg2rad()[None], torch.linspace(0.02, 1.5, 21)[:, None]
+    cylinder = Plane(azimuths, elevations, 2 * math.pi)
+
+    def scene(n=50, b=2, c=2, own=False, attenuations=False, plane=cylinder, spread=(0.05, 0.6), opacity=(0, 0.99)):
+        random = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
+        low, high = (torch.stack([getattr(axis, end)() for axis in (plane.u, plane.v)]) for end in ("min", "max"))
+        turns = random(0, math.pi, b if own else 1, n)
+        axes = torch.stack((turns.cos(), -turns.sin(), turns.sin(), turns.cos()), -1).unflatten(-1, (2, 2))
+        half = axes * random(math.log(spread[0]), math.log(spread[1]), len(turns), n, 2).exp()[..., None, :]
+        splats = Splats(random(low, high, n, 2), half @ half.mT, random(0.5, 5, n), random(0, 1, n) > 0.1)
+        signal = torch.randn(b, n, c, generator=generator)
+        return splats, signal, random(*opacity, b, n), random(0.3, 1, b, n) if attenuations else None, plane
+
+    yield "random", scene()
+    yield "attenuations", scene(attenuations=True)
+    yield "own covariances", scene(own=True, attenuations=True)
+    yield "one channel", scene(c=1)
+    yield "many channels", scene(c=19, own=True, attenuations=True)
+    yield "no splat", scene(n=0)
+    yield "no transmitter", scene(b=0)
+    yield "one splat, one transmitter", scene(n=1, b=1)
+    yield "opaque", scene(opacity=(1, 1), spread=(0.2, 1))
+    yield "silent", scene(opacity=(0, 0))
+    yield "wider than the plane", scene(n=12, spread=(5, 20))
+    yield "narrower than a pixel", scene(spread=(0.01, 0.02), opacity=(0.9, 1))
+    yield "one pixel", scene(plane=Plane(azimuths[:, :1], elevations[:1], 2 * math.pi), spread=(0.5, 1))
+    yield "one row", scene(plane=Plane(azimuths, elevations[:1], 2 * math.pi))
+    yield "one column", scene(plane=Plane(azimuths[:, :1], elevations, 2 * math.pi))
+    disc = elevations.cos() * azimuths.cos(), elevations.cos() * azimuths.sin()
+    yield "rows and columns mixed", scene(plane=Plane(*disc, None), own=True, attenuations=True)
+    yield "columns mixed", scene(plane=Plane(azimuths * elevations.cos(), elevations, None))
+    rays = torch.stack((6.28 * torch.rand(30, generator=generator) - 3.14, 1.5 * torch.rand(30, generator=generator)))
+    yield "rays in a single row", scene(plane=Plane(*rays[:, None], 2 * math.pi), attenuations=True)
+    splats, *rest = scene()
+    splats.depths.round_()
+    yield "equal depths", (splats, *rest)
+    splats, *rest = scene()
+    splats.covariances2d[:, ~splats.visible], splats.means2d[~splats.visible] = torch.nan, torch.inf
+    yield "rubbish that is not visible", (splats, *rest)
+
+
+def _render(rasterizer: Rasterizer, arguments: tuple, pixels: Bool[Tensor, "b rows columns"]) -> dict[str, Tensor]:
+    """Map and transmittance at ``pixels``, and the gradients of a fixed function of both."""
+    splats, signal, opacities, attenuations, plane = arguments
+    leaves = {"means2d": splats.means2d, "covariances2d": splats.covariances2d}
+    leaves |= {"signal": signal, "opacities": opacities, "attenuations": attenuations}
+    leaves = {name: None if leaf is None else leaf.detach().clone().requires_grad_() for name, leaf in leaves.items()}
+    means2d, covariances2d, *others = leaves.values()
+    image, left = rasterizer(replace(splats, means2d=means2d, covariances2d=covariances2d), *others, plane)
+    image, left = image * pixels[:, None], left * pixels
+    (fixed_sum(image) + fixed_sum(left)).backward()
+    results = {"map": image.detach(), "transmittance": left.detach()}
+    for name, leaf in leaves.items():
+        if leaf is not None:
+            gradient = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+            # A covariance is symmetric: how its gradient is shared between [0, 1] and [1, 0] does not matter.
+            results[f"gradient of {name}"] = (gradient + gradient.mT) / 2 if name == "covariances2d" else gradient
+    return results
+
+
+def _cast(arguments: tuple, device: torch.device | str, dtype: torch.dtype) -> tuple:
+    splats, signal, opacities, attenuations, plane = arguments
+    to = lambda tensor: None if tensor is None else tensor.to(device, dtype)
+    splats = Splats(*map(to, (splats.means2d, splats.covariances2d, splats.depths)), splats.visible.to(device))
+    return splats, to(signal), to(opacities), to(attenuations), Plane(to(plane.u), to(plane.v), plane.period)
+
+
+def _only_last(arguments: tuple) -> tuple:
+    """The last transmitter by itself."""
+    splats, signal, opacities, attenuations, plane = arguments
+    splats = replace(splats, covariances2d=splats.covariances2d[-1:])
+    return splats, signal[-1:], opacities[-1:], None if attenuations is None else attenuations[-1:], plane
+
+
+def _check_nan_shows(rasterizer: Rasterizer, device: torch.device | str) -> None:
+    """What is broken must not vanish."""
+    for name in ("means2d", "covariances2d", "signal", "opacities"):
+        splats, signal, opacities, attenuations, plane = _cast(next(_scenes())[1], device, torch.float32)
+        broken = {"means2d": splats.means2d[None], "covariances2d": splats.covariances2d, "signal": signal}
+        front = torch.where(splats.visible, splats.depths, torch.inf).argmin()
+        broken.get(name, opacities)[:, front] = torch.nan
+        image, _ = rasterizer(splats, signal, opacities, attenuations, plane)
+        require(bool(image.isnan().any()), f"NaN in {name} must show as NaN in the map")

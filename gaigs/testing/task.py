@@ -1,0 +1,131 @@
+"""The check of kind ``task``."""
+
+import io
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaigs.directions import Grid
+from gaigs.query import Batch, Query
+from gaigs.registry import registry
+from gaigs.task import Metric, Task
+from gaigs.testing._checks import flat, random_labels, require, require_close, require_raises
+
+SAMPLES = 5
+
+
+def check_task(task: Task, *thinnings: Mapping) -> None:
+    """A task: it comes back from its state, scores what is right best, refuses what is broken, thins consistently.
+
+    Args:
+        task: What to check.
+        thinnings: Options of its ``thinning`` to check beside none.
+
+    Raises:
+        AssertionError: It breaks the contract of ``gaigs.task.Task``.
+    """
+    _check_facts(task)
+    _check_state(task)
+    generator = torch.Generator().manual_seed(0)
+    labels, noise = (random_labels((SAMPLES, *task.shape), task.dtype, generator) for _ in range(2))
+    _check_scores(task, labels, noise)
+    _check_refusals(task, labels, noise)
+    for options in ({}, *thinnings):
+        _check_thinning(task, dict(options))
+
+
+def _check_facts(task: Task) -> None:
+    require(task.name in registry("task").names(), f"a task must bear its registered name, got {task.name!r}")
+    for name in ("quantity", "unit", "normalisation", "watched"):
+        require(isinstance(getattr(task, name), str), f"{name} must be a string, got {getattr(task, name)!r}")
+    for name in ("larger_is_better", "is_noisy"):
+        require(isinstance(getattr(task, name), bool), f"{name} must be true or false, got {getattr(task, name)!r}")
+    require(isinstance(task.shape, tuple), f"shape must be a tuple, got {task.shape!r}")
+    if task.directions is not None:
+        require(isinstance(task.directions, Grid), "directions must be a Grid")
+        require(task.directions.shape == task.shape, f"directions must be of the label's shape {task.shape}")
+    metrics = type(task).metrics()
+    require(bool(metrics), "metrics must name at least one number")
+    require(all(isinstance(metric, Metric) for metric in metrics.values()), "metrics must be gaigs.task.Metric")
+    require(any(metric.is_brief for metric in metrics.values()), "at least one metric must be brief")
+
+
+def _check_state(task: Task) -> None:
+    file = io.BytesIO()
+    torch.save(task.state(), file)
+    file.seek(0)
+    state = torch.load(file, weights_only=True)
+    again = registry("task").build(state)
+    require(type(again) is type(task), "the task must come back from its state as one of its kind")
+    require(flat(again.state()) == flat(task.state()), "the task must come back from its state as it was")
+    facts = lambda task: (task.shape, task.dtype, task.unit, task.normalisation, task.watched, task.larger_is_better)
+    require(facts(again) == facts(task), "the task must come back from its state as it was")
+
+
+def _check_scores(task: Task, labels: Tensor, noise: Tensor) -> None:
+    values = labels + noise
+    perfect, worse = (task.scores(labels, guess) for guess in (labels, values))
+    require(task.watched in perfect, f"scores must have the one watched, {task.watched!r}, got {', '.join(perfect)}")
+    for name, score in (*perfect.items(), *worse.items()):
+        right = tuple(score.shape) == (SAMPLES,) and score.dtype == torch.float64 and score.device.type == "cpu"
+        require(right, f"the score {name} must be ({SAMPLES},) float64 on the CPU, got {score.shape}, {score.dtype}")
+        require(bool(score.isfinite().all()), f"the score {name} must be finite")
+    gain = perfect[task.watched] - worse[task.watched]
+    require(bool((gain > 0).all() if task.larger_is_better else (gain < 0).all()), "what is right must score best")
+    for name, score in task.scores(labels[-1:], values[-1:]).items():
+        require_close(score, worse[name][-1:], 1e-9, f"the score {name} must not depend on the other samples")
+    graded = task.scores(labels, values.clone().requires_grad_())
+    require(not any(score.requires_grad for score in graded.values()), "scores must not carry a gradient")
+
+    metrics = type(task).metrics()
+    best, second = task.summarise(perfect), task.summarise(worse)
+    require([*best] == [*metrics], f"summarise must give {', '.join(metrics)}, got {', '.join(best)}")
+    require(all(type(number) is float for number in best.values()), "summarise must give plain numbers")
+    for name, metric in metrics.items():
+        better = best[name] > second[name] if metric.larger_is_better else best[name] < second[name]
+        require(better, f"what is right must have the best {name}, got {best[name]} and else {second[name]}")
+    stored = task.stored(labels, values, worse)
+    require(all(isinstance(array, np.ndarray) for array in stored.values()), "stored must give arrays of numpy")
+    require(all(len(array) == SAMPLES for array in stored.values()), "stored must give a row for each sample")
+
+
+def _check_refusals(task: Task, labels: Tensor, values: Tensor) -> None:
+    wrong = {
+        "of different number": (labels, values[1:]),
+        "with an axis too many": (labels[..., None], values[..., None]),
+        "of a single sample without its axis": (labels[0], values[0]),
+        "that are NaN": (labels, torch.where(torch.arange(labels.numel()).view_as(labels) == 1, torch.nan, values)),
+        "measured that are infinite": (torch.full_like(labels, torch.inf), values),
+    }
+    for what, pair in wrong.items():
+        require_raises(ValueError, lambda pair=pair: task.scores(*pair), f"values {what} must be a ValueError")
+    none = task.scores(labels[:0], values[:0])
+    require(all(len(score) == 0 for score in none.values()), "no samples must have no scores")
+    require_raises(ValueError, lambda: task.summarise(none), "a summary of no samples must be a ValueError")
+
+
+def _check_thinning(task: Task, options: dict) -> None:
+    """Each label is the number of its pixel, so that labels and directions tell whether they were parted."""
+    thin = task.thinning(**options)
+    count = max(1, int(np.prod(task.shape)))
+    numbers = torch.arange(count, dtype=torch.float64).reshape(task.shape).expand(2, *task.shape)
+    query = Query(torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), torch.tensor([0, 1]))
+    batch = Batch(query, task.directions, numbers, (0.5, 0.25))
+    part, again = (thin(batch, torch.Generator().manual_seed(3)) for _ in range(2))
+    require(torch.equal(part.labels, again.labels), "the generator alone must decide what is looked at")
+    require(part.shares == batch.shares and len(part) == 2, "thinning must keep links and shares")
+    require(torch.equal(part.query.transmitters, query.transmitters), "thinning must keep the query")
+    require(part.labels[0].numel() > 0, "thinning must leave something")
+    require(torch.equal(part.labels[0], part.labels[1]), "all links must be looked at in the same directions")
+    if task.directions is None:
+        require(part.directions is None, "labels without directions must have none when thinned")
+        return
+    require(tuple(part.labels.shape[1:]) == tuple(part.directions.shape), "labels and directions must be of one shape")
+    pixels = task.directions.flatten().vectors()[part.labels[0].long()]
+    require_close(part.directions.vectors(), pixels, 1e-6, "labels and directions must be thinned together")
+    if part.labels[0].numel() < count:
+        other = [thin(batch, torch.Generator().manual_seed(seed)).labels for seed in range(8)]
+        moved = any(x.shape != part.labels.shape or not torch.equal(x, part.labels) for x in other)
+        require(moved, "thinning must look at other directions in another step")

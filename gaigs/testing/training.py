@@ -1,0 +1,182 @@
+"""The check of kind ``training``."""
+
+import math
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
+
+from gaigs.checkpoint import KEY
+from gaigs.data import Links
+from gaigs.model import Model
+from gaigs.processes import stopping
+from gaigs.query import Batch
+from gaigs.scene import Scene
+from gaigs.testing._checks import flat, require, require_close, require_raises
+from gaigs.training.batches import Batches, InOrder
+from gaigs.training.callbacks import KeepLast, save
+
+STEPS = 6
+"""Of a whole training."""
+
+STOP = 3
+"""The step behind which one is stopped; validations are due behind every second."""
+
+ADVICE = (".*LeafSpec", ".*does not have many workers", "GPU available but not used")
+"""Warnings of Lightning's that say nothing of the training."""
+
+
+def check_training(
+    build: Callable[..., lightning.LightningModule],
+    build_model: Callable[[Scene], Model],
+    links: Links,
+    device: torch.device | str = "cpu",
+) -> None:
+    """A training: it takes one step a batch, validates, follows from its seed, and goes on as if it had never stopped.
+
+    Args:
+        build: Makes it, given ``model``, ``loss``, ``identity`` and ``seed`` by name, as
+            ``functools.partial(registry("training").build, config)`` does; all of its learning rates positive.
+        build_model: Makes a model that it trains, for a scene.
+        links: What it trains on; with a split that validates.
+        device: Where it works.
+
+    Raises:
+        AssertionError: It breaks the contract of kind ``training``, see ``gaigs.training.descent.Descent``.
+    """
+    identity = {"who": "the check", "numbers": torch.arange(3)}
+
+    def make(**changes) -> lightning.LightningModule:
+        torch.manual_seed(0)
+        model = build_model(links.scene)
+        model.fit(links)
+        for name, value in changes.items():
+            setattr(model, name, value)
+        return build(model=model, loss=_squared, identity=identity, seed=0)
+
+    module = make()
+    _check_attributes(module, links)
+    content: dict = {}
+    module.on_save_checkpoint(content)
+    require(flat(content.get(KEY)) == flat(identity), f"a checkpoint must hold the identity as its entry {KEY!r}")
+    other = f"none but {module.model.trained_by}"
+    require_raises(ValueError, lambda: make(trained_by=other), "a model that is trained otherwise must be a ValueError")
+    before = _copy(module.model)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        whole = _train(module, links, folder, device)
+        require(whole.steps == list(range(1, STEPS + 1)), f"{STEPS} batches must be as many steps, got {whole.steps}")
+        _check_loss(whole)
+        _check_changes(module.model, before)
+        _check_validation(module.model, links, whole.metrics)
+        again = _train(make(), links, folder, device)
+        _compare(again.states, whole.states, "the same seed must give the same training")
+        unlike = make()
+        torch.manual_seed(1)  # another process need not start from the same
+        rest = _train(unlike, links, folder, device, resume=folder / f"{STOP}.ckpt")
+    require(rest.steps == whole.steps[STOP:], f"a training must go on where it stopped, got steps {rest.steps}")
+    _compare(rest.states, whole.states[STOP:], "a training must go on as if it had never stopped")
+
+
+class _Course(Callback):
+    """The model behind every step, and what the training told; writes a checkpoint behind one of them."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.steps: list[int] = []
+        self.states: list[dict[str, Tensor]] = []
+        self.losses: list[float] = []
+        self.metrics: dict[str, float] = {}
+
+    def on_train_batch_end(self, trainer, module, *_) -> None:
+        self.steps.append(trainer.global_step)
+        self.states.append(_copy(module.model))
+        self.losses.append(float(trainer.progress_bar_metrics.get("train/loss", math.nan)))
+        if trainer.global_step == STOP:
+            save(trainer, self.folder / f"{STOP}.ckpt")
+
+    def on_train_end(self, trainer, module) -> None:
+        self.metrics = {name: value.item() for name, value in trainer.callback_metrics.items()}
+
+
+def _train(module, links: Links, folder: Path, device, resume: Path | None = None) -> _Course:
+    course = _Course(folder)
+    with stopping(), warnings.catch_warnings():
+        for message in ADVICE:
+            warnings.filterwarnings("ignore", message)
+        trainer = lightning.Trainer(
+            accelerator="gpu" if torch.device(device).type == "cuda" else "cpu",
+            devices=1,
+            max_epochs=-1,
+            max_steps=STEPS,
+            val_check_interval=2,
+            check_val_every_n_epoch=None,
+            num_sanity_val_steps=0,
+            log_every_n_steps=1,
+            logger=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            callbacks=[course, KeepLast(folder / "last.ckpt", math.inf)],
+            default_root_dir=folder,
+        )
+        batches = Batches(links, links.split.train, module.batch_size, 0, STEPS)
+        validation = InOrder(links, links.split.validation, module.batch_size)
+        trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
+    return course
+
+
+def _squared(values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    """The mean squared error, of any task."""
+    error = (values - batch.labels).abs().square().mean()
+    return error, {"squared": error}
+
+
+def _check_attributes(module: lightning.LightningModule, links: Links) -> None:
+    """What a run asks a training for."""
+    require(isinstance(module, lightning.LightningModule), f"a training must be a LightningModule, got {type(module)}")
+    require(isinstance(module.model, Model), "the training's model must be its attribute model")
+    require(module.task.name == links.task.name, "the training's task must be that of its model's scene")
+    size, patience, density = module.batch_size, module.patience, module.density
+    require(isinstance(size, int) and size >= 1, f"batch_size must be a number of places, got {size!r}")
+    counts = patience is None or (isinstance(patience, int) and patience >= 1)
+    require(counts, f"patience must be a number of validations or None, got {patience!r}")
+    require(density is None or isinstance(density, Mapping), f"density must be options or None, got {density!r}")
+
+
+def _check_loss(course: _Course) -> None:
+    finite = all(math.isfinite(loss) for loss in course.losses)
+    require(finite, f"each step must log a finite train/loss for the progress bar, got {course.losses}")
+
+
+def _check_changes(model: Model, before: dict[str, Tensor]) -> None:
+    after, names = _copy(model), {id(parameter): name for name, parameter in model.named_parameters()}
+    for group, parameters in model.parameter_groups().items():
+        changed = any(not torch.equal(after[names[id(p)]], before[names[id(p)]]) for p in parameters if p.requires_grad)
+        require(changed, f"the parameters of group {group} must be trained, and stay as they were")
+
+
+def _check_validation(model: Model, links: Links, metrics: Mapping[str, float]) -> None:
+    batch = links.batch(links.split.validation)
+    device = next(model.parameters()).device
+    values = model.eval().evaluate(batch.to(device)).cpu()
+    for name, scores in links.task.scores(batch.labels, values).items():
+        logged = metrics.get(f"validation/{name}")
+        require(logged is not None, f"a validation must log validation/{name}, got {', '.join(metrics) or 'nothing'}")
+        rule = f"validation/{name} must be the mean over the validation links of what the model evaluates"
+        require_close(torch.tensor(logged), scores.mean(), 1e-4, rule)
+
+
+def _compare(states: list[dict[str, Tensor]], expected: list[dict[str, Tensor]], rule: str) -> None:
+    require(len(states) == len(expected), f"{rule}, got {len(states)} steps for {len(expected)}")
+    for a, b in zip(states, expected, strict=True):
+        for name, tensor in b.items():
+            require_close(a[name], tensor, 1e-6, f"{rule}; {name} differs")
+
+
+def _copy(model: Model) -> dict[str, Tensor]:
+    return {name: tensor.detach().cpu().clone() for name, tensor in model.state_dict().items()}

@@ -1,0 +1,84 @@
+"""Learning rates over the steps, and the optimizers they belong to."""
+
+from collections.abc import Iterable, Mapping
+from types import ModuleType
+
+import torch
+from torch import nn
+from torch.optim import Optimizer, lr_scheduler
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler
+
+from gaigs.registry import call
+
+
+def make_optimizer(
+    config: Mapping, groups: Mapping[str, Iterable[nn.Parameter]], rates: Mapping[str, float]
+) -> Optimizer:
+    """An optimizer of ``torch.optim`` with a learning rate for each group.
+
+    Args:
+        config: ``_target_``, a class of ``torch.optim``, and its options. A weight decay is that of the group
+            ``network`` alone: positions, scales and opacities have no reason to be small.
+        groups: Parameters by name.
+        rates: Learning rate of each group.
+
+    Raises:
+        TypeError: An option is not of its type.
+        ValueError: The target is no class of ``torch.optim``, does not take the options, or one is out of range.
+    """
+    kind, options = _target("training.optimizer", config, torch.optim, Optimizer)
+    if "lr" in options:
+        raise ValueError("training.optimizer takes no lr, as each group has its own; set training.learning_rates")
+    parts = [{"params": list(parameters), "lr": rates[name], "name": name} for name, parameters in groups.items()]
+    optimizer = call("training.optimizer", kind, options, params=parts)
+    for group in optimizer.param_groups:
+        if group["name"] != "network" and "weight_decay" in group:
+            group["weight_decay"] = 0.0
+    return optimizer
+
+
+def make_schedule(config: Mapping, optimizer: Optimizer, steps: int) -> LRScheduler:
+    """A schedule of all of an optimizer's rates, to be stepped once a step.
+
+    Args:
+        config: Options of ``warmup_and_decay``; or ``_target_``, a class of ``torch.optim.lr_scheduler``, with its own.
+        optimizer: Whose rates.
+        steps: Of the whole training.
+
+    Raises:
+        TypeError: An option is not of its type.
+        ValueError: The target is no class of ``torch.optim.lr_scheduler``; an option is unknown or out of range.
+    """
+    if "_target_" not in config:
+        return call("training.schedule", warmup_and_decay, config, optimizer=optimizer, steps=steps)
+    kind, options = _target("training.schedule", config, lr_scheduler, LRScheduler)
+    return call("training.schedule", kind, options, optimizer=optimizer)
+
+
+def warmup_and_decay(optimizer: Optimizer, steps: int, warmup: int, final: float) -> LRScheduler:
+    """Rates rise linearly at first and fall exponentially.
+
+    Args:
+        optimizer: Whose rates.
+        steps: Of the whole training.
+        warmup: Steps over which the rates rise.
+        final: Every rate falls to this fraction of itself at the last step.
+
+    Raises:
+        ValueError: An option is out of range.
+    """
+    if not 0 < final <= 1:
+        raise ValueError(f"training.schedule.final must be in (0, 1], got {final}")
+    if warmup < 0:
+        raise ValueError(f"training.schedule.warmup must be at least 0 steps, got {warmup}")
+    return LambdaLR(optimizer, lambda step: min(1.0, (step + 1) / max(warmup, 1)) * final ** (step / steps))
+
+
+def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tuple[type, dict]:
+    """The class that a configuration names, and its options."""
+    options = dict(config)
+    target = options.pop("_target_", None)
+    found = getattr(module, str(target).removeprefix(f"{module.__name__}."), None)
+    if not str(target).startswith(f"{module.__name__}.") or not (isinstance(found, type) and issubclass(found, base)):
+        raise ValueError(f"{option}._target_ must be a class of {module.__name__}, got {target!r}")
+    return found, options

@@ -1,0 +1,135 @@
+"""Channels of the built-in room: free space, the power and the spectra of the same room, and the phases' sign."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.constants import speed_of_light
+
+from gaigs.data import load
+from gaigs.data.synthetic.image_source import bartlett, min_max
+from gaigs.directions import Grid
+from gaigs.testing import check_data
+
+OFFICIAL = {"name": "official", "validation": 0}
+CARRIER, BANDWIDTH = 6.4896e9, 499.2e6
+
+
+def channels(**options):
+    return load({"name": "synthetic_csi", **options}, OFFICIAL)
+
+
+@pytest.fixture(scope="module")
+def links():
+    return load({"name": "synthetic_csi"}, {"name": "official"})
+
+
+@pytest.fixture(scope="module")
+def free():
+    """Without reflections: a direct path alone, that furniture dims."""
+    return channels(transmitters=40, order=0)
+
+
+def distances(links):
+    """From each transmitter to each element [m]; world frame, float64."""
+    (receiver,) = links.receivers
+    turned = receiver.array.elements.double() @ receiver.pose.rotation.double().T
+    elements = (receiver.pose.position.double() + turned).numpy()
+    return np.linalg.norm(links.query.transmitters.double().numpy()[:, None] - elements, axis=-1)
+
+
+def test_the_default_channels_keep_the_contract(links):
+    check_data(links)
+    assert links.labels.dtype == torch.complex64
+    assert links.labels.shape == (500, 16, 26)
+    assert (links.task.name, links.task.shape) == ("csi", (16, 26))
+    assert links.split.name == "official, validation 0.1, seed 0"
+    assert links.split.test.tolist() == list(range(400, 500))
+    assert links.query.frequencies.tolist() == [CARRIER] * 500
+    assert (links.labels != 0).flatten(1).any(1).all()
+
+
+def test_subcarriers_are_evenly_over_the_band(links):
+    expected = np.linspace(CARRIER - BANDWIDTH / 2, CARRIER + BANDWIDTH / 2, 26)
+    np.testing.assert_allclose(links.task.frequencies, expected, rtol=1e-12)
+
+
+def test_places_and_array_are_those_of_the_spectra(links):
+    spectra = load({"name": "synthetic"}, OFFICIAL)
+    assert torch.equal(links.query.transmitters, spectra.query.transmitters)
+    for ours, theirs in zip(links.receivers, spectra.receivers, strict=True):
+        assert torch.equal(ours.array.elements, theirs.array.elements)
+        assert torch.equal(ours.pose.rotation, theirs.pose.rotation)
+    assert torch.equal(links.split.test, spectra.split.test)
+
+
+def test_spectra_of_the_channels_are_those_of_the_room():
+    """With as many subcarriers as sample the band of a spectrum, steering the channels gives that spectrum."""
+    longest = 3 * math.hypot(7, 5, 3)
+    links = channels(transmitters=8, seed=3, subcarriers=math.ceil(BANDWIDTH * longest / speed_of_light) + 1)
+    spectra = load({"name": "synthetic", "transmitters": 8, "seed": 3}, OFFICIAL)
+    steered = bartlett(links.labels.to(torch.complex128), Grid.degrees(), links.receivers[0].array, CARRIER)
+    assert (min_max(steered) - spectra.labels).abs().max() < 1e-5
+
+
+def test_without_reflections_channels_are_friis_waves_that_furniture_dims(free):
+    frequencies = np.linspace(CARRIER - BANDWIDTH / 2, CARRIER + BANDWIDTH / 2, 26)
+    apart = distances(free)[..., None]
+    waves = (
+        speed_of_light / (4 * np.pi * frequencies * apart) * np.exp(-2j * np.pi * frequencies * apart / speed_of_light)
+    )
+    ratios = free.labels.numpy() / waves
+    assert np.abs(np.angle(ratios)).max() < 1e-3
+    (receiver,) = free.receivers
+    rays = free.query.transmitters - receiver.pose.position
+    cosines = (rays @ receiver.pose.rotation[:, 2] / rays.norm(dim=1)).numpy()
+    losses_db = -20 * np.log10(np.abs(ratios) / cosines[:, None, None])
+    assert np.ptp(losses_db, axis=(1, 2)).max() < 1e-2  # for all of a link's elements and subcarriers the same
+    assert np.abs(losses_db.mean((1, 2)) - losses_db.mean((1, 2)).round()).max() < 1e-2  # furniture's are whole numbers
+    assert 0.3 < (losses_db.mean((1, 2)) < 1e-2).mean() < 0.95
+
+
+def test_reflections_arrive_after_the_direct_path(links, free):
+    """The mean delay of the power is the direct one without reflections, and later with them."""
+
+    def delays(links):
+        spacing = (links.task.frequencies[1] - links.task.frequencies[0]).item()
+        phases = (links.labels[..., 1:] * links.labels[..., :-1].conj()).sum((1, 2)).angle().double().numpy()
+        return -phases / (2 * math.pi * spacing)  # modulo one over the spacing, 50 ns or 15 m
+
+    direct = distances(links).mean(1) / speed_of_light
+    np.testing.assert_allclose(delays(free), distances(free).mean(1) / speed_of_light, atol=1e-10)
+    assert np.median(delays(links) - direct) > 1e-10
+
+
+def test_a_single_subcarrier_is_the_carrier():
+    links = channels(transmitters=5, subcarriers=1)
+    assert links.task.frequencies.tolist() == [CARRIER]
+    wide = channels(transmitters=5, subcarriers=3)
+    torch.testing.assert_close(links.labels[..., 0], wide.labels[..., 1])
+    check_data(links)
+
+
+def test_channels_repeat_with_their_seed_alone():
+    first, again, other = (channels(transmitters=5, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(first.labels, again.labels)
+    assert not torch.equal(first.labels, other.labels)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"subcarriers": 0}, "subcarriers must be at least 1, got 0"),
+        ({"bandwidth": 0.0}, r"bandwidth must be positive \[Hz\], got 0.0"),
+        ({"bandwidth": math.inf}, "bandwidth must be positive"),
+        ({"bandwidth": 14e9}, "frequencies must be positive"),
+        ({"frequency": 920e6}, r"frequency must lie in 1e9\.\.40e9 Hz"),
+        ({"frequency": 0.0}, "frequency must be positive"),
+        ({"transmitters": 1}, "transmitters must be at least 2"),
+        ({"order": -1}, "order must be the largest number of reflections"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        channels(**{"transmitters": 4, **options})

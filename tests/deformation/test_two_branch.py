@@ -1,0 +1,174 @@
+"""The scene mapping network: heads that are left out, one linear layer in parts, and where residuals start."""
+
+from itertools import chain, combinations
+
+import pytest
+import torch
+
+from gaigs.deformation.two_branch import CLEAR, DARKEST, HEADS, TokenLinear, TwoBranch
+from gaigs.placement import Placed
+from gaigs.query import Query
+from gaigs.tokenizer import Tokens
+
+B, N, CHANNELS, WIDTH = 3, 7, 2, 8
+WIDTHS = (5, 4, 6)
+SUBSETS = [list(subset) for subset in chain.from_iterable(combinations(HEADS, size) for size in range(6))]
+SHAPES = {
+    "rotation": (B, N, 4),
+    "scale": (B, N, 3),
+    "signal": (B, N, CHANNELS, 1),
+    "opacity": (B, N),
+    "attenuation": (B, N),
+}
+
+
+def make_tokens(widths=WIDTHS, b=B, n=N, scale=1.0):
+    scene, gaussian, transmitter = widths
+    return Tokens(
+        *(scale * torch.randn(count, width) for count, width in ((b, scene), (n, gaussian), (b, transmitter)))
+    )
+
+
+def make_network(heads, widths=WIDTHS):
+    return TwoBranch(widths, CHANNELS, width=WIDTH, attenuation_layers=2, signal_layers=1, heads=heads)
+
+
+def residuals_of(network, tokens):
+    """The network's residuals; it looks at tokens alone."""
+    b, n = len(tokens.scene), tokens.gaussians.shape[-2]
+    query = Query(torch.full((b, 3), torch.nan), torch.zeros(b, dtype=torch.long))
+    return network(tokens, Placed(torch.full((1, n, 3), torch.nan)), query)
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    torch.manual_seed(0)
+
+
+# --- heads ---
+
+
+@pytest.mark.parametrize("heads", SUBSETS, ids="-".join)
+def test_a_head_left_out_does_not_exist_and_costs_nothing(heads):
+    network = make_network(heads)
+    residuals = dict(zip(HEADS, residuals_of(network, make_tokens()), strict=True))
+    assert {name for name, residual in residuals.items() if residual is not None} == set(heads)
+    for name in heads:
+        assert residuals[name].shape == SHAPES[name]
+    # What no head reads would get no gradient; what starts at 0 lets none through.
+    for head in network.heads.values():
+        torch.nn.init.normal_(head.weight)
+    parameters = dict(network.named_parameters())
+    if heads:
+        total = sum(r.square().sum() for r in residuals_of(network, make_tokens()) if r is not None)
+        total.backward()
+    assert all(parameter.grad is not None and parameter.grad.any() for parameter in parameters.values())
+    assert bool(parameters) == bool(heads)
+
+
+def test_the_number_of_parameters_is_that_of_the_papers_layers():
+    scene, gaussian, transmitter = WIDTHS
+    linear = lambda fan_in, fan_out: (fan_in + 1) * fan_out
+    attenuation = linear(scene + gaussian + transmitter, WIDTH) + 2 * linear(WIDTH, WIDTH)
+    signal = linear(scene + gaussian + transmitter + WIDTH, WIDTH) + linear(WIDTH, WIDTH)
+    heads = {name: linear(WIDTH, 1) for name in ("opacity", "attenuation")}
+    heads |= {name: linear(2 * WIDTH, size) for name, size in (("rotation", 4), ("scale", 3), ("signal", CHANNELS))}
+    for chosen in SUBSETS:
+        expected = sum(heads[name] for name in chosen) + attenuation * bool(chosen)
+        expected += signal * any(name in chosen for name in ("rotation", "scale", "signal"))
+        assert sum(parameter.numel() for parameter in make_network(chosen).parameters()) == expected
+
+
+def test_an_unknown_head_is_refused():
+    with pytest.raises(ValueError, match="among rotation, scale, signal, opacity, attenuation, got phase, shift"):
+        make_network(["signal", "shift", "phase"])
+
+
+@pytest.mark.parametrize(
+    ("option", "count", "least"), [("width", 0, 1), ("attenuation_layers", -1, 0), ("signal_layers", -2, 0)]
+)
+def test_sizes_out_of_range_are_refused(option, count, least):
+    options = {"width": WIDTH, "attenuation_layers": 2, "signal_layers": 1, option: count}
+    with pytest.raises(ValueError, match=rf"deformation\.{option} must be at least {least}, got {count}"):
+        TwoBranch(WIDTHS, CHANNELS, heads=["signal"], **options)
+
+
+def test_residuals_start_at_zero_and_the_attenuation_nearly_clear():
+    residuals = residuals_of(make_network(list(HEADS)), make_tokens(scale=10.0))
+    for residual in (residuals.delta_quats, residuals.delta_scales, residuals.delta_opacities):
+        assert not residual.any()
+    torch.testing.assert_close(residuals.attenuations, torch.full((B, N), CLEAR))
+    assert residuals.delta_signal.any()  # the signal is where transmitters differ from the first step on
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e4, 1e18])
+def test_the_attenuation_lies_in_0_1_however_large_the_activations(dtype, scale):
+    network = make_network(["attenuation"]).to(dtype)
+    tokens = Tokens(*(token.to(dtype) for token in make_tokens(scale=scale)))
+    extremes = []
+    for sign in (-1, 1):
+        torch.nn.init.constant_(network.heads["attenuation"].weight, sign * 3)
+        attenuations = residuals_of(network, tokens).attenuations
+        assert attenuations.min() > 0
+        assert attenuations.max() <= 1
+        attenuations.log().sum().backward()
+        assert all(parameter.grad.isfinite().all() for parameter in network.parameters())
+        extremes += [attenuations.min().item(), attenuations.max().item()]
+    if scale == 1e18:
+        assert min(extremes) == pytest.approx(DARKEST)
+        assert max(extremes) == pytest.approx(1)
+
+
+# --- the linear layer on the concatenation that never exists ---
+
+
+@pytest.mark.parametrize("hidden", [0, 3])
+@pytest.mark.parametrize("widths", [WIDTHS, (5, 0, 0), (0, 4, 0), (0, 4, 6), (5, 0, 6), (0, 0, 0)])
+def test_it_is_one_linear_layer_on_the_concatenation(widths, hidden):
+    layer, tokens = TokenLinear(widths, WIDTH, hidden), make_tokens(widths)
+    inner = torch.randn(B, N, hidden) if hidden else None
+    scene, gaussians, transmitters = tokens.scene[:, None], tokens.gaussians[None], tokens.transmitters[:, None]
+    parts = [part.expand(B, N, -1) for part in (scene, transmitters, gaussians)] + [inner] * bool(hidden)
+    weights = [linear.weight for linear in (layer.links, layer.gaussians, layer.hidden) if linear is not None]
+    weight = torch.cat(weights, 1) if weights else torch.zeros(WIDTH, 0)
+    whole = torch.nn.functional.linear(torch.cat(parts, -1), weight, layer.bias)
+    torch.testing.assert_close(layer(tokens, inner), whole)
+
+
+def test_it_starts_as_one_linear_layer_on_the_concatenation_does():
+    layer = TokenLinear((30, 300, 70), 200, hidden=100)
+    whole = torch.nn.Linear(500, 200)
+    for parameter in layer.parameters():
+        assert parameter.abs().max() <= whole.weight.abs().max() * 1.01
+        assert parameter.std().item() == pytest.approx(whole.weight.std().item(), rel=0.15)
+
+
+def test_each_pair_is_mapped_by_itself():
+    network, tokens = make_network(["rotation", "signal", "opacity"]), make_tokens()
+    for head in network.heads.values():
+        torch.nn.init.normal_(head.weight)
+    everyone = residuals_of(network, tokens)
+    alone = residuals_of(network, Tokens(tokens.scene[1:2], tokens.gaussians[4:5], tokens.transmitters[1:2]))
+    for all_pairs, pair in zip(everyone, alone, strict=True):
+        if pair is not None:
+            torch.testing.assert_close(pair[0, 0], all_pairs[1, 4])
+
+
+@pytest.mark.parametrize("hidden", [0, 3])
+def test_gaussians_that_stand_elsewhere_for_each_query_have_tokens_of_their_own(hidden):
+    layer, tokens = TokenLinear(WIDTHS, WIDTH, hidden), make_tokens()
+    own = tokens._replace(gaussians=torch.randn(B, N, WIDTHS[1]))
+    inner = torch.randn(B, N, hidden) if hidden else None
+    alone = [Tokens(own.scene[i : i + 1], own.gaussians[i], own.transmitters[i : i + 1]) for i in range(B)]
+    each = [layer(part, inner[i : i + 1] if hidden else None) for i, part in enumerate(alone)]
+    torch.testing.assert_close(layer(own, inner), torch.cat(each))
+    shared = own._replace(gaussians=tokens.gaussians.expand(B, -1, -1))
+    torch.testing.assert_close(layer(shared, inner), layer(tokens, inner))
+
+
+@pytest.mark.parametrize(("b", "n"), [(0, N), (B, 0)])
+def test_nothing_has_residuals_too(b, n):
+    residuals = residuals_of(make_network(list(HEADS)), make_tokens(b=b, n=n))
+    for residual, shape in zip(residuals, SHAPES.values(), strict=True):
+        assert residual.shape == (b, n, *shape[2:])

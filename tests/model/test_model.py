@@ -1,0 +1,213 @@
+"""What all models share, asked of the splatting pipeline: directions, chunks, questions of every kind, carriers."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from pipeline import NONE, PARTS, watch
+
+from gaigs.directions import Rays
+from gaigs.query import Batch, Query
+
+PROJECTIONS = pytest.mark.parametrize("projection", ["mercator", "equirectangular", "direction_cosine"])
+
+
+# --- directions ---
+
+
+@PROJECTIONS
+def test_fewer_directions_get_the_values_of_all(build, batch, projection):
+    model = build(projection={"name": projection})
+    thin = replace(batch, directions=batch.directions.thin(slice(1, None, 3), slice(2, None, 4)), labels=None)
+    torch.testing.assert_close(model(thin).value, model(batch).value[:, 1::3, 2::4], rtol=0, atol=1e-5)
+
+
+@PROJECTIONS
+def test_rays_get_the_values_of_the_grids_pixels(build, batch, projection):
+    model, whole = build(projection={"name": projection}), batch.directions
+    chosen = torch.randperm(whole.shape[0] * whole.shape[1], generator=torch.Generator().manual_seed(0))[:200]
+    rays = whole.flatten()[chosen]
+    assert isinstance(rays, Rays)
+    value = model(replace(batch, directions=rays, labels=None)).value
+    assert value.shape == (3, 200)
+    torch.testing.assert_close(value, model(batch).value.flatten(1)[:, chosen], rtol=0, atol=1e-5)
+    assert (value[:, :-1] - value[:, 1:]).abs().max() > 0.1  # it is no constant map
+
+
+def test_rays_train_as_the_grid_does(build, batch):
+    model = build()
+    gradients = []
+    for directions in (batch.directions, batch.directions.flatten()):
+        value = model(replace(batch, directions=directions, labels=None)).value
+        gradients.append(torch.autograd.grad(value.square().sum(), list(model.parameters())))
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4 * one.abs().max().item())
+
+
+def test_labels_are_predicted_in_their_own_directions_unless_told(build, batch):
+    model = build()
+    assert torch.equal(model(Batch(batch.query)).value, model(batch).value)
+
+
+@pytest.mark.parametrize("chunk", [1, 100, 648, 700, 1296, 10**6])
+def test_evaluation_in_chunks_equals_the_whole(build, batch, chunk):
+    model = build()
+    whole = model(batch).value.detach()
+    model.chunk = chunk
+    if chunk == 1:
+        batch = replace(batch, directions=batch.directions.flatten()[:5])
+        whole = whole.flatten(1)[:, :5]
+    drawn = []
+    watch(model, drawn)
+    found = model.evaluate(batch)
+    pairs = [len(arguments[1]) * arguments[4].shape[0] * arguments[4].shape[1] for arguments in drawn]
+    assert max(pairs) <= max(chunk, 1)
+    torch.testing.assert_close(found, whole, rtol=0, atol=1e-5)
+    assert not found.requires_grad
+
+
+# --- predict ---
+
+
+def test_batches_do_not_change_predictions(build, links):
+    model, places = build(), links.query.transmitters
+    together = model.predict(places, batch_size=24)
+    for size in (1, 5, 100):
+        torch.testing.assert_close(model.predict(places, batch_size=size), together, rtol=0, atol=1e-5)
+    assert torch.equal(together, model.predict(places, batch_size=24))
+
+
+def test_predict_takes_lists_and_leaves_the_mode(build):
+    model = build().train()
+    values = model.predict([[1, 2, 1.5], [0, 0, 0]], 1)
+    assert model.training
+    assert values.shape == (2, 18, 36)
+    assert not values.requires_grad
+    assert values.isfinite().all()
+    assert model.eval().predict([[1, 2, 1.5]]).shape == (1, 18, 36)
+    assert not model.training
+    assert model.predict(torch.zeros(0, 3)).shape == (0, 18, 36)
+
+
+def test_predict_takes_points_grids_and_receivers_of_any_kind(build):
+    model, points = build(), torch.rand(2, 3, 3)
+    each = torch.stack([model.predict(points.flatten(0, 1), receiver) for receiver in (0, 1)])
+    close = lambda found, true: torch.testing.assert_close(found, true, rtol=0, atol=1e-5)
+    close(model.predict(points, "gateway1"), each[1].unflatten(0, (2, 3)))
+    close(model.predict(points[1, 2], 1), each[1, 5])
+    receivers = torch.tensor([0, 1, 1, 0, 1, 0])
+    close(model.predict(points.flatten(0, 1), receivers), each[receivers, torch.arange(6)])
+    close(model.predict(Query(points.flatten(0, 1), receivers), batch_size=4), each[receivers, torch.arange(6)])
+
+
+def test_predict_takes_directions(build, links):
+    model, places = build(), links.query.transmitters[:2]
+    whole = model.predict(places)
+    grid, rays = links.task.directions.thin(slice(0, 3), slice(4, 9)), links.task.directions.flatten()[7:11]
+    close = lambda found, true: torch.testing.assert_close(found, true, rtol=0, atol=1e-5)
+    close(model.predict(places, directions=grid), whole[:, :3, 4:9])
+    close(model.predict(places, directions=rays), whole.flatten(1)[:, 7:11])
+
+
+@pytest.mark.parametrize(
+    ("transmitters", "receiver", "message"),
+    [
+        ([1.0, 2], 0, r"\(..., 3\) positions \[m\], got shape \(2,\)"),
+        ([[1.0, 2]], 0, r"got shape \(1, 2\)"),
+        ([[1.0, 2, 3], [0, float("nan"), 1]], 0, r"must be finite, got \[0.0, nan, 1.0\] in row 1"),
+        ([[1.0, float("inf"), 3]], 0, "must be finite"),
+        ([[1.0, 2, 3]], 2, "must be one of 0 = gateway0, 1 = gateway1, got 2"),
+        ([[1.0, 2, 3]], -1, "got -1"),
+        ([[1.0, 2, 3]], "gateway2", "must be one of 0 = gateway0, 1 = gateway1, got 'gateway2'"),
+        ([[1.0, 2, 3]], True, "must be one of 0 = gateway0, 1 = gateway1, got True"),
+        ([[1.0, 2, 3]], ["gateway0"], r"must be one of 0 = gateway0, 1 = gateway1, got \['gateway0'\]"),
+        ([[1.0, 2, 3]], torch.tensor([0, 1]), r"one for each of the \(1,\) positions, got \(2,\)"),
+    ],
+)
+def test_impossible_questions_are_refused(build, transmitters, receiver, message):
+    with pytest.raises(ValueError, match=message):
+        build([]).predict(transmitters, receiver)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "message"),
+    [
+        (0.0, r"positive and finite \[Hz\], got 0"),
+        (-1e9, "positive and finite"),
+        (float("nan"), "positive and finite"),
+        (torch.tensor([1e9, 2e9]), r"one for each of the \(1,\) positions, got \(2,\)"),
+    ],
+)
+def test_impossible_frequencies_are_refused(build, frequency, message):
+    with pytest.raises(ValueError, match=message):
+        build([]).predict([[1.0, 2, 3]], frequency=frequency)
+
+
+def test_gaussians_that_become_nan_are_not_hidden(build, links):
+    model = build()
+    with torch.no_grad():
+        model.gaussians.means[3] = torch.nan
+    assert model.predict(links.query.transmitters[:1]).isnan().any()
+
+
+# --- several carriers ---
+
+
+@pytest.fixture
+def band(links):
+    """The same links at one of three carriers each."""
+    query = links.query
+    frequencies = torch.tensor([1e9, 2e9, 4e9])[torch.arange(24) // 2 % 3]
+    return replace(links, query=Query(query.transmitters, query.receivers, frequencies))
+
+
+@pytest.mark.parametrize("tokenizer", ["multiview", "ga", "euclidean"])
+def test_carriers_change_predictions(build, band, tokenizer):
+    parts = {"euclidean": PARTS["tokenizer"]["euclidean"], "multiview": PARTS["tokenizer"]}
+    model = build(scene=band.scene, tokenizer=parts.get(tokenizer, {"name": tokenizer}))
+    place = band.query.transmitters[:1]
+    low, high = (model.predict(place, frequency=frequency) for frequency in (1e9, 4e9))
+    assert (low - high).abs().max() > 1e-4
+    mixed = model.predict(place.expand(2, 3), frequency=torch.tensor([1e9, 4e9]))
+    torch.testing.assert_close(mixed, torch.cat((low, high)), rtol=0, atol=1e-5)
+
+
+def test_a_missing_frequency_is_refused_where_there_are_several(build, band):
+    place = band.query.transmitters[:1]
+    for model in (build(scene=band.scene), build(scene=band.scene, **NONE)):
+        with pytest.raises(ValueError, match=r"have 3 carriers, 1e\+09 to 4e\+09 Hz; say which with frequency="):
+            model.predict(place)
+        with pytest.raises(ValueError, match="have 3 carriers"):
+            model.predict(Query(place, torch.tensor([0])))
+        assert model.predict(Query(place, torch.tensor([0]), torch.tensor([2e9]))).isfinite().all()
+
+
+def test_one_carrier_goes_without_saying(build, band):
+    band = replace(band, query=replace(band.query, frequencies=torch.full((24,), 2e9)))
+    model, place = build(scene=band.scene), band.query.transmitters[:1]
+    assert torch.equal(model.predict(place), model.predict(place, frequency=2e9))
+
+
+def test_a_batch_moves(batch):
+    batch = replace(batch, query=replace(batch.query, frequencies=torch.ones(3)))
+    moved = batch.to(torch.device("meta"))
+    tensors = moved.query.transmitters, moved.query.receivers, moved.query.frequencies, moved.labels
+    assert {tensor.device.type for tensor in (*tensors, moved.directions.azimuths)} == {"meta"}
+    bare = Batch(Query(batch.query.transmitters, batch.query.receivers)).to(torch.device("meta"))
+    assert bare.directions is None
+    assert bare.labels is None
+    assert bare.query.frequencies is None
+
+
+@pytest.mark.parametrize(
+    ("query", "options", "message"),
+    [
+        (Query(torch.zeros(2, 3), torch.zeros(2, dtype=torch.long)), {"receiver": 1}, "a query says itself who hears"),
+        (Query(torch.zeros(2, 3), torch.zeros(2, dtype=torch.long)), {"frequency": 1e9}, "at which frequency; leave"),
+        (Query(torch.full((2, 3), torch.nan), torch.zeros(2, dtype=torch.long)), {}, "transmitters must be finite"),
+        (Query(torch.zeros(2, 3), torch.full((2,), 9)), {}, "receiver must be one of 0 = "),
+    ],
+)
+def test_queries_that_cannot_be_answered_are_refused(build, query, options, message):
+    with pytest.raises(ValueError, match=message):
+        build([]).predict(query, **options)

@@ -1,0 +1,161 @@
+"""Channels at the elements against spherical waves from very far away, which are plane where they arrive."""
+
+import cmath
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.constants import speed_of_light
+
+from gaigs.data import Links, Split
+from gaigs.geometry import Pose
+from gaigs.pooling.element_sum import ElementSum
+from gaigs.propagation import direct_waves, free_space
+from gaigs.query import Query
+from gaigs.scene import Array, Receiver
+from gaigs.task.csi import Csi
+from gaigs.testing import check_pooling, example_links
+
+FREQUENCIES = torch.tensor([2.40e9, 2.44e9, 2.48e9], dtype=torch.float64)
+POSES = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)), Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0))
+ROWS, COLUMNS = 6, 12
+
+
+def make(pattern="isotropic", conjugated=False, gain=1.0, random_phases=False):
+    """Direct waves to two turned receivers; an array whose elements are in no plane."""
+    elements = torch.tensor([[0.05, 0, 0], [0, 0.07, 0], [0, 0, 0.03], [-0.04, 0.02, 0.01]])
+    places = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 4.0, 2.0])
+    links = Links(
+        query=Query(places, torch.arange(60) % 2),
+        receivers=tuple(Receiver(f"gateway{i}", pose, Array(elements, pattern)) for i, pose in enumerate(POSES)),
+        labels=torch.zeros(60, 4, 3, dtype=torch.complex64),
+        task=Csi(4, FREQUENCIES),
+        split=Split("all but the last", torch.arange(50), torch.arange(0), torch.arange(50, 60)),
+    )
+    waves = gain * direct_waves(links.scene, links.query, FREQUENCIES, 1 if conjugated else -1)
+    if random_phases:
+        phases = 2 * math.pi * torch.rand(60, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        waves = waves * torch.polar(torch.ones_like(phases), phases)
+    return replace(links, labels=waves.to(torch.complex64))
+
+
+def fitted(links, grid=(ROWS, COLUMNS)):
+    pooling = ElementSum(links.scene, list(grid))
+    pooling.fit(links)
+    return pooling
+
+
+def bright(pooling, row, column, amplitudes):
+    """A map that is dark but for one direction; a complex amplitude for each subcarrier."""
+    image = torch.zeros(1, pooling.channels, *pooling.grid.shape)
+    for s, amplitude in enumerate(amplitudes):
+        image[0, s, row, column], image[0, len(amplitudes) + s, row, column] = amplitude.real, amplitude.imag
+    return image
+
+
+@pytest.mark.parametrize("pattern", ["isotropic", "cosine"])
+@pytest.mark.parametrize("conjugated", [False, True])
+@pytest.mark.parametrize("receiver", [0, 1])
+@pytest.mark.parametrize(("row", "column"), [(4, 0), (3, 7), (5, 10), (1, 5)])
+def test_a_bright_direction_is_a_plane_wave_from_there(pattern, conjugated, receiver, row, column):
+    links = make(pattern, conjugated, gain=7.0)
+    pooling, sign = fitted(links), 1 if conjugated else -1
+    amplitudes = [0.8 * cmath.exp(0.3j), 1.1 * cmath.exp(-2j), 0.5 + 0j]
+    query = Query(torch.tensor([[1.0, 2.0, 0.5]]), torch.tensor([receiver]))
+    (found,) = pooling(bright(pooling, row, column, amplitudes), query)
+
+    # What comes from a source very far away in that direction, over what would come to the array's middle.
+    pose, array = POSES[receiver], links.receivers[receiver].array
+    ray = pooling.grid.vectors()[row, column].double()
+    places = array.elements.double() @ pose.rotation.double().T
+    source = 1e6 * pose.rotation.double() @ ray
+    at = lambda distances: free_space(distances[:, None], FREQUENCIES, sign)
+    arriving = at((source - places).norm(dim=1)) / at(source.norm()[None])
+    middle = at((query.transmitters[0].double() - pose.position.double()).norm()[None])
+    share = 1 / (ROWS * COLUMNS)  # of the sphere
+    element = max(0.0, ray[2].item()) if pattern == "cosine" else 1.0
+    unit = 7.0 * middle * share
+    expected = unit * element * torch.tensor(amplitudes) * arriving
+    torch.testing.assert_close(found, expected.to(found.dtype), rtol=0, atol=1e-4 * unit.abs().max().item())
+    if element:
+        assert (arriving[0] - arriving[1]).abs().min() > 0.1  # elements do tell the direction
+
+
+@pytest.mark.parametrize("conjugated", [False, True])
+@pytest.mark.parametrize("receiver", [0, 1])
+def test_the_direct_path_is_one_map_from_everywhere(conjugated, receiver):
+    """A transmitter in the same direction, near or far: the map that explains the one explains the other."""
+    links = make(conjugated=conjugated)
+    pooling, pose = fitted(links), POSES[receiver]
+    ray = pooling.grid.vectors()[4, 3]
+    places = torch.stack([pose.world(distance * ray) for distance in (40.0, 90.0, 333.0)])
+    query = Query(places, torch.full((3,), receiver))
+    found = pooling(bright(pooling, 4, 3, [ROWS * COLUMNS + 0j] * 3).expand(3, -1, -1, -1), query)
+    true = direct_waves(links.scene, query, FREQUENCIES, 1 if conjugated else -1)
+    assert ((found - true).abs() / true.abs()).max() < 0.01
+
+
+def test_directions_add_up():
+    pooling = fitted(make())
+    query = Query(torch.tensor([[1.0, 2.0, 0.5]]), torch.tensor([1]))
+    one, other = bright(pooling, 0, 3, [1 + 0j] * 3), bright(pooling, 4, 8, [0.5j] * 3)
+    torch.testing.assert_close(pooling(one + other, query), pooling(one, query) + pooling(other, query))
+
+
+def test_each_link_has_its_own_map():
+    pooling = fitted(make())
+    image = torch.randn(3, 6, ROWS, COLUMNS, generator=torch.Generator().manual_seed(0))
+    query = Query(torch.rand(3, 3), torch.zeros(3, dtype=torch.long))
+    alone = torch.cat([pooling(image[i : i + 1], query[i : i + 1]) for i in range(3)])
+    torch.testing.assert_close(pooling(image, query), alone)
+
+
+@pytest.mark.parametrize("gain", [1e-3, 1.0, 40.0])
+def test_the_strength_is_that_of_the_channels_over_free_space(gain):
+    pooling = fitted(make(gain=gain))
+    assert pooling.strength.item() == pytest.approx(gain, rel=1e-4)
+
+
+@pytest.mark.parametrize("conjugated", [False, True])
+def test_without_a_common_clock_the_amplitude_is_left_and_the_arrays_sign(conjugated):
+    pooling = fitted(make(conjugated=conjugated, random_phases=True))
+    assert pooling.sign == 0
+    assert pooling.array_sign == (1 if conjugated else -1)
+    clocked = fitted(make(conjugated=conjugated))
+    image = torch.randn(1, 6, ROWS, COLUMNS, generator=torch.Generator().manual_seed(0))
+    query = Query(torch.tensor([[1.0, 2.0, 0.5]]), torch.tensor([0]))
+    distance = (query.transmitters[0] - POSES[0].position).double().norm()
+    turned = torch.polar(torch.ones(3, dtype=torch.float64), 2 * math.pi / speed_of_light * FREQUENCIES * distance)
+    turned = turned.conj() if conjugated else turned
+    expected = clocked(image, query) * turned.to(torch.complex64)
+    scale = expected.abs().max().item()
+    torch.testing.assert_close(pooling(image, query), expected, rtol=0, atol=1e-4 * scale)
+
+
+def test_no_test_label_is_looked_at():
+    links = make()
+    labels = links.labels.clone()
+    labels[links.split.test] = torch.nan
+    assert fitted(replace(links, labels=labels)).strength == fitted(links).strength
+
+
+@pytest.mark.parametrize("pattern", ["isotropic", "cosine"])
+def test_the_zone_is_what_the_elements_hear(pattern):
+    low, high = ElementSum(make(pattern).scene, [ROWS, COLUMNS]).zone
+    assert (low, high) == (0 if pattern == "cosine" else -math.pi / 2, math.pi / 2)
+
+
+def test_it_keeps_the_contract_of_poolings():
+    check_pooling(lambda scene: ElementSum(scene, [4, 8]), example_links("csi"))
+
+
+def test_other_labels_and_arrays_are_refused():
+    with pytest.raises(ValueError, match="pooling 'element_sum' gives complex channels, and labels of task 'rssi' are"):
+        ElementSum(example_links("rssi").scene, [4, 8])
+    links = make()
+    receivers = links.receivers[0], replace(links.receivers[1], array=Array.single())
+    with pytest.raises(ValueError, match="labels have 4 elements, and the array of gateway1 1; give the data's"):
+        ElementSum(replace(links, receivers=receivers).scene, [4, 8])
+    with pytest.raises(ValueError, match=r"pooling\.grid must be \[rows, columns\], two whole numbers, got \[4\]"):
+        ElementSum(links.scene, [4])

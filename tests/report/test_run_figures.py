@@ -1,0 +1,199 @@
+"""All figures of a run, as its task asks for them."""
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+from matplotlib import image
+from matplotlib.figure import Figure
+
+from gaigs import evaluation
+from gaigs.data import Links, Split
+from gaigs.directions import Grid
+from gaigs.evaluation import write_figures
+from gaigs.gaussians import Gaussians
+from gaigs.geometry import Pose
+from gaigs.query import Query
+from gaigs.radio_map import RadioMap
+from gaigs.report import channels, curves, radio_map, room, spectra, style
+from gaigs.scene import Array, Receiver
+from gaigs.task.csi import Csi
+from gaigs.task.rssi import Rssi
+from gaigs.task.spectrum import Spectrum
+
+GRID = Grid.degrees(range(10, 91, 10), range(0, 360, 15))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(5)
+
+
+@pytest.fixture
+def spy(monkeypatch):
+    """Notes the arguments and the figure of a function that tasks import when they draw."""
+
+    def watch(module, name):
+        shown, original = [], getattr(module, name)
+
+        def noted(*args, **options):
+            shown.append((args, original(*args, **options)))
+            return shown[-1][1]
+
+        monkeypatch.setattr(module, name, noted)
+        return shown
+
+    return watch
+
+
+@pytest.fixture
+def spectrum_links():
+    generator = torch.Generator().manual_seed(1)
+    query = Query(torch.rand(12, 3, generator=generator), torch.zeros(12, dtype=torch.long))
+    pose = Pose.from_xyzw([3.0, 0, 1], [0.0, 0, 0, 1])
+    split = Split("runs of 4", torch.arange(8), torch.tensor([], dtype=torch.long), torch.arange(8, 12))
+    task = Spectrum(GRID.elevations, GRID.azimuths, "min-max")
+    labels = torch.rand(12, *task.shape, generator=generator)
+    return Links(query, (Receiver("array", pose),), labels, task, split=split)
+
+
+def write_losses(path, steps=30):
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, ["epoch", "step", "train/loss", "validation/ssim"])
+        writer.writeheader()
+        writer.writerows({"epoch": 0, "step": k, "train/loss": 1 / (k + 1), "validation/ssim": k} for k in range(steps))
+
+
+def test_a_run_is_drawn_into_its_folder(spectrum_links, tmp_path, rng):
+    test = spectrum_links.split.test
+    labels = spectrum_links.labels[test].numpy().astype(np.float16)
+    ssim = {f"ssim_{model}": rng.random(4) for model in ("gaigs", "mean", "knn")}
+    np.savez(tmp_path / "predictions.npz", labels=labels, prediction=labels[::-1], link=test, **ssim)
+    (tmp_path / "log" / "version_0").mkdir(parents=True)
+    write_losses(tmp_path / "log" / "version_0" / "metrics.csv")
+    torch.manual_seed(0)
+    start = {"count": 30, "near": 0.5, "far": 3, "spread": 1, "opacity": 0.5, "signal": 0.1}
+    gaussians = Gaussians(spectrum_links.scene, zone=(0.1, 1.5), channels=2, **start)
+    files = write_figures(tmp_path, spectrum_links, gaussians)
+    assert {file.stem for file in files} == {"room", "loss", "spectra", "spectra_polar", "ssim_cdf"}
+    for file in files:
+        pixels = image.imread(file)
+        assert file.parent == tmp_path / "figures"
+        assert pixels[..., :3].std() > 0.02  # something is drawn on the white
+        assert pixels.shape[1] >= 600  # a column at 200 dpi
+
+
+def test_examples_are_at_their_percentiles_of_the_own_model(spectrum_links, tmp_path, rng, spy):
+    labels = rng.random((41, 9, 24)).astype(np.float16)
+    own = rng.permutation(np.linspace(0, 0.8, 41))
+    np.savez(tmp_path / "predictions.npz", labels=labels, prediction=1 - labels, ssim_gaigs=own, ssim_knn=own[::-1])
+    shown = spy(spectra, "spectra")
+    spectrum_links.task.figures(tmp_path, spectrum_links)
+    drawn_labels, drawn_predictions, ssim, names = shown[0][0][:4]
+    assert dict(zip(names, ssim, strict=True)) == pytest.approx(
+        {"10th percentile": 0.08, "median": 0.4, "90th percentile": 0.72}
+    )
+    np.testing.assert_array_equal(drawn_labels[1], labels[np.argsort(own)[20]])
+    np.testing.assert_array_equal(drawn_predictions, 1 - drawn_labels)
+
+
+def test_a_baseline_has_neither_losses_nor_gaussians(spectrum_links, tmp_path):
+    labels = spectrum_links.labels[spectrum_links.split.test].numpy().astype(np.float16)
+    np.savez(tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_knn=np.ones(1))
+    names = {file.stem for file in write_figures(tmp_path, spectrum_links, None)}
+    assert names == {"room", "spectra", "spectra_polar", "ssim_cdf"}
+
+
+@pytest.fixture
+def rssi_run(tmp_path):
+    """Links of eight gateways and the folder of a run on them."""
+    rng = np.random.default_rng(8)
+    count = 8
+    poses = [Pose(torch.tensor([float(i), 0, 2]), torch.eye(3)) for i in range(count)]
+    receivers = tuple(Receiver(f"g{i}", pose) for i, pose in enumerate(poses))
+    query = Query(torch.rand(160, 3) * torch.tensor([8.0, 4, 1]), torch.arange(160) % count)
+    labels = torch.linspace(-80, -50, 160)
+    split = Split("random", torch.arange(80), torch.zeros(0, dtype=torch.long), torch.arange(80, 160))
+    links = Links(query, receivers, labels, Rssi(), split=split)
+    test = split.test.numpy()
+    errors = {name: rng.normal(0, scale, 80) for name, scale in (("gaigs", 2), ("mean", 6), ("knn", 3))}
+    np.savez(
+        tmp_path / "predictions.npz",
+        link=test,
+        transmitters=query.transmitters[test].numpy(),
+        receiver=test % count,
+        labels=labels[test].numpy(),
+        prediction=labels[test].numpy() + errors["gaigs"],
+        **{f"error_{name}": error for name, error in errors.items()},
+    )
+    names = tuple(receiver.name for receiver in receivers)
+    maps = RadioMap(rng.uniform(-80, -50, (count, 9, 17)), 0.5 * np.arange(17), 0.5 * np.arange(9), 0.5, names)
+    maps.save(tmp_path / "radio_map.npz")
+    return links, tmp_path, errors
+
+
+def test_an_rssi_run_is_drawn_into_its_folder(rssi_run, monkeypatch):
+    links, folder, _ = rssi_run
+    monkeypatch.setattr(style, "DPI", 50)  # small ones are written sooner
+    files = write_figures(folder, links, None)
+    paged = ("predicted_against_measured", "radio_map")
+    assert {file.stem for file in files} == {"room", "error_cdf", *paged, *(f"{name}_2" for name in paged)}
+    for file in files:
+        assert file.parent == folder / "figures"
+        assert image.imread(file)[..., :3].std() > 0.02  # something is drawn on the white
+
+
+def test_figures_show_the_run(rssi_run, spy, monkeypatch):
+    links, folder, errors = rssi_run
+    monkeypatch.setattr(Figure, "savefig", lambda *_, **__: None)
+    distributed, mapped, seen = spy(curves, "cdf"), spy(radio_map, "radio_maps"), spy(room, "room")
+    evaluation.write_figures(folder, links, None)
+    (absolute, *_), drawn = distributed[0]
+    assert list(absolute) == ["gaigs", "mean", "knn"]
+    np.testing.assert_allclose(absolute["mean"], np.abs(errors["mean"]))
+    (ax,) = drawn.axes
+    assert ax.get_xlim() == (0, pytest.approx(np.quantile(np.abs(errors["mean"]), 0.99)))
+    assert ax.get_xlabel() == "|error| [dB], split random"
+    assert ax.get_ylabel() == "share of test readings"
+    _, gateways, readings, _ = mapped[0][0]
+    assert gateways["g3"].tolist() == [3, 0, 2]
+    third = links.split.test[links.split.test % 8 == 3]
+    np.testing.assert_allclose(readings["g3"][:, :2], links.query.transmitters[third, :2])
+    np.testing.assert_allclose(readings["g3"][:, 2], links.labels[third])
+    plan = seen[0][1].axes[0]
+    assert not plan.texts  # gateways have no axes to show
+    assert len(plan.lines[2].get_xdata()) == 8
+
+
+def test_a_missing_map_is_told(rssi_run):
+    links, folder, _ = rssi_run
+    (folder / "radio_map.npz").unlink()
+    with pytest.raises(FileNotFoundError, match=r"radio_map\.npz"):
+        write_figures(folder, links, None)
+
+
+@pytest.mark.parametrize("subcarriers", [1, 2, 16])
+def test_a_run_of_channels_is_drawn(tmp_path, rng, spy, monkeypatch, subcarriers):
+    frequencies = 2.4e9 + 1e6 * torch.arange(subcarriers, dtype=torch.float64)
+    task = Csi(4, frequencies)
+    pose, array = Pose.from_xyzw([3.0, 0, 1], [0.0, 0, 0, 1]), Array.planar(2, 2, 0.06)
+    split = Split("official", torch.arange(8), torch.tensor([], dtype=torch.long), torch.arange(8, 29))
+    query = Query(torch.rand(29, 3), torch.zeros(29, dtype=torch.long))
+    labels = torch.randn(29, *task.shape, dtype=torch.complex64)
+    links = Links(query, (Receiver("array", pose, array),), labels, task, split=split)
+    own = rng.permutation(np.linspace(-10, 30, 21))
+    test = labels[split.test].numpy()
+    np.savez(tmp_path / "predictions.npz", labels=test, prediction=1j * test, snr_db_gaigs=own, snr_db_knn=own[::-1])
+    shown = spy(channels, "magnitudes_and_phases")
+    monkeypatch.setattr(style, "DPI", 50)
+    files = write_figures(tmp_path, links, None)
+    responses = {"impulse_response"} if subcarriers > 1 else set()
+    assert {file.stem for file in files} == {"room", "channels", "snr_cdf"} | responses
+    drawn_labels, drawn_predictions, snr, names, drawn_frequencies = shown[0][0]
+    assert dict(zip(names, snr, strict=True)) == pytest.approx(
+        {"10th percentile": -6, "median": 10, "90th percentile": 26}
+    )
+    np.testing.assert_array_equal(drawn_labels[2], test[np.argsort(own)[18]])
+    np.testing.assert_array_equal(drawn_predictions, 1j * drawn_labels)
+    np.testing.assert_array_equal(drawn_frequencies, frequencies)

@@ -1,0 +1,300 @@
+"""Parts of made-up trajectories and clouds, checked by set arithmetic and numpy."""
+
+import inspect
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from gaigs.configuration import conf_dir
+from gaigs.data import Links
+from gaigs.geometry import Pose
+from gaigs.query import Query
+from gaigs.registry import registry
+from gaigs.scene import Receiver
+from gaigs.task.rssi import Rssi
+from gaigs.testing import check_split
+
+N = 400
+
+SPLITS = [
+    {"name": "official"},
+    {"name": "random", "test": 0.25},
+    {"name": "sparse", "train": 60, "test": 0.25},
+    {"name": "runs", "length": 10, "test": 0.25},
+    {"name": "blocks", "edge": 0.5, "test": 0.25},
+]
+each_split = pytest.mark.parametrize("options", SPLITS, ids=lambda options: options["name"])
+
+
+def links_at(places, rows=None, official=None):
+    """Links from places, each of a row of its own unless told, to one receiver."""
+    return Links(
+        query=Query(places, torch.zeros(len(places), dtype=torch.long)),
+        receivers=(Receiver("gateway1", Pose(torch.zeros(3), torch.eye(3))),),
+        labels=torch.linspace(-80, -40, len(places)),
+        task=Rssi(),
+        rows=rows,
+        official=official,
+    )
+
+
+def part(links, **options):
+    return registry("split").build(options, links=links)
+
+
+@pytest.fixture
+def links():
+    """A cloud; the data's own parts are the even links against every fourth of the odd ones, out of order."""
+    places = 3 * torch.rand(N, 3, generator=torch.Generator().manual_seed(1))
+    return links_at(places, official=lambda: (torch.arange(0, N, 2).flip(0), torch.arange(1, N, 4).flip(0)))
+
+
+@each_split
+def test_a_split_keeps_the_contract(links, options):
+    check_split(lambda seed: part(links, **options, seed=seed), links)
+
+
+@each_split
+@pytest.mark.parametrize("validation", [0, 0.2])
+def test_parts_are_disjoint_and_ascending(links, options, validation):
+    result = part(links, validation=validation, **options)
+    parts = [result.train, result.validation, result.test]
+    numbers = torch.cat(parts).tolist()
+    assert len(numbers) == len(set(numbers))
+    assert all(p.tolist() == sorted(p.tolist()) and p.dtype == torch.int64 for p in parts)
+    assert len(result.train)
+    assert len(result.test)
+    kept = {"official": 300, "sparse": 160}.get(options["name"], N)
+    assert len(numbers) == kept
+    training = len(result.train) + len(result.validation)
+    assert len(result.validation) == pytest.approx(validation * training, abs=10)
+    assert bool(len(result.validation)) == bool(validation)
+
+
+@each_split
+def test_validation_takes_training_links_only(links, options):
+    with_validation, without = (part(links, validation=v, **options) for v in (0.2, 0))
+    assert torch.equal(with_validation.test, without.test)
+    training = torch.cat((with_validation.train, with_validation.validation)).sort().values
+    assert torch.equal(training, without.train)
+
+
+@each_split
+def test_a_split_repeats_with_its_seed_alone(links, options):
+    first, again, other = (part(links, seed=seed, **options) for seed in (3, 3, 4))
+    assert torch.equal(first.train, again.train)
+    assert torch.equal(first.test, again.test)
+    assert not torch.equal(first.train, other.train)
+    assert first.name == again.name != other.name
+
+
+def test_official_parts_are_those_given(links):
+    result = part(links, name="official", validation=0)
+    assert result.train.tolist() == list(range(0, N, 2))
+    assert result.test.tolist() == list(range(1, N, 4))
+    assert result.name == "official"
+
+
+@each_split
+def test_official_parts_are_asked_for_by_the_official_split_alone(links, options):
+    asked = []
+    spied = replace(links, official=lambda: asked.append(1) or links.official())
+    part(spied, **options)
+    assert bool(asked) == (options["name"] == "official")
+
+
+@pytest.mark.parametrize("test", [0.1, 0.25, 0.9])
+def test_random_holds_out_the_fraction(links, test):
+    result = part(links, name="random", test=test, validation=0)
+    assert len(result.test) == round(test * N)
+    assert 0.3 < result.test.double().mean() / N < 0.7  # drawn from everywhere, not the head or the tail
+
+
+def test_sparse_parts_are_nested_and_share_their_test(links):
+    few, more = (part(links, name="sparse", train=count, validation=0) for count in (20, 100))
+    random = part(links, name="random", validation=0)
+    assert (len(few.train), len(more.train)) == (20, 100)
+    assert set(few.train.tolist()) < set(more.train.tolist()) < set(random.train.tolist())
+    assert torch.equal(few.test, random.test)
+    assert torch.equal(more.test, random.test)
+
+
+@pytest.mark.parametrize("length", [1, 7, 20])
+def test_runs_stay_whole(links, length):
+    result = part(links, name="runs", length=length, validation=0.2)
+    home = {link: name for name in ("train", "validation", "test") for link in getattr(result, name).tolist()}
+    for start in range(0, N, length):
+        assert len({home[link] for link in range(start, min(start + length, N))}) == 1
+    assert len(result.test) == pytest.approx(0.2 * N, abs=length)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 10**6), edge=st.floats(0.2, 1.4), far=st.sampled_from([0.0, -50.0, 1000.0]))
+def test_cubes_stay_whole(seed, edge, far):
+    points = 3 * torch.rand(200, 3, generator=torch.Generator().manual_seed(seed)) + far
+    result = part(links_at(points), name="blocks", edge=edge, seed=seed, validation=0.2)
+    cubes = np.floor((points.double().numpy() - points.double().numpy().min(0)) / edge).astype(int)
+    parts = [{tuple(cubes[i]) for i in p.tolist()} for p in (result.train, result.validation, result.test)]
+    assert all(parts)
+    assert sum(map(len, parts)) == len(set.union(*parts))
+
+
+def test_cubes_hold_out_about_the_fraction(links):
+    result = part(links, name="blocks", edge=0.5, test=0.2, validation=0)
+    largest = torch.unique((links.query.transmitters / 0.5).floor(), dim=0, return_counts=True)[1].max()
+    assert len(result.test) == pytest.approx(0.2 * N, abs=2 * int(largest))
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"name": "official", "validation": 0.1}, "official, validation 0.1, seed 0"),
+        ({"name": "official", "length": 8}, "official, validation 0.1 in runs of 8, seed 0"),
+        ({"name": "official", "length": 8, "validation": 0}, "official"),
+        ({"name": "random", "validation": 0, "seed": 2}, "random, test 0.2, seed 2"),
+        ({"name": "sparse", "train": 60}, "sparse 60, test 0.2, validation 0.1, seed 0"),
+        ({"name": "runs", "length": 20, "test": 0.3}, "runs of 20, test 0.3, validation 0.1, seed 0"),
+        ({"name": "blocks", "edge": 0.25, "validation": 0}, "blocks 0.25 m, test 0.2, seed 0"),
+    ],
+)
+def test_names_say_the_numbers(links, options, name):
+    assert part(links, **options).name == name
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"name": "cubes"}, "unknown split 'cubes'.*; there are: blocks, official, random, runs, sparse"),
+        ({"name": "random", "edge": 0.5, "length": 3}, "'random' has no option 'edge' .*or 'length'.*; it has: test"),
+        ({"name": "runs", "lenght": 5}, r"has no option 'lenght' \(did you mean 'length'\?\)"),
+        ({"name": "official", "test": 0.2}, "'official' has no option 'test'"),
+        ({"name": "blocks"}, "'blocks' needs option edge"),
+        ({"name": "runs"}, "'runs' needs option length"),
+        ({"name": "sparse"}, "'sparse' needs option train"),
+        ({"name": "random", "test": 0}, r"split.test must be in \(0, 1\), got 0"),
+        ({"name": "random", "test": 1.0}, r"split.test must be in \(0, 1\), got 1.0"),
+        ({"name": "random", "validation": 1}, r"split.validation must be in \[0, 1\), got 1"),
+        ({"name": "random", "validation": -0.1}, "split.validation must be"),
+        ({"name": "sparse", "train": 5, "test": 1.0}, r"split.test must be in \(0, 1\), got 1.0"),
+        ({"name": "sparse", "train": 5, "validation": 1}, "split.validation must be"),
+        ({"name": "official", "validation": 1.5}, "split.validation must be"),
+        ({"name": "official", "length": 0}, "split.length must be a whole number of rows"),
+        ({"name": "official", "length": N}, "takes two groups of them or more, got 1"),
+        ({"name": "runs", "length": 0}, "split.length must be a whole number of rows"),
+        ({"name": "blocks", "edge": 0}, r"split.edge must be positive \[m\], got 0"),
+        ({"name": "blocks", "edge": float("nan")}, "split.edge must be positive"),
+        ({"name": "sparse", "train": 321}, r"split.train must be in 1\.\.320"),
+        ({"name": "blocks", "edge": 50.0}, "takes two groups of them or more, got 1"),
+        ({"name": "runs", "length": 250, "validation": 0.1}, "takes two groups"),
+    ],
+)
+def test_unusable_options_are_refused(links, options, message):
+    with pytest.raises(ValueError, match=message):
+        part(links, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"name": "runs", "length": 2.5}, "'length' must be a whole number, got 2.5"),
+        ({"name": "sparse", "train": 60.0}, "'train' must be a whole number, got 60.0; write 60"),
+        ({"name": "random", "test": None}, "'test' must be a number, got None"),
+    ],
+)
+def test_options_of_another_type_are_refused(links, options, message):
+    with pytest.raises(TypeError, match=message):
+        part(links, **options)
+
+
+def test_data_without_official_parts_says_so(links):
+    with pytest.raises(ValueError, match="no official split; choose split=random, sparse, runs or blocks"):
+        part(replace(links, official=None), name="official")
+
+
+# --- several links a row ---
+
+
+@pytest.fixture
+def heard():
+    """Links by which up to six receivers heard 120 rows; the first 90 rows are for training. Row 7 was not heard."""
+    generator = torch.Generator().manual_seed(5)
+    heard = torch.rand(120, 6, generator=generator) < 0.6
+    heard[7] = False
+    rows = heard.nonzero()[:, 0]
+    early = rows < 90
+    official = lambda: (early.nonzero()[:, 0], (~early).nonzero()[:, 0])
+    return links_at(3 * torch.rand(120, 3, generator=generator)[rows], rows, official)
+
+
+@each_split
+@pytest.mark.parametrize("seed", range(3))
+def test_links_of_a_row_are_never_parted(heard, options, seed):
+    rows = heard.rows
+    result = part(heard, seed=seed, validation=0.2, **options)
+    parts = [set(rows[part].tolist()) for part in result.parts().values()]
+    assert all(parts)
+    assert sum(map(len, parts)) == len(set.union(*parts))
+    training = len(result.train) + len(result.validation)
+    if options["name"] != "blocks":
+        assert len(result.validation) == pytest.approx(0.2 * training, abs=40)
+    if options["name"] != "sparse":
+        assert training + len(result.test) == len(rows)
+
+
+def test_sparse_counts_rows(heard):
+    rows = heard.rows
+    few, more = (part(heard, name="sparse", train=count, validation=0) for count in (5, 40))
+    assert (len(rows[few.train].unique()), len(rows[more.train].unique())) == (5, 40)
+    assert set(few.train.tolist()) < set(more.train.tolist())
+    assert len(few.train) > 5
+    with pytest.raises(ValueError, match=r"split.train must be in 1\.\.\d\d, the rows that do not test"):
+        part(heard, name="sparse", train=119)
+
+
+def test_runs_count_rows(heard):
+    rows = heard.rows
+    result = part(heard, name="runs", length=10, validation=0)
+    runs = [set((rows[part] // 10).tolist()) for part in (result.train, result.test)]
+    assert runs[0].isdisjoint(runs[1])
+    assert runs[0] | runs[1] == set(range(12))
+    assert len(result.test) == pytest.approx(0.2 * len(rows), abs=30)
+
+
+def test_official_validation_in_runs_of_rows(heard):
+    rows = heard.rows
+    official = (rows < 100).nonzero()[:, 0], (rows >= 100).nonzero()[:, 0]
+    result = part(replace(heard, official=lambda: official), name="official", length=10, validation=0.3)
+    validating = rows[result.validation].unique()
+    assert {(row // 10).item() for row in validating}.isdisjoint((rows[result.train] // 10).tolist())
+    assert len(validating) == pytest.approx(30, abs=10)
+    assert torch.equal(result.test, official[1])
+
+
+@pytest.mark.parametrize("options", SPLITS[1:], ids=lambda options: options["name"])
+def test_each_link_is_a_row_of_its_own_unless_given(links, options):
+    plain, numbered = (part(each, **options) for each in (links, replace(links, rows=torch.arange(N))))
+    assert all(torch.equal(a, b) for a, b in zip(plain.parts().values(), numbered.parts().values(), strict=True))
+
+
+# --- configuration ---
+
+
+@pytest.mark.parametrize("file", sorted((conf_dir() / "split").glob("*.yaml")), ids=lambda file: file.stem)
+def test_a_configuration_has_every_option_with_its_default(file):
+    config = OmegaConf.load(file)
+    mandatory = OmegaConf.missing_keys(config)
+    options = {key: config[key] for key in config.keys() - mandatory - {"name"}}
+    parameters = inspect.signature(registry("split").get(config.name)).parameters
+    assert {*options, *mandatory} == parameters.keys() - {"links"}
+    assert mandatory == {name for name, p in parameters.items() if p.default is p.empty} - {"links"}
+    defaults = {name: parameters[name].default for name in options}
+    assert options == defaults | ({"length": 100} if file.stem == "official_runs" else {})
+
+
+def test_every_split_has_a_configuration():
+    assert {*registry("split").names()} <= {file.stem for file in (conf_dir() / "split").glob("*.yaml")}

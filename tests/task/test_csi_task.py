@@ -1,0 +1,156 @@
+"""Complex channels: SNR against the plain formula in numpy, and the phase that is removed against a search for it."""
+
+import numpy as np
+import pytest
+import torch
+
+from gaigs.task.csi import HIGHEST, Csi
+
+FREQUENCIES = 2.4e9 + 312.5e3 * torch.arange(6, dtype=torch.float64)
+TASK = Csi(3, FREQUENCIES)
+
+
+def snr(labels, values):
+    """-10 log10(|h - h'|² / |h|²) of each link, in complex128."""
+    h, guess = (part.numpy().astype(np.complex128).reshape(len(part), -1) for part in (labels, values))
+    return -10 * np.log10((abs(h - guess) ** 2).sum(1) / (abs(h) ** 2).sum(1))
+
+
+@pytest.fixture
+def pairs():
+    generator = torch.Generator().manual_seed(0)
+    labels, noise = torch.randn(2, 7, *TASK.shape, dtype=torch.complex64, generator=generator)
+    return labels, labels + torch.logspace(-2, 1, 7)[:, None, None] * noise
+
+
+@pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
+def test_it_is_the_formula(pairs, dtype):
+    labels, values = (part.to(dtype) for part in pairs)
+    scores = TASK.scores(labels, values)
+    assert [*scores] == ["snr_db", "snr_aligned_db"]
+    assert scores["snr_db"].dtype == torch.float64
+    np.testing.assert_allclose(scores["snr_db"], snr(labels, values), rtol=1e-12)
+
+
+def test_the_phase_removed_is_the_best_there_is(pairs):
+    """Found here by trying 20,000 of them."""
+    labels, values = pairs
+    turns = torch.polar(torch.ones(20_000, dtype=torch.float64), torch.linspace(0, 2 * np.pi, 20_000).double())
+    found = TASK.scores(labels, values)["snr_aligned_db"]
+    for k in range(len(labels)):
+        turned = turns[:, None, None] * values[k].to(torch.complex128)
+        best = snr(labels[k].expand_as(turned), turned).max()
+        assert found[k].item() == pytest.approx(best, abs=1e-3)
+        assert found[k].item() >= best - 1e-12
+
+
+def test_the_aligned_formula_in_numpy(pairs):
+    """With the phase of sum conj(h') h, the error left is |h|² + |h'|² - 2 |sum conj(h') h|."""
+    labels, values = (part.numpy().astype(np.complex128).reshape(7, -1) for part in pairs)
+    power = (abs(labels) ** 2).sum(1)
+    left = power + (abs(values) ** 2).sum(1) - 2 * abs((values.conj() * labels).sum(1))
+    found = TASK.scores(*pairs)["snr_aligned_db"]
+    np.testing.assert_allclose(found, -10 * np.log10(left / power), rtol=1e-9)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, -2.0, np.pi])
+def test_a_global_phase_of_the_prediction_is_what_alignment_removes(pairs, phase):
+    labels, values = pairs
+    turned = np.exp(1j * phase) * values
+    here, there = TASK.scores(labels, values), TASK.scores(labels, turned)
+    torch.testing.assert_close(there["snr_aligned_db"], here["snr_aligned_db"], rtol=1e-5, atol=1e-5)
+    assert (here["snr_aligned_db"] >= here["snr_db"] - 1e-9).all()
+
+
+def test_the_unit_of_amplitudes_does_not_matter(pairs):
+    here = TASK.scores(*pairs)
+    for scale in (1e-18, 1e15):
+        there = TASK.scores(*(scale * part for part in pairs))
+        for name, score in here.items():
+            torch.testing.assert_close(there[name], score, rtol=1e-5, atol=1e-4)
+
+
+def test_a_perfect_channel_has_the_highest_snr(pairs):
+    for score in TASK.scores(pairs[0], pairs[0]).values():
+        np.testing.assert_allclose(score, HIGHEST)
+
+
+def test_silence_predicts_nothing_of_a_channel(pairs):
+    for score in TASK.scores(pairs[0], torch.zeros_like(pairs[0])).values():
+        np.testing.assert_allclose(score, 0, atol=1e-12)
+
+
+def test_the_summary_is_that_of_numpy(pairs):
+    scores = TASK.scores(*pairs)
+    expected = {}
+    for name in ("snr_db", "snr_aligned_db"):
+        score = scores[name].numpy()
+        p10, p90 = np.percentile(score, [10, 90])
+        numbers = {"median": np.median(score), "mean": score.mean(), "p10": p10, "p90": p90}
+        expected |= {f"{name}_{what}": number for what, number in numbers.items()}
+    summary = TASK.summarise(scores)
+    assert [*summary] == [*expected] == [*Csi.metrics()]
+    assert summary == pytest.approx(expected, rel=1e-12)
+
+
+def test_predictions_may_carry_a_gradient(pairs):
+    assert not any(score.requires_grad for score in TASK.scores(pairs[0], pairs[1].requires_grad_()).values())
+
+
+def test_both_scores_are_stored(pairs):
+    scores = TASK.scores(*pairs)
+    stored = TASK.stored(*pairs, scores)
+    assert [*stored] == ["snr_db", "snr_aligned_db"]
+    np.testing.assert_array_equal(stored["snr_db"], scores["snr_db"])
+
+
+@pytest.mark.parametrize(
+    ("labels", "values", "message"),
+    [
+        (torch.ones(2, 6, 3), torch.ones(2, 6, 3), r"must both be \(k, 3, 6\), got \(2, 6, 3\)"),
+        (torch.ones(2, 3, 6), torch.ones(1, 3, 6), r"got \(2, 3, 6\) and \(1, 3, 6\)"),
+        (torch.ones(2, 3, 6), torch.full((2, 3, 6), torch.nan), "predictions must be finite, .* 2 of 2 channels"),
+        (torch.full((1, 3, 6), torch.inf), torch.ones(1, 3, 6), "labels must be finite"),
+        (torch.zeros(2, 3, 6), torch.ones(2, 3, 6), "not be zero throughout, got 2 such channels; leave them out"),
+    ],
+)
+def test_unusable_channels_are_refused(labels, values, message):
+    with pytest.raises(ValueError, match=message):
+        TASK.scores(labels.to(torch.complex64), values.to(torch.complex64))
+
+
+def test_a_channel_of_which_only_the_phase_is_not_finite_is_refused():
+    values = torch.ones(1, 3, 6, dtype=torch.complex64)
+    values[0, 1, 2] = complex(1.0, float("nan"))
+    with pytest.raises(ValueError, match="predictions must be finite"):
+        TASK.scores(torch.ones(1, 3, 6, dtype=torch.complex64), values)
+
+
+def test_nothing_to_summarise_is_refused():
+    nothing = torch.zeros(0, 3, 6, dtype=torch.complex64)
+    with pytest.raises(ValueError, match="at least one sample"):
+        TASK.summarise(TASK.scores(nothing, nothing))
+
+
+@pytest.mark.parametrize(
+    ("elements", "frequencies", "message"),
+    [
+        (0, [1e9], "at least one element, got 0"),
+        (1, [], r"positive, finite frequencies \[Hz\], got \[\]"),
+        (1, [1e9, 0.0], "positive, finite frequencies"),
+        (1, [1e9, -1e9], "positive, finite frequencies"),
+        (1, [float("nan")], "positive, finite frequencies"),
+        (1, [float("inf")], "positive, finite frequencies"),
+    ],
+)
+def test_impossible_options_are_refused(elements, frequencies, message):
+    with pytest.raises(ValueError, match=message):
+        Csi(elements, torch.tensor(frequencies))
+
+
+def test_frequencies_are_kept_to_the_hertz():
+    """In float32 they would be off by up to 128 Hz each."""
+    task = Csi(1, torch.tensor([2_437_000_001.0, 2_437_000_002.0], dtype=torch.float64))
+    assert task.frequencies.tolist() == [2_437_000_001, 2_437_000_002]
+    assert task.shape == (1, 2)
+    assert task.directions is None

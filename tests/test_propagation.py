@@ -1,0 +1,141 @@
+"""Free space against hand-written sums in numpy, and signs against phases that are known."""
+
+import cmath
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.constants import speed_of_light
+
+from gaigs.geometry import Pose
+from gaigs.propagation import array_sign, check_elements, direct_gains, direct_waves, free_space, phase_sign
+from gaigs.query import Query
+from gaigs.scene import Array, Receiver
+from gaigs.testing import example_links
+
+FREQUENCIES = torch.tensor([2.40e9, 2.44e9, 2.48e9], dtype=torch.float64)
+POSES = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)), Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0))
+
+
+def scene(array):
+    """Two turned receivers with that array."""
+    receivers = tuple(Receiver(f"gateway{i}", pose, array) for i, pose in enumerate(POSES))
+    return replace(example_links("csi").scene, receivers=receivers)
+
+
+def ask(count, seed=0):
+    places = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor([6.0, 4.0, 2.0])
+    return Query(places, torch.arange(count) % 2)
+
+
+def friis(distance, frequency, sign):
+    wavelength = speed_of_light / frequency
+    return wavelength / (4 * math.pi * distance) * cmath.exp(sign * 2j * math.pi * distance / wavelength)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_free_space_is_friis_formula(sign):
+    distances, frequencies = torch.tensor([0.5, 3.0, 1234.5]), torch.tensor([9e8, 6.4896e9])
+    found = free_space(distances[:, None], frequencies, sign)
+    assert found.dtype == torch.complex128
+    for i, distance in enumerate(distances.tolist()):
+        for j, frequency in enumerate(frequencies.double().tolist()):
+            expected = friis(distance, frequency, sign)
+            assert abs(found[i, j].item() - expected) < 1e-9 * abs(expected)
+
+
+def test_without_a_sign_the_amplitude_alone_is_left():
+    found = free_space(torch.tensor([2.0]), torch.tensor([1e9]), 0)
+    assert found.item() == pytest.approx(abs(friis(2.0, 1e9, -1)))
+    assert found.imag.item() == 0
+
+
+def test_at_the_antenna_itself_a_wave_is_that_of_a_centimetre():
+    near = free_space(torch.tensor([0.0, 1e-3, 1e-2]), torch.tensor([1e9]))
+    assert near.isfinite().all()
+    assert near[0] == near[1] == near[2]
+    assert near[0].item() == pytest.approx(friis(1e-2, 1e9, -1))
+
+
+@pytest.mark.parametrize("at_elements", [True, False])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_direct_waves_go_to_each_element(at_elements, sign):
+    array = Array.planar(2, 3, 0.06)
+    query = ask(5)
+    found = direct_waves(scene(array), query, FREQUENCIES, sign, at_elements)
+    elements = array.elements.double().numpy() if at_elements else np.zeros((1, 3))
+    assert found.shape == (5, len(elements), 3)
+    for i in range(5):
+        pose = POSES[i % 2]
+        places = elements @ pose.rotation.double().numpy().T + pose.position.double().numpy()
+        for e, place in enumerate(places):
+            distance = float(np.linalg.norm(query.transmitters[i].double().numpy() - place))
+            for s, frequency in enumerate(FREQUENCIES.tolist()):
+                expected = friis(distance, frequency, sign)
+                assert abs(found[i, e, s].item() - expected) < 1e-7 * abs(expected)
+
+
+def test_the_pattern_is_that_towards_the_transmitter():
+    query = ask(40)
+    gains = direct_gains(scene(Array.planar(2, 2, 0.06, "cosine")), query)
+    for i, gain in enumerate(gains.tolist()):
+        ray = (query.transmitters[i] - POSES[i % 2].position).double().numpy()
+        normal = POSES[i % 2].rotation.double().numpy()[:, 2]
+        assert gain == pytest.approx(max(0, ray @ normal / np.linalg.norm(ray)), abs=1e-6)
+    assert (gains == 0).any()
+    assert (gains > 0.1).any()
+    assert torch.equal(direct_gains(scene(Array.planar(2, 2, 0.06)), query), torch.ones(40, dtype=torch.float64))
+    on_top = Query(POSES[0].position[None], torch.tensor([0]))
+    assert direct_gains(scene(Array.planar(2, 2, 0.06, "cosine")), on_top).item() == 1
+
+
+# --- signs ---
+
+
+def made(count=40, gains=(1.0, 1.0), clutter=0.0, seed=0):
+    """Channels of the direct wave, times a gain of each receiver, and waves of random phase beside it."""
+    query = ask(count)
+    waves = direct_waves(scene(Array.planar(2, 2, 0.06)), query, FREQUENCIES)
+    random = torch.randn(waves.shape, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed))
+    return query, waves, waves * torch.tensor(gains)[query.receivers][:, None, None] + clutter * waves.abs() * random
+
+
+@pytest.mark.parametrize("clutter", [0.0, 1.0])
+def test_the_sign_is_what_the_phases_show(clutter):
+    gains = 3e4 * cmath.exp(1j), 2e4 * cmath.exp(-2j)  # clocks of their own
+    query, waves, channels = made(gains=gains, clutter=2e4 * clutter)
+    assert phase_sign(channels, waves, query.receivers) == -1
+    assert phase_sign(channels.conj(), waves, query.receivers) == 1
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_random_phases_show_no_sign(seed):
+    query, waves, _ = made(count=100)
+    phases = 2 * math.pi * torch.rand(100, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    turned = waves * torch.polar(torch.ones_like(phases), phases)
+    assert phase_sign(turned, waves, query.receivers) == 0
+    # What elements and subcarriers of a link have in common is left.
+    assert array_sign(turned, waves) == -1
+    assert array_sign(turned.conj(), waves) == 1
+
+
+def test_a_handful_of_links_shows_no_sign():
+    query, waves, channels = made(count=4)
+    assert phase_sign(channels, waves, query.receivers) == 0
+
+
+def test_a_single_number_a_link_has_no_sign_of_its_own():
+    query = ask(10)
+    waves = direct_waves(scene(Array.single()), query, FREQUENCIES[:1])
+    assert array_sign(waves.abs().to(waves.dtype), waves) == -1
+
+
+def test_arrays_must_fit_the_labels():
+    links = example_links("csi")
+    check_elements("model 'm'", links.scene)
+    with pytest.raises(ValueError, match="labels have 4 elements, and the array of gateway0 9; give the data's"):
+        check_elements("model 'm'", scene(Array.planar(3, 3, 0.06)))
+    with pytest.raises(ValueError, match="model 'm' gives complex channels, and labels of task 'rssi' are none"):
+        check_elements("model 'm'", example_links("rssi").scene)

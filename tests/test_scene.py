@@ -1,0 +1,203 @@
+"""Arrays, the band, and scenes that come back from what a checkpoint stores, that of earlier versions too."""
+
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gaigs.directions import Grid
+from gaigs.geometry import Pose
+from gaigs.query import Query
+from gaigs.scene import PATTERNS, VERSION, Array, Receiver, Scene
+from gaigs.task.csi import Csi
+from gaigs.task.rssi import Rssi
+from gaigs.task.spectrum import Spectrum
+from gaigs.testing import example_links
+
+POSE = Pose.from_xyzw((0.2, 0.3, 2.5), (-0.6, 0, 0, 0.8))
+
+
+def stored(state):
+    """A state as it comes back from a checkpoint."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+# --- arrays ---
+
+
+def test_a_single_antenna_stands_at_the_middle():
+    array = Array.single()
+    assert len(array) == 1
+    assert torch.equal(array.elements, torch.zeros(1, 3))
+    assert array.pattern == "isotropic"
+
+
+def test_a_square_array_has_the_elements_of_the_nerf2_spectra():
+    """Element 4 i + k stands i half wavelengths along x and k along y from the first."""
+    wavelength = 0.046
+    array = Array.planar(4, 4, wavelength / 2)
+    expected = [[(i - 1.5) * wavelength / 2, (k - 1.5) * wavelength / 2, 0] for i in range(4) for k in range(4)]
+    np.testing.assert_allclose(array.elements, expected, atol=1e-8)
+    world = POSE.to(array.elements).world(array.elements)
+    turned = POSE.position.numpy() + np.array(expected) @ POSE.rotation.numpy().T
+    np.testing.assert_allclose(world, turned, atol=1e-6)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (2, 5), (3, 1)])
+def test_rows_lie_along_y_and_columns_along_x(rows, columns):
+    elements = Array.planar(rows, columns, 0.1).elements.reshape(columns, rows, 3)
+    x, y = (0.1 * (np.arange(count) - (count - 1) / 2) for count in (columns, rows))
+    np.testing.assert_allclose(elements[:, :, 0], np.broadcast_to(x[:, None], (columns, rows)))
+    np.testing.assert_allclose(elements[:, :, 1], np.broadcast_to(y, (columns, rows)))
+    assert not elements[:, :, 2].any()
+
+
+def test_elements_hear_as_their_pattern_says():
+    directions = Grid.degrees(range(-90, 91, 30), range(0, 360, 60)).vectors().double()
+    assert torch.equal(Array.single().gain(directions), torch.ones(7, 6, dtype=torch.float64))
+    patch = Array.planar(2, 2, 0.1, "cosine").gain(directions)
+    off_normal = np.radians(90 - np.arange(-90, 91, 30))
+    np.testing.assert_allclose(patch[:, 0], np.maximum(np.cos(off_normal), 0), atol=1e-7)
+    assert patch.dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Array(torch.zeros(1, 3), "parrot"), f"one of {', '.join(PATTERNS)}, got 'parrot'"),
+        (lambda: Array(torch.zeros(0, 3)), r"must be \(e, 3\) positions \[m\], got \(0, 3\)"),
+        (lambda: Array(torch.zeros(3)), r"got \(3,\)"),
+        (lambda: Array(torch.zeros(4, 2)), r"got \(4, 2\)"),
+        (lambda: Array.planar(0, 4, 0.1), "at least 1 x 1 elements at a positive pitch, got 0 x 4 at 0.1 m"),
+        (lambda: Array.planar(4, -1, 0.1), "got 4 x -1"),
+        (lambda: Array.planar(4, 4, 0.0), "at 0.0 m"),
+        (lambda: Array.planar(4, 4, math.nan), "at nan m"),
+        (lambda: Array.planar(4, 4, math.inf), "at inf m"),
+    ],
+)
+def test_impossible_arrays_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# --- the band ---
+
+
+@pytest.fixture
+def scene():
+    return example_links().scene
+
+
+def test_positions_follow_the_tensor_that_they_are_put_beside(scene):
+    positions = scene.positions(torch.zeros(1, dtype=torch.float64))
+    assert positions.dtype == torch.float64
+    np.testing.assert_allclose(positions, [[0.2, 0.2, 2.5], [5, 4, 1]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_carriers_place_in_the_band_is_that_of_its_logarithm(scene, dtype):
+    scene = replace(scene, frequencies=torch.tensor([1e9, 2e9, 8e9]))
+    query = Query(torch.zeros(4, 3, dtype=dtype), torch.zeros(4).long(), torch.tensor([1e9, 2e9, 8e9, 16e9]))
+    places = scene.band_positions(query)
+    assert places.dtype == dtype
+    np.testing.assert_allclose(places, [-1, -1 / 3, 1, 5 / 3], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("carriers", "expected"), [([], False), ([1e9], False), ([1e9, 2e9], True)])
+def test_one_carrier_is_no_band(scene, carriers, expected):
+    assert replace(scene, frequencies=torch.tensor(carriers)).has_band is expected
+
+
+def test_a_band_needs_a_frequency(scene):
+    scene = replace(scene, frequencies=torch.tensor([2.4e9, 5.0e9]))
+    with pytest.raises(ValueError, match=r"2 carriers, 2.4e\+09 to 5e\+09 Hz, so a frequency must be given"):
+        scene.band_positions(Query(torch.zeros(1, 3), torch.zeros(1).long()))
+
+
+# --- states ---
+
+
+@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
+def test_a_scene_comes_back_from_its_state(task):
+    scene = replace(example_links(task).scene, frequencies=torch.tensor([2.4e9, 5.0e9]))
+    again = Scene.from_state(stored(scene.state()))
+    for receiver, other in zip(scene.receivers, again.receivers, strict=True):
+        assert other.name == receiver.name
+        assert torch.equal(other.pose.position, receiver.pose.position)
+        assert torch.equal(other.pose.rotation, receiver.pose.rotation)
+        assert torch.equal(other.array.elements, receiver.array.elements)
+        assert other.array.pattern == receiver.array.pattern
+    for field in ("lower", "upper", "frequencies"):
+        assert torch.equal(getattr(again, field), getattr(scene, field))
+    assert again.spacing == scene.spacing
+    assert type(again.task) is type(scene.task)
+    assert again.task.shape == scene.task.shape
+    assert again.task.normalisation == scene.task.normalisation
+
+
+def test_a_tasks_options_come_back_bit_by_bit():
+    grid = Grid.degrees(range(4, 90, 5), range(0, 360, 10))
+    task = Spectrum(grid.elevations, grid.azimuths, "min-max")
+    scene = replace(example_links().scene, task=task)
+    again = Scene.from_state(stored(scene.state())).task
+    assert torch.equal(again.directions.elevations, grid.elevations)
+    assert torch.equal(again.directions.azimuths, grid.azimuths)
+    assert again.normalisation == "min-max"
+    channels = Csi(4, torch.tensor([2.4e9, 2.4e9 + 312.5e3], dtype=torch.float64))
+    again = Scene.from_state(stored(replace(scene, task=channels).state())).task
+    assert torch.equal(again.frequencies, channels.frequencies)
+    assert again.elements == 4
+
+
+def test_an_array_keeps_its_pattern():
+    scene = example_links().scene
+    receiver = Receiver("patches", POSE, Array.planar(2, 3, 0.1, "cosine"))
+    again = Scene.from_state(stored(replace(scene, receivers=(receiver,)).state()))
+    assert again.receivers[0].array.pattern == "cosine"
+    assert torch.equal(again.receivers[0].array.elements, receiver.array.elements)
+
+
+@pytest.mark.parametrize("has_grid", [True, False])
+def test_states_without_a_version_are_read(has_grid):
+    """As checkpoints had them before arrays and tasks: spectra where there was a grid, else RSSI."""
+    elevations, azimuths = torch.linspace(0.1, 1.5, 9), torch.linspace(0, 6, 12)
+    state = {
+        "receivers": [["one", POSE.position, POSE.rotation], ["two", torch.ones(3), torch.eye(3)]],
+        "lower": torch.tensor([0.0, 0.0, 0.5]),
+        "upper": torch.tensor([6.0, 4.0, 2.0]),
+        "spacing": 0.25,
+        "grid": [elevations, azimuths] if has_grid else None,
+        "normalisation": "min-max of each spectrum's amplitude" if has_grid else "dBm",
+    }
+    scene = Scene.from_state(stored(state))
+    assert [receiver.name for receiver in scene.receivers] == ["one", "two"]
+    assert torch.equal(scene.receivers[0].pose.rotation, POSE.rotation)
+    assert all(len(receiver.array) == 1 for receiver in scene.receivers)
+    assert torch.equal(scene.upper, state["upper"])
+    assert scene.spacing == 0.25
+    assert not scene.has_band
+    assert scene.task.normalisation == state["normalisation"]
+    if has_grid:
+        assert isinstance(scene.task, Spectrum)
+        assert torch.equal(scene.task.directions.elevations, elevations)
+        assert torch.equal(scene.task.directions.azimuths, azimuths)
+    else:
+        assert isinstance(scene.task, Rssi)
+    assert scene.state()["version"] == VERSION
+    assert Scene.from_state(stored(scene.state())).state().keys() == scene.state().keys()
+
+
+def test_a_state_of_a_later_version_is_refused(scene):
+    with pytest.raises(ValueError, match=f"of version {VERSION} or earlier, got {VERSION + 1}; update gaigs"):
+        Scene.from_state(scene.state() | {"version": VERSION + 1})
+
+
+def test_a_task_that_is_not_installed_is_refused(scene):
+    with pytest.raises(ValueError, match="unknown task 'odour'"):
+        Scene.from_state(scene.state() | {"task": {"name": "odour"}})
