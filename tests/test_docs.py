@@ -34,7 +34,7 @@ FILES = {".ply", ".log"}
 
 BRIEF = [
     "trainer.max_steps=2", "trainer.val_check_interval=2", "trainer.accelerator=cpu", "gaussians.count=20",
-    "data.transmitters=10", "data.order=0", "data.split.validation=0.2", "hydra.run.dir=runs/room",
+    "data.transmitters=10", "data.order=0", "split.validation=0.2", "hydra.run.dir=runs/room",
 ]  # fmt: skip
 
 
@@ -182,6 +182,30 @@ def _has(composed, base, word):
     return True
 
 
+@pytest.mark.parametrize("kind", ["data", "split", "model", "deformation", "loss"])
+def test_the_first_page_lists_the_choices(kind):
+    _, table = (ROOT / "docs/start.md").read_text().split("| option | choices |\n")
+    (row,) = re.findall(rf"^\| `{kind}` \|(.*)$", table.partition("\n\n")[0], re.M)
+    files = configuration.conf_dir().glob(f"{kind}/*.yaml")
+    assert {*re.findall(r"`(\w+)`", row)} == {file.stem for file in files}
+
+
+@pytest.mark.parametrize("kind", ["data", "split"])
+def test_the_page_on_data_describes_what_there_is(kind):
+    first_cells = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/data.md").read_text(), re.M)
+    assert {file.stem for file in configuration.conf_dir().glob(f"{kind}/*.yaml")} <= {*first_cells}
+
+
+def test_the_documented_file_of_channels_is_read(tmp_path):
+    (code,) = [block for block in blocks(ROOT / "docs/data.md", "python") if "np.savez" in block]
+    check = """
+from gaigs.data import load
+links = load({"name": "csi_npz", "file": "room.npz"}, {"name": "random"})
+print(len(links), *links.task.shape)
+"""
+    assert _python(tmp_path, "-c", code + check).split() == ["200", "4", "8"]
+
+
 def test_the_tokenizer_has_fifteen_lines():
     source = written_files(ROOT / "docs/plugins.md")["plugins/plane_waves.py"]
     assert len([line for line in source.splitlines()[1:] if line.strip()]) <= 15
@@ -191,7 +215,7 @@ def test_the_tokenizer_trains_by_its_command_and_predicts_as_the_readme_says(pla
     (command,) = [words for words in map(overrides, commands(ROOT / "docs/plugins.md")) if words is not None]
     _python(place, "-m", "gaigs", *command, *BRIEF)
     metrics = json.loads((place / "runs/room/metrics.json").read_text())
-    assert [*metrics["models"]] == ["gaigs", "mean", "knn"]
+    assert [*metrics["models"]] == ["gaigs", "mean", "knn", "gaussian_process"]
     checkpoint = torch.load(place / "runs/room/best.ckpt", weights_only=True)
     assert checkpoint["global_step"] == 2
     assert "model.tokenizer.waves.weight" in checkpoint["state_dict"]

@@ -5,6 +5,9 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 SHOWN = 10
 """Defects that an error lists one by one."""
 
@@ -110,3 +113,10 @@ def to_number(cell: str) -> float:
         return float(cell)
     except ValueError:
         return math.nan
+
+
+def number_places(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:
+    """The distinct points in the order in which they appear, and which of them each one is."""
+    numbers: dict[tuple, int] = {}
+    index = [numbers.setdefault(tuple(point), len(numbers)) for point in points]
+    return [*numbers], torch.tensor(index)

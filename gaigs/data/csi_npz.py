@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gaigs.data import Links
-from gaigs.data._files import FAR, NEAR, refuse
+from gaigs.data._files import FAR, NEAR, number_places, refuse
 from gaigs.geometry import Pose
 from gaigs.query import Query
 from gaigs.registry import register
@@ -65,8 +65,7 @@ def read(file: str | Path) -> Links:
     heard = (numbers["h"] != 0).flatten(1).any(1)
     present, receivers = numbers["rx_index"][heard].unique(return_inverse=True)
     transmitters = numbers["tx"].float()[heard]
-    places: dict[tuple, int] = {}
-    rows = torch.tensor([places.setdefault(tuple(place), len(places)) for place in transmitters.tolist()])
+    places, rows = number_places(transmitters.tolist())
     frequencies = numbers["frequencies"]
     carrier = (frequencies.min() + frequencies.max()).item() / 2
     count = numbers["h"].shape[1]

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gaigs.data import Links, Parts
-from gaigs.data._files import find_folder, read_lines, read_points, refuse, to_number
+from gaigs.data._files import find_folder, number_places, read_lines, read_points, refuse, to_number
 from gaigs.directions import Grid
 from gaigs.geometry import Pose
 from gaigs.query import Query
@@ -39,7 +39,8 @@ HIGHEST = 1000.0
 def read(root: str | Path, elements: Sequence[int] | None = (4, 4), frequency: float | None = 920e6) -> Links:
     """A data set from its folder, which is only read.
 
-    Everything but the pixels is checked here; images are decoded when their labels are first asked for.
+    Everything but the pixels is checked here; images are decoded when their labels are first asked for. Where links
+    have carriers of their own, those of one position share a row.
 
     Args:
         root: Folder with ``tx_pos.csv``, ``gateway_info.yml``, ``spectrum/``, for the official split
@@ -83,6 +84,7 @@ def read(root: str | Path, elements: Sequence[int] | None = (4, 4), frequency: f
         receivers=(replace(receiver, array=array),),
         labels=Spectra(files),
         task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
+        rows=number_places(positions)[1] if has_own else None,
         official=partial(_read_official, root, len(files)),
         remarks="; ".join(remarks),
     )

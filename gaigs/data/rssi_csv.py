@@ -1,14 +1,12 @@
 """Received signal strength from one table; docs/data.md describes its columns."""
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.data._files import read_lines, refuse, to_cells, to_columns, to_coordinates
+from gaigs.data._files import number_places, read_lines, refuse, to_cells, to_columns, to_coordinates
 from gaigs.data.nerf2_rssi import LOUDEST, NOT_HEARD, gateway, read_walls, to_dbm
 from gaigs.query import Query
 from gaigs.registry import register
@@ -68,7 +66,7 @@ def read(
     walls = torch.zeros(0, 2, 3) if layout is None else read_walls(Path(layout).expanduser(), defects)
     refuse(file, defects)
 
-    numbered = {end: _number_places(points[end]) for end in ENDS}
+    numbered = {end: number_places(points[end]) for end in ENDS}
     tx, rx = (len(numbered[end][0]) for end in ENDS)
     counts = f"{FIXED} places at most, got {tx} of the transmitter and {rx} of the receiver"
     if min(tx, rx) > FIXED:
@@ -136,10 +134,3 @@ def _read_table(file: Path, not_heard: float, defects: list[str]) -> tuple[dict[
     if not defects and all(value == not_heard for value in dbm):
         defects.append(f"{file.name}: expected a reading that was heard, got none but {not_heard:g} dBm")
     return points, dbm, [name for name in written if name.lower() not in COLUMNS]
-
-
-def _number_places(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:
-    """The distinct points in the order in which they appear, and which of them each one is."""
-    numbers: dict[tuple, int] = {}
-    index = [numbers.setdefault(tuple(point), len(numbers)) for point in points]
-    return [*numbers], torch.tensor(index)

@@ -220,6 +220,14 @@ def test_what_is_written_reads_back(links, tmp_path):
     assert torch.equal(again.split.test, links.split.test)
 
 
+def test_carriers_of_one_place_are_never_parted(links, tmp_path):
+    """A place that is measured at another carrier in training would give its labels away."""
+    places = links.query.transmitters[[0, 1, 2, 0, 1]]
+    query = changed(links.query, transmitters=places, frequencies=torch.tensor([2e9, 2e9, 2e9, 3e9, 3e9]))
+    write(tmp_path / "room", changed(links, query=query))
+    assert read(tmp_path / "room").rows.tolist() == [0, 1, 2, 0, 1]
+
+
 @pytest.mark.parametrize("carriers", [[2.4e9] * 5, [6.4896e9, 868.3e6, 2.441e9, 868.3e6, 39e9]], ids=["one", "several"])
 def test_carriers_are_written(links, tmp_path, carriers):
     frequencies = torch.tensor(carriers)
