@@ -52,10 +52,8 @@ class L1Ssim:
             raise ValueError(f"loss 'l1_ssim' needs at least 3 x 3 directions, got {batch.directions.shape}")
         step = max(1, round(batch.directions.pitch / self.pitch))
         window = min(max(3, round((SSIM_WINDOW - 1) / step / 2) * 2 + 1), (smallest - 1) // 2 * 2 + 1)
-        terms = {
-            "l1": (values - batch.labels).abs().mean(),
-            "ssim": 1 - structural_similarity(values, batch.labels, window),
-        }
+        similarity = structural_similarity(values, batch.labels, window)
+        terms = {"l1": (values - batch.labels).abs().mean(), "ssim": 1 - similarity}
         return (1 - self.ssim) * terms["l1"] + self.ssim * terms["ssim"], terms
 
 

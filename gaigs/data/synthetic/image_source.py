@@ -249,8 +249,8 @@ def respond(
         raise ValueError(f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth")
     pose, array = receiver.pose, receiver.array
     paths = trace(room, transmitters, pose.position, frequency, order)
-    rays = paths.images - pose.position.double()
-    directions = (rays @ pose.rotation.double()) / rays.norm(dim=-1, keepdim=True)
+    local = (paths.images - pose.position.double()) @ pose.rotation.double()
+    directions = local / local.norm(dim=-1, keepdim=True)
     elements = pose.position.double() + array.elements.double() @ pose.rotation.double().T
     distances = (paths.images[:, :, None] - elements).norm(dim=-1)
     phases = distances[..., None] * (2 * math.pi * frequencies / speed_of_light)
@@ -265,7 +265,8 @@ def bartlett(
     """Amplitude of the conventional beamformer's output, root mean square over the frequencies.
 
     At one frequency it is |sum_n y_n exp(-j 2 pi / lambda (r_n . u))| for element n at r_n and the direction u. Its
-    square is a sum over the covariance of the y_n, half of which says all: one pass for all frequencies of a band.
+    square depends on the covariance of the y_n only through the sums over pairs of elements with the same difference of
+    places; of a 4 x 4 array 49 of them instead of 256 pairs make it cheap.
 
     Args:
         responses: Of the array's elements.
@@ -276,12 +277,14 @@ def bartlett(
     Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
     """
     covariances = responses @ responses.mH / responses.shape[-1]
-    first, second = torch.triu_indices(len(array), len(array), 1)
-    steps = array.elements[first].double() - array.elements[second].double()
+    # In half wavelengths; to so many digits the steps between the elements of a regular array are alike.
+    places = array.elements.double() * (2 * frequency / speed_of_light)
+    differences = (places[:, None] - places).flatten(0, 1).round(decimals=9)
+    steps, pair = torch.unique(differences, dim=0, return_inverse=True)
+    lags = covariances.new_zeros(len(responses), len(steps)).index_add(1, pair, covariances.flatten(1))
     directions = Grid(grid.elevations.double(), grid.azimuths.double()).flatten().vectors()
-    phases = 2 * math.pi * frequency / speed_of_light * steps @ directions.T
-    pairs, own = 2 * covariances[:, first, second], covariances.diagonal(dim1=1, dim2=2).real.sum(1, keepdim=True)
-    power = own + pairs.real @ torch.cos(phases) + pairs.imag @ torch.sin(phases)
+    phases = math.pi * steps @ directions.T
+    power = lags.real @ torch.cos(phases) + lags.imag @ torch.sin(phases)
     # In a null of the pattern rounding may leave the power a little below zero.
     return power.clamp(min=0).sqrt().unflatten(1, grid.shape)
 
