@@ -90,9 +90,9 @@ def _flat(config: dict, prefix: str = "") -> dict:
 def run_folder(overrides: str) -> str:
     """The name of a job's folder from its overrides: one folder, whatever is in them, and no longer than allowed."""
     name = overrides.replace("/", "_") or "defaults"
-    if len(name.encode()) <= LONGEST:
+    if name == overrides and len(name.encode()) <= LONGEST:
         return name
-    digest = hashlib.sha256(name.encode()).hexdigest()[:12]
+    digest = hashlib.sha256(overrides.encode()).hexdigest()[:12]
     return name.encode()[: LONGEST - len(digest) - 1].decode(errors="ignore") + "-" + digest
 
 

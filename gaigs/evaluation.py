@@ -26,7 +26,7 @@ Scores = dict[str, dict[str, Tensor]]
 
 
 def baseline_configurations(configurations: Sequence[Mapping], own: str, scene: Scene) -> dict[str, Mapping]:
-    """Configurations of the models that a run is held against, by name; without the run's own.
+    """Configurations of the models that a run is held against, by name; one of its own model's name is left out.
 
     Raises:
         ValueError: One has no name, an unknown one, or options that do not fit; two have the same name; or one is a
@@ -39,9 +39,11 @@ def baseline_configurations(configurations: Sequence[Mapping], own: str, scene: 
         name = config["name"]
         if name in found:
             raise ValueError(f"baselines must have different names, got {name!r} twice")
+        found[name] = config
+        if name == own:
+            continue
         if is_trained(registry("model").build(config, scene=scene)):
             raise ValueError(f"baselines are models without a training, and {name!r} has one; take it as model={name}")
-        found[name] = config
     return {name: config for name, config in found.items() if name != own}
 
 
@@ -205,7 +207,7 @@ def _room(links: Links, gaussians: Gaussians | None):
         places[links.split.train].numpy(),
         places[links.split.test].numpy(),
         np.stack([pose.position.numpy() for pose in poses]),
-        rotations[: sum(has_axes)] if all(has_axes) else rotations[:0],
+        rotations if all(has_axes) else rotations[:0],
         links.edges.numpy(),
         cloud,
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import lightning
 import torch
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch.callbacks import Timer
@@ -30,6 +31,9 @@ from gaigs.training.batches import Batches, InOrder
 from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine
 
 log = logging.getLogger(__name__)
+
+WRITTEN = ("config.yaml", "best.ckpt", "log", "predictions.npz", "gaussians.ply", "radio_map.npz", "figures")
+"""What a run writes into its folder before there is anything to go on from."""
 
 
 def run(config: dict, folder: Path) -> dict | None:
@@ -77,9 +81,15 @@ def claim(folder: Path, config: dict) -> None:
     """Writes the configuration into a run folder, unless a run has left something there to go on from.
 
     Raises:
-        ValueError: It has, and it was a run of another configuration.
+        ValueError: It has, and it was a run of another configuration; or files of that name are not a run's.
     """
     file = folder / "config.yaml"
+    there = [name for name in WRITTEN if (folder / name).exists()]
+    if there and not is_configuration(file):
+        raise ValueError(
+            f"{folder} must be free or hold a run, and it holds {', '.join(there)} of something else; choose another "
+            "folder with hydra.run.dir=DIR"
+        )
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         OmegaConf.save(OmegaConf.create(config), file)
         return
@@ -91,6 +101,15 @@ def claim(folder: Path, config: dict) -> None:
             f"{folder} must be free or hold a run of the same configuration, but {listed}; choose another folder with "
             "hydra.run.dir=DIR (nothing was written into this one but Hydra's own .hydra/)"
         )
+
+
+def is_configuration(file: Path) -> bool:
+    """Whether a file is the configuration of a run."""
+    try:
+        content = yaml.safe_load(file.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return False
+    return isinstance(content, dict) and {"model", "data"} <= content.keys()
 
 
 def train_and_test(config: dict, folder: Path) -> dict | None:
@@ -222,6 +241,8 @@ def check_trainer(trainer: lightning.Trainer) -> None:
     """
     if trainer.accumulate_grad_batches > 1:
         raise ValueError("trainer.accumulate_grad_batches must be 1; set training.batch_size instead")
+    if trainer.limit_val_batches != 1.0:
+        raise ValueError("trainer.limit_val_batches must be left out, as all validation links decide on the best step")
     strategy, launcher = trainer.strategy, trainer.strategy.launcher
     starts_scripts = launcher is None or "Subprocess" in type(launcher).__name__
     if not isinstance(strategy, DDPStrategy | SingleDeviceStrategy) or not starts_scripts:
@@ -245,11 +266,21 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
     """
     parts = ("train", "validation", "test")
     same = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
+    same = same and _is_same(there.get("scene"), here.get("scene"))
     if not same or there["links"] != here["links"]:
         raise ValueError(
             f"{path} must be of these very data to go on, but they have another split, or other transmitters, "
             "receivers, frequencies or labels now; choose another folder with hydra.run.dir=DIR"
         )
+
+
+def _is_same(a: object, b: object) -> bool:
+    """Whether two nested states hold the same values."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(_is_same(a[key], b[key]) for key in a)
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(map(_is_same, a, b))
+    return torch.equal(a, b) if isinstance(a, Tensor) and isinstance(b, Tensor) else a == b
 
 
 def fingerprint(links: Links) -> str:

@@ -59,7 +59,10 @@ def is_first() -> bool:
     """Whether this is the first of the processes that train together, which alone writes files."""
     from lightning.pytorch.utilities import rank_zero_only  # slow to import
 
-    return rank_zero_only.rank == 0
+    # Lightning's number is that within a machine where neither torchrun nor SLURM gives one over all of them.
+    is_global = any(name in os.environ for name in ("RANK", "SLURM_PROCID"))
+    machine = 0 if is_global else int(os.environ.get("NODE_RANK", os.environ.get("GROUP_RANK", 0)))
+    return rank_zero_only.rank == 0 and machine == 0
 
 
 @contextlib.contextmanager

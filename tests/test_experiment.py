@@ -292,9 +292,18 @@ def test_what_changes_no_result_may_change(finished, tmp_path):
 
 
 def test_a_folder_with_nothing_to_go_on_from_is_free(tmp_path):
-    (tmp_path / "config.yaml").write_text("seed: 5\n")
+    (tmp_path / "config.yaml").write_text("seed: 5\nmodel: {name: knn}\ndata: {name: synthetic}\n")
     experiment.run(configure("trainer.max_steps=1"), tmp_path)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["seed"] == 0
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "predictions.npz", "figures"])
+def test_a_folder_of_something_else_is_left_alone(name, tmp_path):
+    (tmp_path / name).write_text("my: own\n")
+    before = digest(tmp_path)
+    with pytest.raises(ValueError, match=f"must be free or hold a run, and it holds {name} of something else"):
+        experiment.run(configure("trainer.max_steps=1"), tmp_path)
+    assert digest(tmp_path) == before
 
 
 def test_a_damaged_checkpoint_is_refused(finished, tmp_path):
@@ -305,9 +314,7 @@ def test_a_damaged_checkpoint_is_refused(finished, tmp_path):
         experiment.run(config, tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("model", "others"), [("knn", ["mean"]), ("mean", ["knn"])]
-)
+@pytest.mark.parametrize(("model", "others"), [("knn", ["mean"]), ("mean", ["knn"])])
 def test_look_ups_run_without_training(model, others, finished, tmp_path):
     metrics = experiment.run(configure(f"model={model}"), tmp_path)
     assert list(metrics) == METRICS
@@ -359,6 +366,8 @@ def test_tensorboard_logs_beside_the_csv(tmp_path):
         (["+trainer.callbacks=[]"], r"trainer has no option 'callbacks'"),
         (["+trainer.accumulate_grad_batches=2"], r"trainer.accumulate_grad_batches must be 1; set training.batch_size"),
         (["trainer.devices=2", "trainer.strategy=ddp_spawn"], r"trainer.strategy must be auto for one process or ddp"),
+        (["+trainer.limit_val_batches=2"], r"trainer.limit_val_batches must be left out"),
+        (["task.trend={name: gaigs}"], r"model 'gaigs' needs option gaussians"),
         (["trainer.max_steps=-1"], r"trainer.max_steps must be at least 1, got -1"),
         (["split.name=blcks"], r"unknown split 'blcks' \(did you mean 'blocks'\?\)"),
     ],

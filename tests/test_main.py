@@ -180,6 +180,8 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
             "gaigs: training 'descent' option 'batch_size' must be a whole number, got 8.0; write 8",
         ),
         (["save_every=null"], "gaigs: save_every must be a number, got None"),
+        (["seed=-1"], "gaigs: seed must be in 0..4294967295, got -1"),
+        (["baselines=3"], "gaigs: baselines must be a list, [] for none, got 3"),
         (["seed=1.5"], "gaigs: seed must be a whole number, got 1.5"),
         (["command=trian"], "gaigs: command must be train or devices, got 'trian'"),
         (["~command"], "gaigs: command must be train or devices, got None"),

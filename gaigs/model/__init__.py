@@ -128,9 +128,9 @@ class Model(nn.Module):
             (``model.scene.task.normalisation``); on the device of the model.
 
         Raises:
-            ValueError: The positions are not (..., 3) or not finite, there is no such receiver, a frequency is not
-                positive, none is given and the training links have several, or a query is given with a receiver or a
-                frequency beside it.
+            ValueError: The positions are not (..., 3) or not finite; there is no such receiver; a frequency is not
+                positive, is another than the training links' only one, or is missing where they have several; or a
+                query is given with a receiver or a frequency beside it.
         """
         device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
         if isinstance(transmitters, Query):
@@ -185,6 +185,9 @@ class Model(nn.Module):
                 f"frequencies must be one, or one for each of the {tuple(shape)} positions, got "
                 f"{tuple(frequency.shape)}"
             )
+        if len(known) < 2 and not (len(known) and torch.isclose(frequency, known[0].float(), rtol=1e-6).all()):
+            carrier = f"one carrier, {known[0]:.6g} Hz" if len(known) else "no carrier that is known"
+            raise ValueError(f"the training links have {carrier}, which says nothing of others; leave frequency out")
         return frequency.expand(shape).reshape(-1)
 
     def _index(self, receiver: int | str | Tensor, shape: tuple[int, ...]) -> Int[Tensor, "n"]:

@@ -32,7 +32,7 @@ class GaussianSplatting(Model):
 
     Raises:
         ValueError: The pooling does not give the task's labels; the projection does not see all of the map; the trend
-            is a look-up.
+            needs its data or a training of its own.
 
     Source: GAI-GS, section "Framework"; the trend is ours (docs/methods.md).
     """
@@ -53,10 +53,11 @@ class GaussianSplatting(Model):
         self.trend = None
         if trend is not None:
             self.trend = registry("model").build(trend, scene=scene)
-            if not self.trend.state_dict():
+            if not self.trend.state_dict() or [*self.trend.parameters()]:
+                kind = "needs its data" if not self.trend.state_dict() else "has to be trained itself"
                 raise ValueError(
-                    f"model.trend must be a model that a checkpoint can store, and {trend['name']} is a look-up that "
-                    "needs its data; take path_loss, friis or mean"
+                    f"the trend must be fitted at once and stored in a checkpoint, and {trend['name']} {kind}; take "
+                    "path_loss, friis or mean with task.trend.name"
                 )
             self.register_buffer("level", torch.zeros(()))  # of the untrained map, in the label's unit
         self.pooling = registry("pooling").build(pooling, scene=scene)

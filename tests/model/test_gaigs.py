@@ -337,5 +337,5 @@ def test_a_map_takes_two_whole_numbers(readings, grid):
 @pytest.mark.parametrize("name", ["knn", "gaussian_process"])
 def test_a_look_up_is_no_trend(readings, name):
     trend = {"name": name} | ({"k": 3} if name == "knn" else {})
-    with pytest.raises(ValueError, match=f"a checkpoint can store, and {name} is a look-up"):
+    with pytest.raises(ValueError, match=f"stored in a checkpoint, and {name} needs its data; take path_loss"):
         GaussianSplatting(readings.scene, **PARTS | NONE | {"pooling": SOFTMAX, "trend": trend})

@@ -136,6 +136,7 @@ def test_impossible_questions_are_refused(build, transmitters, receiver, message
         (-1e9, "positive and finite"),
         (float("nan"), "positive and finite"),
         (torch.tensor([1e9, 2e9]), r"one for each of the \(1,\) positions, got \(2,\)"),
+        (1e9, "the training links have no carrier that is known, which says nothing of others; leave frequency out"),
     ],
 )
 def test_impossible_frequencies_are_refused(build, frequency, message):
