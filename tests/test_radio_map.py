@@ -111,12 +111,14 @@ def test_carrier_is_the_training_links_of_several_the_middle_one_or_the_one_aske
     pitch = {"pitch": 0.5}
     unknown = radio_map(Slope(scene()), **pitch)
     assert unknown.frequency is None
-    for carriers, asked, used in (((7.0,), None, 7), ((5.0, 7.0, 12.0), None, 7), ((5.0, 12.0), 9, 9), ((), 9, 9)):
+    for carriers, asked, used in (((7.0,), None, 7), ((5.0, 7.0, 12.0), None, 7), ((5.0, 12.0), 9, 9), ((7.0,), 7, 7)):
         drawn = radio_map(Slope(scene(frequencies=carriers)), frequency=asked, **pitch)
         assert drawn.frequency == used
         np.testing.assert_allclose(drawn.values, unknown.values + used, atol=1e-3)
     with pytest.raises(ValueError, match="frequency must be positive"):
         radio_map(Slope(scene()), frequency=-1.0)
+    with pytest.raises(ValueError, match="have one carrier, 7 Hz, which says nothing of others"):
+        radio_map(Slope(scene(frequencies=(7.0,))), frequency=9)
 
 
 def test_file_holds_the_map_and_its_axes(tmp_path):

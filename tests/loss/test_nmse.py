@@ -9,7 +9,7 @@ from gaigs.query import Batch, Query
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 
-TASK = Csi(3, 1e9 + torch.arange(5))
+TASK = Csi(3, 1e9 + 1e6 * torch.arange(5))
 
 
 def loss_of(values, labels):
