@@ -23,6 +23,7 @@ from torch import Tensor, distributed
 from gaigs import checkpoint, evaluation
 from gaigs.configuration import check_keys, differences
 from gaigs.data import Links, load
+from gaigs.loss import Loss
 from gaigs.model import Model
 from gaigs.processes import STOPPING, Stopped, is_first, only_run
 from gaigs.registry import call, registry
@@ -134,6 +135,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     scene = links.scene
     box = " x ".join(f"{edge:.2f}" for edge in scene.upper - scene.lower)
     log.info("data: training transmitters within %s m%s", box, links.remarks and f"; {links.remarks}")
+    loss = registry("loss").build(config["loss"], task=task)
     baselines = evaluation.baseline_configurations(config["baselines"], name, scene)
     model = registry("model").build(config["model"], scene=scene)
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
@@ -142,7 +144,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
 
     start, seconds, size = count_gaussians(model), None, None
     if evaluation.is_trained(model):
-        model, seconds = train(model, links, config, folder)
+        model, seconds = train(model, loss, links, config, folder)
         if not is_first():
             return None
         size = (folder / "best.ckpt").stat().st_size
@@ -173,7 +175,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     return metrics
 
 
-def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model, float]:
+def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Model, float]:
     """Trains the model.
 
     Returns:
@@ -186,8 +188,7 @@ def train(model: Model, links: Links, config: dict, folder: Path) -> tuple[Model
     split = {"name": links.split.name, **links.split.parts()}
     identity = {"version": checkpoint.VERSION, "model": config["model"], "scene": links.scene.state(), "split": split}
     identity |= {"config": config, "links": fingerprint(links)}
-    context = {"model": model, "identity": identity, "seed": config["seed"]}
-    context["loss"] = registry("loss").build(config["loss"], task=links.task)
+    context = {"model": model, "loss": loss, "identity": identity, "seed": config["seed"]}
     module = registry("training").build(config["training"], **context)
     last, best = folder / "last.ckpt", folder / "best.ckpt"
     timer, keep_last = Timer(), KeepLast(last, config["save_every"])
