@@ -43,7 +43,7 @@ class Run(NamedTuple):
     Attributes:
         name: Its sub-folder.
         overrides: What was changed on the command line, by key.
-        metrics: Contents of ``metrics.json``; None where the job failed.
+        metrics: Contents of ``metrics.json``; None where the job failed, was stopped or is still at work.
     """
 
     name: str
@@ -105,8 +105,8 @@ def _resolved(path: Path) -> dict:
 def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
     """Rows of the table, each a dictionary by column, and what all runs have in common.
 
-    Varied overrides lead, then come scores and costs. A failed run has a row without scores. The baselines that the
-    runs were held against follow, once for each split.
+    Varied overrides lead, then come scores and costs. An unfinished run has a row without scores. The baselines
+    that the runs were held against follow, once for each split.
     """
     shared, varied = {}, []
     for key in dict.fromkeys(key for run in runs for key in run.overrides):
@@ -126,7 +126,7 @@ def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
 
     rows, baselines = [], {}
     for name, overrides, metrics in runs:
-        row = {"run": name, "status": "failed", "model": ""} | {key: overrides.get(key, "") for key in varied}
+        row = {"run": name, "status": "unfinished", "model": ""} | {key: overrides.get(key, "") for key in varied}
         if metrics is not None:
             (own, scores), *others = metrics["models"].items()
             row |= {"status": "done", "model": row["model"] or own} | {key: metrics[key] for key in facts}
@@ -178,7 +178,7 @@ def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
 
 
 def report(folder: Path) -> Group:
-    """Writes ``ablation.csv``, ``ablation.md`` and, unless all runs failed, ``speed_against_error.png`` there.
+    """Writes ``ablation.csv``, ``ablation.md`` and, unless none has ended, ``speed_against_error.png`` there.
 
     Args:
         folder: Of a Hydra multirun, or one above several.
@@ -211,7 +211,7 @@ def report(folder: Path) -> Group:
         _speed(runs, rows, shared, titles).savefig(folder / "speed_against_error.png", dpi=DPI)
 
     hidden = {name for name, metric in known.items() if not metric.is_brief} | {WRITTEN_ONLY}
-    if not any(row["status"] == "failed" for row in rows):
+    if not any(row["status"] == "unfinished" for row in rows):
         hidden.add("status")
     varied = [[value for key, value in run.overrides.items() if key not in shared] for run in runs]
     if all(varied.count(values) == 1 for values in varied):
@@ -263,7 +263,7 @@ def _table(title: str, rows: list[dict], titles: Mapping[str, str], hidden: set[
             overflow="fold",
         )
     for row in rows:
-        style = {"failed": "red", "baseline": "dim"}.get(row["status"])
+        style = {"unfinished": "red", "baseline": "dim"}.get(row["status"])
         table.add_row(*(escape(_text(row.get(column), "\n")) for column in columns), style=style)
     return table
 

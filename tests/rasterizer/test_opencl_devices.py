@@ -18,8 +18,7 @@ Build on <pyopencl.Device 'pthread-Zen 9' on 'Portable Computing Language' at 0x
 error: unknown target CPU 'generic'
 Device pthread-Zen 9 failed to build the program
 
-(options: -I /site-packages/pyopencl/cl)
-(source saved as /tmp/tmp1.cl)"""
+(options: -I site-packages/pyopencl/cl)"""
 """What PoCL says of a processor that its compiler does not know, as pyopencl passes it on."""
 
 

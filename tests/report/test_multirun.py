@@ -89,7 +89,7 @@ def test_folder_of_hydra_is_read(tmp_path):
     assert r"a\|b" in (tmp_path / "sweep" / "ablation.md").read_text()
 
 
-def test_failed_runs_stay_and_baselines_come_once(tmp_path):
+def test_unfinished_runs_stay_and_baselines_come_once(tmp_path):
     common = ["+experiment=spectrum", "data=rfid"]
     write_run(tmp_path, "0", [*common, "tokenizer=ga", "seed=1"], models=scores(0.91))
     write_run(tmp_path, "1", [*common, "tokenizer=multiview", "seed=1"])
@@ -100,7 +100,7 @@ def test_failed_runs_stay_and_baselines_come_once(tmp_path):
     assert list(rows[0])[:5] == ["run", "status", "model", "tokenizer", "seed"]
     assert [(row["run"], row["status"], row["model"]) for row in rows] == [
         ("0", "done", "gaigs"),
-        ("1", "failed", ""),
+        ("1", "unfinished", ""),
         ("2", "done", "gaigs"),
         ("10", "done", "gaigs"),
         ("", "baseline", "mean"),
@@ -114,7 +114,7 @@ def test_failed_runs_stay_and_baselines_come_once(tmp_path):
     assert table.caption == "experiment=spectrum, data=rfid, split=official, device=cpu; all columns in ablation.md"
     markdown = (tmp_path / "ablation.md").read_text().splitlines()
     assert len({line.count("|") for line in markdown[:8]}) == 1
-    assert markdown[3].startswith("| 1 | failed |  | multiview | 1 |")
+    assert markdown[3].startswith("| 1 | unfinished |  | multiview | 1 |")
     assert table.caption.removesuffix("; all columns in ablation.md") in markdown
     assert image.imread(tmp_path / "speed_against_error.png").shape[1] > 1000
 
@@ -216,7 +216,7 @@ def test_spread_over_seeds(tmp_path):
     for (width, seed), median in medians.items():
         overrides = ["data=rfid", f"width={width}", f"seed={seed}"]
         write_run(tmp_path, f"{width}-{seed}", overrides, seed=int(seed), models=scores(median))
-    write_run(tmp_path, "8-4", ["data=rfid", "width=8", "seed=4"])  # failed
+    write_run(tmp_path, "8-4", ["data=rfid", "width=8", "seed=4"])  # unfinished
     write_run(tmp_path, "32-1", ["data=rfid", "width=32", "seed=1"], models=scores(0.99))  # alone
     _, seeds = report(tmp_path).renderables
     rows = [row for row in read_csv(tmp_path) if row["status"] == "seeds"]
@@ -271,12 +271,15 @@ def test_models_may_vary(tmp_path):
     assert [row["model"] for row in read_csv(tmp_path)] == ["gaigs_small", "mlp", "fire", "mean", "knn"]
 
 
-def test_all_failed(tmp_path):
+def test_none_has_ended(tmp_path):
     write_run(tmp_path, "0", ["tokenizer=[a]"])
     write_run(tmp_path, "1", ["tokenizer=[b]"])
     (table,) = report(tmp_path).renderables
     assert table.row_count == 2
-    assert [(row["status"], row["tokenizer"]) for row in read_csv(tmp_path)] == [("failed", "[a]"), ("failed", "[b]")]
+    assert [(row["status"], row["tokenizer"]) for row in read_csv(tmp_path)] == [
+        ("unfinished", "[a]"),
+        ("unfinished", "[b]"),
+    ]
     assert not (tmp_path / "speed_against_error.png").exists()
 
 
@@ -309,4 +312,4 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     main()
     printed = capsys.readouterr().out
     assert "[ga]" in printed
-    assert "failed" in printed
+    assert "unfinished" in printed
