@@ -56,6 +56,7 @@ def train(config: DictConfig) -> float | None:
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         types = {"seed": int, "save_every": float, "tensorboard": bool, "threads": int | None}
+        types |= {"kriging": bool, "kriging_folds": int}
         for key, annotation in types.items():
             check_type(key, plain.get(key), annotation)
         if not 0 <= plain["seed"] < 2**32:

@@ -64,6 +64,31 @@ def load(path: str | Path) -> Model:
     return model.eval()
 
 
+def trained_weights(content: dict) -> dict:
+    """The weights of the training module in a checkpoint, without what was kriged on top of it."""
+    weights = content["state_dict"]
+    if content[KEY]["model"]["name"] != "kriging":
+        return weights
+    trend = "model.trend."
+    return {f"model.{key.removeprefix(trend)}": value for key, value in weights.items() if key.startswith(trend)}
+
+
+def exchange_model(path: Path, config: dict, model: Model) -> None:
+    """Puts another model into a checkpoint, whole or not at all.
+
+    Args:
+        path: The file, which is rewritten.
+        config: Of the model.
+        model: In its place, of the same scene.
+    """
+    content = read(path)
+    content[KEY] |= {"model": config}
+    content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
+    part = path.with_suffix(".part")
+    torch.save(content, part)
+    part.replace(path)
+
+
 def _from_version_0(content: dict) -> dict:
     """The splatting pipeline's parts had other names: mapping, the map's grid in the model, reference."""
     part = content[KEY]

@@ -18,7 +18,8 @@ HARMLESS = (
 """Keys that change nothing of what a run finds: one that goes on may have others."""
 
 KEYS = {
-    *KINDS, "gaussians", "density", "baselines", "trainer", "command", "seed", "save_every", "tensorboard", "threads"
+    *KINDS, "gaussians", "density", "kriging", "kriging_folds", "baselines", "trainer", "command", "seed", "save_every",
+    "tensorboard", "threads"
 }  # fmt: skip
 """What stands at the top of a configuration."""
 
@@ -75,7 +76,7 @@ def check_keys(config: dict) -> None:
         near = difflib.get_close_matches(unknown[0], KEYS, n=1)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
         raise ValueError(f"the configuration has no key {unknown[0]!r}{hint}; there are: {', '.join(sorted(KEYS))}")
-    if missing := sorted(KEYS - {"density"} - set(config)):  # which is null unless asked for
+    if missing := sorted(KEYS - {"density", "gaussians"} - set(config)):  # which may be null
         raise ValueError(f"the configuration needs the key {missing[0]!r}; conf/config.yaml has them all")
 
 

@@ -16,6 +16,7 @@ from gaigs.data import Links, Split
 from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.model import Model
 from gaigs.registry import registry
+from gaigs.report.shapes import LearntRoom
 from gaigs.scene import Scene
 
 BATCH = 64
@@ -64,8 +65,15 @@ def predict(model: Model, links: Links, index: Int[Tensor, "k"]) -> Tensor:
     return torch.cat([model.predict(links.query[part], batch_size=BATCH).cpu() for part in index.split(BATCH)])
 
 
-def test(model: Model, name: str, baselines: Mapping[str, Mapping], links: Links, folder: Path) -> Scores:
-    """Scores of the model and its baselines on every test link; writes ``predictions.npz``."""
+def test(models: Mapping[str, Model], baselines: Mapping[str, Mapping], links: Links, folder: Path) -> Scores:
+    """Scores of a run's models and their baselines on every test link; writes ``predictions.npz``.
+
+    Args:
+        models: By name; the first one's predictions are written.
+        baselines: Configurations by name.
+        links: All of them.
+        folder: Of the run.
+    """
     task, index = links.task, links.split.test
     labels = torch.cat([links.labels[part] for part in index.split(BATCH)])
     query = links.query[index]
@@ -78,20 +86,22 @@ def test(model: Model, name: str, baselines: Mapping[str, Mapping], links: Links
     if query.frequencies is not None:
         content["frequencies"] = query.frequencies.numpy()
     scores = {}
-    for key, candidate in ({name: model} | dict.fromkeys(baselines)).items():
-        values = predict(candidate or fit(baselines[key], links), links, index)
+    for key in [*models, *baselines]:
+        values = predict(models[key] if key in models else fit(baselines[key], links), links, index)
         scores[key] = task.scores(labels, values)
-        if candidate is model:
-            content["prediction"] = task.packed(values)
+        content.setdefault("prediction", task.packed(values))
         content |= {f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()}
     np.savez_compressed(folder / "predictions.npz", **content)
     return scores
 
 
-def validate(model: Model, config: Mapping, baselines: Mapping[str, Mapping], links: Links) -> Scores:
-    """Scores on the validation links of the model as it was trained, and of baselines that have not seen them.
+def validate(models: Mapping[str, Model], look_ups: Mapping[str, Mapping], links: Links) -> Scores:
+    """Scores on the validation links; none where nothing validates.
 
-    A model that learns by ``fit`` alone is fitted anew without them, too. There are none where nothing validates.
+    Args:
+        models: By name; they have not been fitted to these links.
+        look_ups: Configurations, by name, of models that learn by ``fit`` alone and are fitted without these links.
+        links: All of them.
     """
     split = links.split
     if not len(split.validation):
@@ -99,8 +109,8 @@ def validate(model: Model, config: Mapping, baselines: Mapping[str, Mapping], li
     unseen = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
     labels = torch.cat([links.labels[part] for part in split.validation.split(BATCH)])
     scores = {}
-    for name, candidate in {config["name"]: config, **baselines}.items():
-        fitted = model if candidate is config and is_trained(model) else fit(candidate, unseen)
+    for name in [*models, *look_ups]:
+        fitted = models[name] if name in models else fit(look_ups[name], unseen)
         scores[name] = links.task.scores(labels, predict(fitted, unseen, split.validation))
     return scores
 
@@ -162,7 +172,9 @@ def device_name(device: torch.device) -> str:
     return f"{names[0] if names else platform.processor() or platform.machine()}, {threads} thread{'s' * (threads > 1)}"
 
 
-def write_figures(folder: Path, links: Links, gaussians: Gaussians | None) -> list[Path]:
+def write_figures(
+    folder: Path, links: Links, gaussians: Gaussians | None, learnt: LearntRoom | None = None
+) -> list[Path]:
     """Draws a run: its room, its losses, and what its task shows of the predictions.
 
     Args:
@@ -170,6 +182,7 @@ def write_figures(folder: Path, links: Links, gaussians: Gaussians | None) -> li
             was trained; the figures go to ``figures/``.
         links: What the run was trained and tested on.
         gaussians: The Gaussians it learnt; None for a model without.
+        learnt: What it learnt of the room; None for a model that learns nothing of it.
 
     Returns:
         The files, as PNG.
@@ -178,9 +191,12 @@ def write_figures(folder: Path, links: Links, gaussians: Gaussians | None) -> li
         FileNotFoundError: The folder lacks what its task draws from.
     """
     from gaigs.report.curves import loss_curves, read_curves  # matplotlib is slow to import
+    from gaigs.report.room import paths
     from gaigs.report.style import DPI
 
-    figures = {"room": _room(links, gaussians)}
+    figures = {"room": _room(links, gaussians, learnt)}
+    if learnt is not None and learnt.paths:
+        figures["paths"] = paths(learnt, _positions(links), links.edges.numpy())
     if losses := sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime):
         figures["loss"] = loss_curves(read_curves(losses))
     figures |= links.task.figures(folder, links)
@@ -192,7 +208,7 @@ def write_figures(folder: Path, links: Links, gaussians: Gaussians | None) -> li
 
 
 @torch.no_grad()
-def _room(links: Links, gaussians: Gaussians | None):
+def _room(links: Links, gaussians: Gaussians | None, learnt: LearntRoom | None):
     from gaigs.report.room import Cloud, room
 
     poses = [receiver.pose for receiver in links.receivers]
@@ -206,8 +222,14 @@ def _room(links: Links, gaussians: Gaussians | None):
     return room(
         places[links.split.train].numpy(),
         places[links.split.test].numpy(),
-        np.stack([pose.position.numpy() for pose in poses]),
+        _positions(links),
         rotations if all(has_axes) else rotations[:0],
         links.edges.numpy(),
         cloud,
+        learnt,
     )
+
+
+def _positions(links: Links) -> np.ndarray:
+    """Where the receivers stand [m]."""
+    return np.stack([receiver.pose.position.numpy() for receiver in links.receivers])

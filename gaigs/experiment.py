@@ -30,6 +30,8 @@ from gaigs.registry import call, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine
+from gaigs.training.kriging import check_kriging, krige
+from gaigs.training.revision import Revision
 
 log = logging.getLogger(__name__)
 
@@ -138,18 +140,27 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     loss = registry("loss").build(config["loss"], task=task)
     baselines = evaluation.baseline_configurations(config["baselines"], name, scene)
     model = registry("model").build(config["model"], scene=scene)
+    check_kriging(config, model, links)
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
     model.fit(links)
 
     start, seconds, size = count_gaussians(model), None, None
+    models, unseen, look_ups = {name: model}, {}, {name: config["model"], **baselines}
     if evaluation.is_trained(model):
         model, seconds = train(model, loss, links, config, folder)
+        models, unseen, look_ups = {name: model}, {name: model}, baselines
+        if config["kriging"]:
+            train_fold = lambda model, part, folder: train(model, loss, part, config, folder)
+            kriged = krige(model, links, config, folder, train_fold)
         if not is_first():
             return None
+        if config["kriging"]:
+            models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged.model, kriged.blind))
         size = (folder / "best.ckpt").stat().st_size
-    scores = evaluation.test(model, name, baselines, links, folder)
-    unseen = evaluation.validate(model, config["model"], baselines, links)
+    model = models[name]
+    scores = evaluation.test(models, baselines, links, folder)
+    validation = evaluation.validate(unseen, look_ups, links)
     metrics = {
         "task": task.name,
         "data": links.remarks,
@@ -165,13 +176,15 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
         "checkpoint_bytes": size,
         "models": {name: task.summarise(values) for name, values in scores.items()},
-        "validation": {name: task.summarise(values) for name, values in unseen.items()},
-        "validation_score": unseen[name][task.watched].mean().item() if unseen else None,
+        "validation": {name: task.summarise(values) for name, values in validation.items()},
+        "validation_score": validation[name][task.watched].mean().item() if validation else None,
         "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
     } | model.facts()
+    if config["kriging"]:
+        metrics["kriging"]["seconds"] = kriged.seconds
     model.export(folder)
     task.keep(folder, model)
-    evaluation.write_figures(folder, links, model.primitives)
+    evaluation.write_figures(folder, links, model.primitives, model.learnt_room(links))
     return metrics
 
 
@@ -195,6 +208,8 @@ def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) ->
     callbacks = [timer, KeepBest(best, module.patience), keep_last]  # Lightning puts the last two behind all others
     if module.density is not None:
         callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))
+    if model.revisions:
+        callbacks.append(Revision(links, config["seed"]))
     if config["trainer"].get("enable_progress_bar", True):
         callbacks.append(ProgressLine())
     loggers = [CSVLogger(folder, "log")]
@@ -230,7 +245,7 @@ def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) ->
             distributed.destroy_process_group()
     seconds, steps, size = timer.time_elapsed("train"), trainer.global_step, module.batch_size
     log.info("trained %d steps of %d places in %.0f s: %.1f steps/s", steps, size, seconds, steps / seconds)
-    module.load_state_dict(checkpoint.read(best)["state_dict"])
+    module.load_state_dict(checkpoint.trained_weights(checkpoint.read(best)))
     return model.eval().to(trainer.strategy.root_device), seconds
 
 

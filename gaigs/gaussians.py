@@ -1,6 +1,7 @@
 """The scene's Gaussians: parameters, activations, placement, and .ply files."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -123,10 +124,7 @@ class Gaussians(nn.Module):
         Positions [m], log scales, quaternions (w, x, y, z), opacity logits; the signal's first three channels stand in
         f_dc_*, absent ones as 0, further ones in f_rest_*.
         """
-        columns = _ply_columns(self)
-        vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
-        comment = f"gaigs: {self.signal.shape[1]} signal channels"
-        PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(path))
+        write_ply(path, dict(self.named_parameters()), f"gaigs: {self.signal.shape[1]} signal channels")
 
     def load_ply(self, path: str | Path) -> None:
         """Takes over the Gaussians of a .ply, whatever their number.
@@ -168,6 +166,26 @@ def fibonacci_lattice(count: int, low: float, high: float) -> Float[Tensor, "cou
     return from_spherical(torch.remainder(golden * i, 2 * math.pi), torch.asin(heights)).float()
 
 
+def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> None:
+    """Writes any Gaussians as ``Gaussians.save_ply`` does.
+
+    Args:
+        path: Of the file.
+        values: Raw parameters of n Gaussians, by the names in ``Gaussians.PARAMETERS``.
+        comment: A line for the file's head.
+    """
+    n, channels, _ = values["signal"].shape
+    columns = {}
+    for name, properties in _ply_names(channels).items():
+        filled = np.zeros((n, len(properties)), np.float32)
+        if name != "normals":
+            own = values[name].detach().cpu().numpy().reshape(n, -1)
+            filled[:, : own.shape[1]] = own
+        columns |= zip(properties, filled.T, strict=True)
+    vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
+    PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(path))
+
+
 def _ply_names(channels: int) -> dict[str, list[str]]:
     """Properties of a splatting .ply for each parameter, in the order viewers expect."""
     return {
@@ -178,17 +196,3 @@ def _ply_names(channels: int) -> dict[str, list[str]]:
         "log_scales": [f"scale_{i}" for i in range(3)],
         "quats": [f"rot_{i}" for i in range(4)],
     }
-
-
-def _ply_columns(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    n, channels, _ = gaussians.signal.shape
-    columns = {}
-    for name, properties in _ply_names(channels).items():
-        if name == "normals":
-            values = np.zeros((n, 3))
-        else:
-            values = getattr(gaussians, name).detach().cpu().numpy().reshape(n, -1)
-        filled = np.zeros((n, len(properties)), np.float32)
-        filled[:, : values.shape[1]] = values
-        columns |= zip(properties, filled.T, strict=True)
-    return columns

@@ -33,6 +33,41 @@ def free_space(
     return torch.polar(0.5 / phases, sign * phases)
 
 
+def fresnel(
+    permittivity: complex | Complex[Tensor, "*batch"], cosines: Float[Tensor, "*batch"]
+) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
+    """Fresnel reflection coefficients of a half-space, electric field across (TE) and in (TM) the plane of incidence.
+
+    Args:
+        permittivity: Complex, relative, for the time dependence exp(+j omega t).
+        cosines: Of the angle of incidence against the surface's normal.
+
+    Source: Fresnel's formulas in the form of ITU-R P.2040-3.
+    """
+    root = torch.sqrt(permittivity - (1 - cosines.square()))
+    te = (cosines - root) / (cosines + root)
+    tm = (permittivity * cosines - root) / (permittivity * cosines + root)
+    return te, tm
+
+
+def carriers(scene: Scene, query: Query) -> Float[Tensor, "b"]:
+    """The frequency of each link [Hz]; the data's only one where the query says none, of channels their band's middle.
+
+    Raises:
+        ValueError: Neither says one, or the data have several.
+    """
+    if scene.task.dtype.is_complex:
+        return scene.task.frequencies.mean().to(query.transmitters).expand(len(query))
+    if query.frequencies is not None:
+        return query.frequencies
+    if len(scene.frequencies) != 1:
+        raise ValueError(
+            f"each link must have a frequency [Hz], as the data have {len(scene.frequencies)}; give the query its "
+            "frequencies, or the data theirs"
+        )
+    return scene.frequencies.to(query.transmitters).expand(len(query))
+
+
 def check_elements(what: str, scene: Scene) -> None:
     """Sees to it that labels are channels, and that each receiver's array has as many elements as they.
 

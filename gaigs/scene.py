@@ -1,10 +1,11 @@
 """What a model must know of a data set to be built: receivers with their arrays, the box of places, the task."""
 
+import functools
 import math
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.geometry import Pose
@@ -18,6 +19,12 @@ VERSION = 1
 PATTERNS = ("isotropic", "cosine")
 """Field patterns of an element: alike in all directions, or the cosine of the angle off the array's normal and 0 behind
 it, as of a patch."""
+
+
+def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, "pairs"]]:
+    """The different vectors from one place to another, to nine decimals, and which of them each pair of places has."""
+    apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)
+    return torch.unique(apart, dim=0, return_inverse=True)
 
 
 @dataclass(frozen=True)
@@ -70,6 +77,16 @@ class Array:
     def __len__(self) -> int:
         return len(self.elements)
 
+    @functools.cached_property
+    def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, "pairs"], Float[Tensor, "l"]]:
+        """The different vectors from one element to another [m], which of them each pair of elements has, and how many
+        pairs have each; float64.
+
+        What powers alone say of a field, its covariance, an array hears by these only: 49 for a 4 x 4 array.
+        """
+        steps, pairs = differences(self.elements.double())
+        return steps, pairs, torch.bincount(pairs).double()
+
     def gain(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Field gain of an element towards unit vectors in the array's frame."""
         if self.pattern == "cosine":
@@ -96,6 +113,8 @@ class Scene:
         spacing: Median distance from a training transmitter to the next one elsewhere [m].
         task: What the labels are.
         frequencies: The training links' different carriers, ascending (f,) [Hz]; empty where they are unknown.
+        bandwidth: Of the band around each carrier that a label's power is averaged over, 0 for a carrier alone [Hz];
+            None where it is unknown.
     """
 
     receivers: tuple[Receiver, ...]
@@ -104,6 +123,7 @@ class Scene:
     spacing: float
     task: Task
     frequencies: Float[Tensor, "f"] = field(default_factory=lambda: torch.zeros(0))
+    bandwidth: float | None = None
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Where the receivers stand [m], on the device and in the dtype of ``like``."""
@@ -148,6 +168,7 @@ class Scene:
             "spacing": self.spacing,
             "task": self.task.state(),
             "frequencies": self.frequencies,
+            "bandwidth": self.bandwidth,
         }
 
     @classmethod
@@ -167,7 +188,7 @@ class Scene:
             for r in state["receivers"]
         )
         box = state["lower"], state["upper"], state["spacing"]
-        return cls(receivers, *box, registry("task").build(state["task"]), state["frequencies"])
+        return cls(receivers, *box, registry("task").build(state["task"]), state["frequencies"], state.get("bandwidth"))
 
 
 def _from_version_0(state: dict) -> dict:

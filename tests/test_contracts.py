@@ -41,6 +41,9 @@ SMALL = {
     "synthetic_rssi": ["data.transmitters=40", "data.order=1"],
     "synthetic_csi": ["data.transmitters=12", "data.order=1", "data.subcarriers=3"],
     "gaigs": ["gaussians.count=60", "deformation.width=16"],
+    "sionna": ["data.transmitters=6"],
+    "sionna_rssi": ["data.transmitters=6"],
+    "sionna_csi": ["data.transmitters=6", "data.subcarriers=3"],
 }
 """What makes a component quick to check."""
 
@@ -54,8 +57,10 @@ SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "syntheti
 MADE_FOR = {
     "loss": {"l1_ssim": ["spectrum"], "absolute": ["spectrum", "rssi"], "squared": ["spectrum", "rssi"]}
     | {"huber": ["spectrum", "rssi"], "nmse": ["csi"]},
-    "model": {"array_response": ["spectrum"], "path_loss": ["rssi"], "friis": ["csi"]},
+    "model": {"array_response": ["spectrum"], "path_loss": ["rssi"], "friis": ["csi"]}
+    | {"kriging": []},  # it is made of a trained model alone
     "pooling": {
+        "array_response": ["spectrum"],
         "spectrum": ["spectrum"],
         "mean_power": ["rssi"],
         "softmax_attention": ["rssi"],
@@ -63,6 +68,13 @@ MADE_FOR = {
     },
 }
 """The tasks of a component that does not take all of them."""
+
+MIRRORED = ["placement=mirrored", "deformation=none", "projection=direction_cosine", "rasterizer=aperture"]
+HEARD = {"spectrum": "array_response", "rssi": "mean_power", "csi": "element_sum"}
+"""The pooling of a task for ``aperture``."""
+
+CARRIER = 5e9
+"""Of the links to arrays that are known [Hz]."""
 
 every = lambda kind: pytest.mark.parametrize("name", registry(kind).names())
 on_every_device = pytest.mark.parametrize("device", DEVICES)
@@ -150,7 +162,9 @@ FILES = {
 
 
 @every("data")
-def test_data(name, tmp_path):
+def test_data(name, tmp_path, request):
+    if name.startswith("sionna"):
+        request.getfixturevalue("tracer")
     overrides = FILES[name](tmp_path) if name in FILES else []
     config = composed(f"data={name}", *SMALL.get(name, []), *overrides)
     assert config["data"]["name"] == name
@@ -177,7 +191,7 @@ def test_split(name, task):
 @on_every_device
 def test_placement(name, device):
     for scene in scenes():
-        placement = registry("placement").build(configured("placement", name), scene=scene)
+        placement = registry("placement").build(configured("placement", name), scene=scene, channels=2)
         check_placement(placement, scene, device)
 
 
@@ -225,8 +239,8 @@ def test_rasterizer(name, device):
 @on_its_tasks("pooling")
 @on_every_device
 def test_pooling(name, task, device):
-    config = configured("pooling", name)
-    check_pooling(lambda scene: registry("pooling").build(config, scene=scene), example_links(task), device)
+    config, links = configured("pooling", name), example_links(task, CARRIER if name == "array_response" else None)
+    check_pooling(lambda scene: registry("pooling").build(config, scene=scene), links, device)
 
 
 @on_every_device
@@ -248,8 +262,10 @@ def test_loss(name, task, device):
 @on_its_tasks("model")
 @on_every_device
 def test_model(name, task, device):
-    config = configured("model", name, f"data={SIMULATED[task]}")
-    check_model(lambda scene: registry("model").build(config, scene=scene), example_links(task), device)
+    own = [*MIRRORED, f"pooling={HEARD[task]}"] if name == "mirrored" else []
+    config = configured("model", name, f"data={SIMULATED[task]}", *own)
+    links = example_links(task, CARRIER if name == "mirrored" else None)
+    check_model(lambda scene: registry("model").build(config, scene=scene), links, device)
 
 
 class Judged(GaussianSplatting):

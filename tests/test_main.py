@@ -167,7 +167,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
     [
         (["tokenizer.anchor=3"], "Key 'anchor' is not in struct"),  # Hydra's own
         (["tokenizer=foo"], "Could not find 'tokenizer/foo'"),
-        (["+experiment=foo"], "Available options in 'experiment':\n\tcsi\n\trssi\n\tspectrum"),
+        (["+experiment=foo"], "Available options in 'experiment':\n\tcsi\n\tmirrored"),
         (["+tokenizer.widht=3"], "gaigs: tokenizer 'euclidean' has no option 'widht' (did you mean 'width'?)"),
         (["+trainer.max_step=3"], "gaigs: trainer has no option 'max_step' (did you mean 'max_steps'?)"),
         (["trainer.accelerator=abacus"], "invalid accelerator name: `accelerator='abacus'`"),

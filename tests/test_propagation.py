@@ -1,4 +1,4 @@
-"""Free space against hand-written sums in numpy, and signs against phases that are known."""
+"""Free space against sums in numpy, reflection against Snell's law, signs against phases that are known."""
 
 import cmath
 import math
@@ -10,7 +10,16 @@ import torch
 from scipy.constants import speed_of_light
 
 from gaigs.geometry import Pose
-from gaigs.propagation import array_sign, check_elements, direct_gains, direct_waves, free_space, phase_sign
+from gaigs.propagation import (
+    array_sign,
+    carriers,
+    check_elements,
+    direct_gains,
+    direct_waves,
+    free_space,
+    fresnel,
+    phase_sign,
+)
 from gaigs.query import Query
 from gaigs.scene import Array, Receiver
 from gaigs.testing import example_links
@@ -89,6 +98,70 @@ def test_the_pattern_is_that_towards_the_transmitter():
     assert torch.equal(direct_gains(scene(Array.planar(2, 2, 0.06)), query), torch.ones(40, dtype=torch.float64))
     on_top = Query(POSES[0].position[None], torch.tensor([0]))
     assert direct_gains(scene(Array.planar(2, 2, 0.06, "cosine")), on_top).item() == 1
+
+
+# --- reflection ---
+
+SURFACES = {"glass": 6.31 - 0.05j, "wet_brick": 12 - 4j, "metal": 1 - 3.6e7j, "foam": 1.05 + 0j}
+"""Relative permittivities."""
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+def test_reflection_follows_snells_law(surface):
+    """Against the form with both angles and both impedances."""
+    angles = np.linspace(0, 1.5, 40)
+    n = np.sqrt(SURFACES[surface])
+    inside = np.sqrt(1 - (np.sin(angles) / n) ** 2 + 0j)  # cosine of the angle of refraction
+    te = (np.cos(angles) - n * inside) / (np.cos(angles) + n * inside)
+    tm = (n * np.cos(angles) - inside) / (n * np.cos(angles) + inside)
+    for found, expected in zip(fresnel(SURFACES[surface], torch.from_numpy(np.cos(angles))), (te, tm), strict=True):
+        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+def test_reflection_is_passive_and_total_at_grazing(surface):
+    te, tm = fresnel(SURFACES[surface], torch.linspace(0, 1, 200, dtype=torch.float64))
+    assert te.abs().max() <= 1
+    assert tm.abs().max() <= 1
+    assert te[0].item() == pytest.approx(-1)
+    assert tm[0].item() == pytest.approx(-1)
+    torch.testing.assert_close(te[-1], -tm[-1])
+
+
+def test_at_brewsters_angle_nothing_of_one_polarisation_is_reflected():
+    brewster = torch.tensor([math.cos(math.atan(2.0))], dtype=torch.float64)  # of a refractive index of 2
+    te, tm = fresnel(complex(4), brewster)
+    assert abs(tm.item()) < 1e-12
+    assert abs(te.item()) > 0.5
+
+
+def test_each_surface_may_have_its_own_permittivity_and_learns_it():
+    permittivities = torch.tensor([*SURFACES.values()], dtype=torch.complex128, requires_grad=True)
+    cosines = torch.linspace(0.05, 1, 7, dtype=torch.float64)[:, None].requires_grad_()
+    together = fresnel(permittivities, cosines)
+    for i, surface in enumerate(SURFACES.values()):
+        for whole, alone in zip(together, fresnel(surface, cosines[:, 0]), strict=True):
+            torch.testing.assert_close(whole[:, i], alone)
+    torch.autograd.gradcheck(fresnel, (permittivities[[0, 1]], cosines))
+
+
+# --- carriers ---
+
+
+def test_the_carrier_of_a_link_is_its_own_or_the_datas_only_one():
+    spectra, band = example_links().scene, torch.tensor([2.4e9, 5e9])
+    own = Query(torch.zeros(2, 3), torch.zeros(2, dtype=torch.long), band)
+    silent = replace(own, frequencies=None)
+    assert carriers(replace(spectra, frequencies=band), own).tolist() == band.tolist()
+    assert carriers(replace(spectra, frequencies=band[1:]), silent).tolist() == [5e9, 5e9]
+    middle = carriers(example_links("csi").scene, silent)
+    assert middle.tolist() == pytest.approx([2.44e9] * 2)
+    assert middle.dtype == torch.float32
+    for known in (band, band[:0]):
+        with pytest.raises(
+            ValueError, match=rf"each link must have a frequency \[Hz\], as the data have {len(known)}; give"
+        ):
+            carriers(replace(spectra, frequencies=known), silent)
 
 
 # --- signs ---

@@ -61,7 +61,8 @@ def component(kind, name, body="value = 1"):
 
 BUILT_IN = {
     "task": {"spectrum", "rssi", "csi"},
-    "data": {"nerf2_spectrum", "nerf2_rssi", "rssi_csv", "csi_npz", "synthetic", "synthetic_rssi", "synthetic_csi"},
+    "data": {"nerf2_spectrum", "nerf2_rssi", "rssi_csv", "csi_npz", "synthetic", "synthetic_rssi", "synthetic_csi"}
+    | {"sionna", "sionna_rssi", "sionna_csi"},
     "split": {"official", "random", "sparse", "runs", "blocks"},
     "placement": {"free"},
     "tokenizer": {"ga", "euclidean", "multiview"},
@@ -70,7 +71,7 @@ BUILT_IN = {
     "rasterizer": {"torch", "opencl", "fastest"},
     "pooling": {"spectrum", "softmax_attention", "mean_power", "element_sum"},
     "loss": {"absolute", "squared", "huber", "l1_ssim", "nmse"},
-    "model": {"gaigs", "mean", "knn", "path_loss", "friis", "gaussian_process"},
+    "model": {"gaigs", "mean", "knn", "path_loss", "friis", "gaussian_process", "kriging"},
     "training": {"descent", "adversarial"},
 }
 

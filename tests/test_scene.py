@@ -120,6 +120,31 @@ def test_a_band_needs_a_frequency(scene):
         scene.band_positions(Query(torch.zeros(1, 3), torch.zeros(1).long()))
 
 
+# --- lags ---
+
+
+def test_lags_of_a_square_array_are_those_of_a_square_twice_as_wide():
+    steps, pairs, counts = Array.planar(4, 4, 0.023).lags
+    assert steps.shape == (49, 3)
+    assert pairs.shape == (256,)
+    places = (steps[:, :2] / 0.023).round().long()
+    np.testing.assert_allclose(steps[:, :2], 0.023 * places, atol=1e-9)
+    assert {*map(tuple, places.tolist())} == {(x, y) for x in range(-3, 4) for y in range(-3, 4)}
+    assert counts.tolist() == [(4 - abs(x)) * (4 - abs(y)) for x, y in places.tolist()]
+
+
+@pytest.mark.parametrize("array", [Array.single(), Array(torch.rand(5, 3)), Array.planar(2, 3, 0.1)])
+def test_each_pair_of_elements_has_its_lag(array):
+    steps, pairs, counts = array.lags
+    count = len(array)
+    for k, (i, j) in enumerate((i, j) for i in range(count) for j in range(count)):
+        apart = array.elements[i].double() - array.elements[j].double()
+        np.testing.assert_allclose(steps[pairs[k]], apart, atol=1e-9)
+    assert counts.sum() == count**2
+    torch.testing.assert_close(steps, -steps.flip(0))  # opposite ones stand opposite, and 0 in the middle
+    assert not steps[len(steps) // 2].any()
+
+
 # --- states ---
 
 
@@ -136,9 +161,23 @@ def test_a_scene_comes_back_from_its_state(task):
     for field in ("lower", "upper", "frequencies"):
         assert torch.equal(getattr(again, field), getattr(scene, field))
     assert again.spacing == scene.spacing
+    assert again.bandwidth is None
     assert type(again.task) is type(scene.task)
     assert again.task.shape == scene.task.shape
     assert again.task.normalisation == scene.task.normalisation
+
+
+@pytest.mark.parametrize("bandwidth", [None, 0.0, 499.2e6])
+def test_a_scene_keeps_its_bandwidth_and_states_without_one_are_read(bandwidth):
+    state = stored(replace(example_links().scene, bandwidth=bandwidth).state())
+    assert Scene.from_state(state).bandwidth == bandwidth
+    del state["bandwidth"]
+    assert Scene.from_state(state).bandwidth is None
+
+
+@pytest.mark.parametrize("bandwidth", [None, 0.0, 499.2e6])
+def test_a_scene_has_the_bandwidth_of_its_links(bandwidth):
+    assert replace(example_links(), bandwidth=bandwidth).scene.bandwidth == bandwidth
 
 
 def test_a_tasks_options_come_back_bit_by_bit():

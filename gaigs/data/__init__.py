@@ -47,6 +47,8 @@ class Links:
         official: Gives the training and test links that came with the data; None where none came. It may read files,
             and is called for the official split alone.
         split: Train, validation and test links; None until a split is chosen, see ``load``.
+        bandwidth: Of the band around each carrier that a label's power is averaged over, 0 for a carrier alone [Hz];
+            None where it is unknown.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty where unknown.
         remarks: What was read, and what was left out and why, in a sentence.
     """
@@ -58,6 +60,7 @@ class Links:
     rows: Int[Tensor, "n"] | None = None
     official: Callable[[], Parts] | None = None
     split: Split | None = None
+    bandwidth: float | None = None
     edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
     remarks: str = ""
 
@@ -87,7 +90,8 @@ class Links:
         distances, _ = cKDTree(train.double().numpy()).query(train.double().numpy(), k=2)
         spacing = float(np.median(distances[:, 1]))
         frequencies = torch.zeros(0) if training.frequencies is None else training.frequencies.unique()
-        return Scene(self.receivers, train.amin(0), train.amax(0), spacing, self.task, frequencies)
+        box = train.amin(0), train.amax(0), spacing
+        return Scene(self.receivers, *box, self.task, frequencies, self.bandwidth)
 
 
 def load(data: Mapping, split: Mapping) -> Links:

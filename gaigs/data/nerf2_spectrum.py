@@ -1,5 +1,6 @@
 """Spatial spectra in the folder layout of NeRF²; docs/data.md describes the files."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -36,7 +37,12 @@ HIGHEST = 1000.0
 
 
 @register("data", "nerf2_spectrum")
-def read(root: str | Path, elements: Sequence[int] | None = (4, 4), frequency: float | None = 920e6) -> Links:
+def read(
+    root: str | Path,
+    elements: Sequence[int] | None = (4, 4),
+    frequency: float | None = 920e6,
+    bandwidth: float | None = None,
+) -> Links:
     """A data set from its folder, which is only read.
 
     Everything but the pixels is checked here; images are decoded when their labels are first asked for. Where links
@@ -49,6 +55,8 @@ def read(root: str | Path, elements: Sequence[int] | None = (4, 4), frequency: f
             where they are unknown.
         frequency: Carrier of all links where there is no ``freq.txt`` [Hz]; None where it is unknown, and with it how
             far apart the elements stand. What is unknown of the array counts as a single antenna.
+        bandwidth: Of the band around each carrier that powers were averaged over, 0 for a carrier alone [Hz]; None
+            where it is unknown.
 
     Raises:
         FileNotFoundError: There is no such folder.
@@ -57,7 +65,7 @@ def read(root: str | Path, elements: Sequence[int] | None = (4, 4), frequency: f
 
     Source: NeRF², https://github.com/XPengZhao/NeRF2; its spectra s23 are of a 4 x 4 array at about 920 MHz.
     """
-    _check_options(elements, frequency)
+    _check_options(elements, frequency, bandwidth)
     root = find_folder(root)
     defects: list[str] = []
     positions = read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one spectrum a line", defects)
@@ -86,6 +94,7 @@ def read(root: str | Path, elements: Sequence[int] | None = (4, 4), frequency: f
         task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
         rows=number_places(positions)[1] if has_own else None,
         official=partial(_read_official, root, len(files)),
+        bandwidth=bandwidth,
         remarks="; ".join(remarks),
     )
 
@@ -158,7 +167,9 @@ def write(folder: str | Path, links: Links) -> None:
         (folder / f"{name}_index.txt").write_text(text)
 
 
-def _check_options(elements: Sequence[int] | None, frequency: float | None) -> None:
+def _check_options(elements: Sequence[int] | None, frequency: float | None, bandwidth: float | None) -> None:
+    if bandwidth is not None and not 0 <= bandwidth < math.inf:
+        raise ValueError(f"bandwidth must be that of a band, 0 or more [Hz], or null, got {bandwidth}")
     if frequency is not None and not 0 < frequency < HIGHEST * 1e9:
         raise ValueError(f"frequency must be a carrier above 0 and below 1e12 Hz, or null, got {frequency}")
     is_pair = isinstance(elements, Sequence) and len(elements) == 2

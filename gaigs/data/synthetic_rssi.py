@@ -75,6 +75,7 @@ def furnished_room_rssi(
         task=Rssi(),
         rows=rows,
         official=partial(last_fifth, transmitters, rows),
+        bandwidth=BANDWIDTH,
         edges=edges(ROOM),
         remarks=(
             f"{len(rows)} readings of {transmitters} places at {len(GATEWAYS)} gateways; "

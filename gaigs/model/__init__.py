@@ -13,6 +13,7 @@ from gaigs.data import Links
 from gaigs.directions import Directions
 from gaigs.gaussians import Gaussians
 from gaigs.query import Batch, Query
+from gaigs.report.shapes import LearntRoom
 from gaigs.scene import Scene
 
 
@@ -69,6 +70,27 @@ class Model(nn.Module):
         """The Gaussians that density control changes and figures draw; None for a model without."""
         return None
 
+    @property
+    def revisions(self) -> tuple[float, ...]:
+        """After which shares of the training ``revise`` is called; by default never."""
+        return ()
+
+    def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
+        """Changes the model between two steps in ways that gradients cannot, such as by a search.
+
+        Parameters keep their shapes, and all that it decides is in the state dict.
+
+        Args:
+            number: Which of ``revisions``, from 0.
+            train: Some training links, thinned as the training's steps are.
+            validation: Some validation links; None where nothing is held out.
+            loss: Of the model as it stands, on a batch.
+
+        Returns:
+            What it did, in a sentence for the log.
+        """
+        raise NotImplementedError
+
     # --- what a run reports of it ---
 
     def facts(self) -> dict[str, object]:
@@ -77,6 +99,10 @@ class Model(nn.Module):
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
         """What of a prediction is rendering alone, to be timed; None for a model that renders nothing."""
+        return None
+
+    def learnt_room(self, links: Links) -> LearntRoom | None:
+        """What figures show of the room it has learnt from these links; None for a model that learns nothing of it."""
         return None
 
     def export(self, folder: Path) -> None:

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.directions import Grid
+from gaigs.directions import Directions, Grid
 from gaigs.query import Batch, Query
 from gaigs.scene import Scene
 
@@ -86,7 +86,7 @@ def at_directions(values: Tensor, batch: Batch, scene: Scene) -> Tensor:
     Labels without directions, and those asked for in all of the label's own, come out as they are.
     """
     own, asked = scene.task.directions, batch.directions
-    if own is None or asked is None:
+    if own is None or asked is None or _is_same(asked, own):  # the usual case, told at once
         return values
     rows = _nearest(asked.elevations, own.elevations, None).to(values.device)
     columns = _nearest(asked.azimuths, own.azimuths, 2 * math.pi).to(values.device)
@@ -94,6 +94,14 @@ def at_directions(values: Tensor, batch: Batch, scene: Scene) -> Tensor:
         return values[:, rows, columns]
     is_whole = rows.tolist() == [*range(own.shape[0])] and columns.tolist() == [*range(own.shape[1])]
     return values if is_whole else values[:, rows][:, :, columns]
+
+
+def _is_same(asked: Directions, own: Grid) -> bool:
+    """Whether a label is asked for in all of its own directions."""
+    if not isinstance(asked, Grid) or asked.shape != own.shape:
+        return False
+    pairs = (asked.elevations, own.elevations), (asked.azimuths, own.azimuths)
+    return all(torch.equal(a.to(b), b) for a, b in pairs)
 
 
 def _nearest(asked: Float[Tensor, "k"], own: Float[Tensor, "n"], period: float | None) -> Int[Tensor, "k"]:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Links
@@ -15,6 +15,7 @@ from gaigs.geometry import covariances
 from gaigs.model import Model, Prediction
 from gaigs.placement import Placed
 from gaigs.projection import Splats
+from gaigs.propagation import carriers
 from gaigs.query import Batch, Query
 from gaigs.registry import call, register, registry
 from gaigs.scene import Scene
@@ -26,21 +27,23 @@ class GaussianSplatting(Model):
 
     Args:
         scene: Receivers and task.
-        gaussians: Options of ``gaigs.gaussians.Gaussians``.
+        gaussians: Options of ``gaigs.gaussians.Gaussians``; None for none, where the placement brings its own.
         placement, tokenizer, deformation, projection, rasterizer, pooling: Configurations of registered components.
         trend: Configuration of a model whose value the pooled map is added to; None for none.
 
     Raises:
-        ValueError: The pooling does not give the task's labels; the projection does not see all of the map; the trend
-            needs its data or a training of its own.
+        ValueError: The pooling does not give the task's labels; the projection does not see all of the map; parts do
+            not go together; the trend needs its data or a training of its own.
 
     Source: GAI-GS, section "Framework"; the trend is ours (docs/methods.md).
     """
 
+    name = "gaigs"
+
     def __init__(
         self,
         scene: Scene,
-        gaussians: dict,
+        gaussians: dict | None,
         placement: dict,
         tokenizer: dict,
         deformation: dict,
@@ -67,7 +70,8 @@ class GaussianSplatting(Model):
                 f"labels of task {scene.task.name!r} have no directions, so the pooling must have a grid of its own, "
                 f"and {pooling['name']} has none; take the task's own pooling"
             )
-        nothing = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long))
+        carrier = torch.tensor([1e9])  # whichever
+        nothing = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), carrier)
         gives = tuple(self.pooling(torch.zeros(1, self.pooling.channels, *grid.shape), nothing).shape[1:])
         if gives != scene.task.shape:
             raise ValueError(
@@ -75,18 +79,33 @@ class GaussianSplatting(Model):
                 f"gives {gives}; take the task's own pooling"
             )
         self.projection = registry("projection").build(projection, pixel=grid.pitch)
-        if grid.elevations.min() < 0 and not self.projection.sees_below:
+        self.rasterizer = registry("rasterizer").build(rasterizer)
+        self.draws_map = getattr(self.rasterizer, "draws_map", True)
+        if not self.draws_map and (self.pooling.takes is None or projection["name"] != "direction_cosine"):
+            raise ValueError(
+                f"rasterizer {rasterizer['name']!r} draws no map; it takes projection=direction_cosine and a pooling "
+                f"for it (array_response, mean_power or element_sum), got {projection['name']} and {pooling['name']}"
+            )
+        if self.draws_map and grid.elevations.min() < 0 and not self.projection.sees_below:
             raise ValueError(
                 f"the map's grid reaches below the array's plane, which {projection['name']} folds onto what is above; "
                 "take mercator or equirectangular"
             )
-        self.rasterizer = registry("rasterizer").build(rasterizer)
         zone = self.pooling.zone
         if self.pooling.grid is None:
             zone = grid.elevations.min().item(), grid.elevations.max().item()
-        channels = self.pooling.channels
-        self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels)
-        self.placement = registry("placement").build(placement, scene=scene)
+        channels = self.pooling.channels if self.draws_map else 2  # real and imaginary part of an amplitude
+        self.placement = registry("placement").build(placement, scene=scene, channels=channels)
+        if self.placement.model not in (None, self.name):
+            raise ValueError(
+                f"placement {placement['name']!r} makes another predictor, whose results have a name of their own; set "
+                f"model={self.placement.model}"
+            )
+        if gaussians is None and not self.placement.has_own:
+            raise ValueError(f"placement {placement['name']!r} places free Gaussians alone; set gaussians=lattice")
+        self.gaussians = None
+        if gaussians is not None:
+            self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels)
         reads_tokens = registry("deformation").get(deformation["name"]).reads_tokens
         self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene) if reads_tokens else None
         context = {"scene": scene, "channels": channels}
@@ -97,7 +116,11 @@ class GaussianSplatting(Model):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits pooling and trend, and has the training start from the trend: the map's mean level is taken off."""
+        """Fits placement, pooling and trend.
+
+        The training starts from the trend: the map's mean level is taken off.
+        """
+        self.placement.fit(links)
         self.pooling.fit(links)
         if self.trend is None:
             return
@@ -123,34 +146,40 @@ class GaussianSplatting(Model):
         for receiver in query.receivers.unique().tolist() or [0]:  # no links have a label's shape too
             links.append((query.receivers == receiver).nonzero()[:, 0])
             own = query[links[-1]]
-            maps = [
-                self.rasterizer(*arguments)[0]
-                for arguments in self._arguments(placed, residuals, which[links[-1]], receiver, batch.directions)
-            ]
-            value = self.pooling(torch.cat(maps), own)
+            if self.draws_map:
+                maps = [
+                    self.rasterizer(*arguments)[0]
+                    for arguments in self._arguments(placed, residuals, which[links[-1]], receiver, batch.directions)
+                ]
+                value = self.pooling(torch.cat(maps), own, batch.directions)
+            else:
+                heard = self._sum(placed, residuals, which[links[-1]], receiver, own)
+                value = self.pooling.hear(heard, own, batch.directions)
             if self.pooling.grid is None and batch.directions is not None:
                 value = value.reshape(len(own), *batch.directions.shape)  # a list of rays was rendered as one row
             values.append(value)
-        value = torch.cat(values)[torch.cat(links).argsort()]
-        if self.trend is not None:
-            value = self.trend(batch).value + value - self.level
+        value = self._on_trend(torch.cat(values)[torch.cat(links).argsort()], batch)
         penalties = {}
         if residuals.delta_opacities is not None:
             penalties["opacity"] = residuals.delta_opacities.square().mean()
+        penalties |= self.placement.penalties()
         return Prediction(value, penalties)
 
+    def _on_trend(self, value: Tensor, batch: Batch) -> Tensor:
+        return value if self.trend is None else self.trend(batch).value + value - self.level
+
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        groups = {name: [parameter] for name, parameter in self.gaussians.named_parameters()}
-        network = [
-            parameter
-            for part in (self.placement, self.tokenizer, self.deformation, self.pooling)
-            if part is not None
-            for parameter in part.parameters()
-        ]
-        return groups | {"network": network}
+        groups = {}
+        if self.gaussians is not None:
+            groups = {name: [parameter] for name, parameter in self.gaussians.named_parameters()}
+        placing = self.placement.parameter_groups()
+        network = placing.pop("network", [])
+        for part in (self.tokenizer, self.deformation, self.pooling):
+            network += [] if part is None else list(part.parameters())
+        return groups | placing | ({"network": network} if network else {})
 
     @property
-    def primitives(self) -> Gaussians:
+    def primitives(self) -> Gaussians | None:
         return self.gaussians
 
     def facts(self) -> dict[str, object]:
@@ -158,17 +187,21 @@ class GaussianSplatting(Model):
         return {"rasterizer": self.rasterizer.used}
 
     def rendering(self, batch: Batch) -> Callable[[], object]:
-        """The rasterizer alone, for the links to the first link's receiver."""
+        """The rasterizer alone, for the links to the first link's receiver; of ``aperture`` with the projection."""
         receiver = int(batch.query.receivers[0])
         query = batch.query[(batch.query.receivers == receiver).nonzero()[:, 0]]
         with torch.no_grad():
             which = torch.arange(len(query), device=query.transmitters.device)
-            calls = self._arguments(*self._excite(query), which, receiver, batch.directions)
+            excited = self._excite(query)
+            if not self.draws_map:
+                return lambda: self._sum(*excited, which, receiver, query)
+            calls = self._arguments(*excited, which, receiver, batch.directions)
         return lambda: [self.rasterizer(*arguments) for arguments in calls]
 
     def export(self, folder: Path) -> None:
-        """``gaussians.ply``, for 3-D splatting viewers."""
-        self.gaussians.save_ply(folder / "gaussians.ply")
+        """``gaussians.ply`` of the free Gaussians, for 3-D splatting viewers."""
+        if self.gaussians is not None:
+            self.gaussians.save_ply(folder / "gaussians.ply")
 
     @property
     def _sees_receivers(self) -> bool:
@@ -176,11 +209,16 @@ class GaussianSplatting(Model):
         return any(getattr(part, "sees_receivers", False) for part in parts)
 
     def _excite(self, query: Query) -> tuple[Placed, Residuals]:
-        """Where the Gaussians stand for each query, and what it changes in them."""
-        placed, opacities = self.placement(self.gaussians, query), self.gaussians.opacities
+        """The Gaussians for each query, and what it changes in them."""
+        placed = self.placement(self.gaussians, query)
+        if placed.opacities is None:
+            own = self.gaussians
+            placed = placed._replace(
+                quats=own.unit_quats, scales=own.scales[None], opacities=own.opacities, signal=own.signal
+            )
         # The network says how a place responds to a transmitter; where the Gaussians go is learnt from the image alone.
         seen = Placed(*(None if part is None else part.detach() for part in placed))
-        tokens = None if self.tokenizer is None else self.tokenizer(seen, opacities.detach(), query)
+        tokens = None if self.tokenizer is None else self.tokenizer(seen, seen.opacities, query)
         return placed, self.deformation(tokens, seen, query)
 
     def _arguments(
@@ -191,40 +229,80 @@ class GaussianSplatting(Model):
         receiver: int,
         directions: Directions | None,
     ) -> list[tuple]:
-        """The rasterizer's arguments: the Gaussians as some queries excite them, on the receiver's plane.
+        """A map rasterizer's arguments: the Gaussians as some queries excite them, on the receiver's plane.
 
         One call does for all where the Gaussians stand still, else there is one for each query.
         """
-        if not len(placed.means):  # nobody asks: where Gaussians stand that follow the query does not matter
-            placed = Placed(self.gaussians.means[None])
-        if len(placed.means) > 1:
-            return [
-                self._call(Placed(placed.means[i : i + 1]), residuals, which[k : k + 1], receiver, directions)
-                for k, i in enumerate(which.tolist())
-            ]
-        return [self._call(placed, residuals, which, receiver, directions)]
-
-    def _call(self, placed, residuals, which, receiver, directions) -> tuple:
-        gaussians, b = self.gaussians, len(which)
-        residuals = Residuals(*(None if values is None else values[which] for values in residuals))
-        signal, opacities = gaussians.signal, gaussians.opacities
-        if residuals.delta_signal is not None:
-            signal = signal + residuals.delta_signal
-        if residuals.delta_opacities is not None:
-            opacities = (opacities + residuals.delta_opacities).clamp(0, 1)
-        splats = self._splats(placed, residuals, receiver)
         if self.pooling.grid is not None or directions is None:
             directions = self.pooling.grid or self.scene.task.directions
-        plane = self.projection.plane(directions.to(signal.device).to(signal.dtype))
-        signal = SH_DC * signal.squeeze(-1)
-        return splats, signal.expand(b, -1, -1), opacities.expand(b, -1), residuals.attenuations, plane
+        plane = self.projection.plane(directions.to(placed.means.device).to(placed.means.dtype))
+        # Where nobody asks, it does not matter where Gaussians stand that follow the query.
+        rows = [which] if len(placed.means) == 1 or not len(which) else which.split(1)
+        calls = []
+        for row in rows:
+            if not len(placed.means):
+                n = placed.means.shape[1]
+                placed = placed._replace(means=placed.means.new_zeros(1, n, 3), scales=placed.means.new_ones(1, n, 3))
+            stands = placed.means if len(placed.means) == 1 else placed.means[row]
+            splats = self._splats(placed, residuals, stands, row, receiver)
+            signal, opacities, attenuations = self._strengths(placed, residuals, row)
+            calls.append((splats, signal, opacities, attenuations, plane))
+        return calls
 
-    def _splats(self, placed: Placed, residuals: Residuals, receiver: int) -> Splats:
-        gaussians = self.gaussians
-        quats, scales = gaussians.unit_quats[None], gaussians.scales[None]
+    def _sum(
+        self, placed: Placed, residuals: Residuals, which: Int[Tensor, "b"], receiver: int, query: Query
+    ) -> Tensor:
+        """What the receiver's elements hear, summed without a map."""
+        stands = placed.means.expand(len(which), -1, -1) if len(placed.means) == 1 else placed.means[which]
+        splats = self._splats(placed, residuals, stands, which, receiver)
+        signal, opacities, _ = self._strengths(placed, residuals, which)
+        amplitudes = torch.complex(signal[..., 0], signal[..., 1]) * opacities
+        n = amplitudes.shape[1]
+        lengths = amplitudes.real.new_zeros(len(which), n) if placed.lengths is None else placed.lengths[which]
+        array, frequencies = self.scene.receivers[receiver].array, self._carriers(query)
+        if self.pooling.takes == "fields":
+            offsets = self.scene.task.frequencies.to(frequencies)[None] - frequencies[:, None]
+            return self.rasterizer.fields(splats, amplitudes, lengths, array, frequencies, offsets)
+        coherences = lengths.new_ones(n) if placed.coherences is None else placed.coherences
+        return self.rasterizer.lags(splats, amplitudes, lengths, coherences, placed.bandwidth, array, frequencies)
+
+    def _carriers(self, query: Query) -> Float[Tensor, "b"]:
+        """The links' frequencies [Hz]; single antennas hear powers alike at any, so they need none."""
+        is_known = query.frequencies is not None or len(self.scene.frequencies) or self.scene.task.dtype.is_complex
+        if not is_known and all(len(receiver.array) == 1 for receiver in self.scene.receivers):
+            return query.transmitters.new_ones(len(query))
+        return carriers(self.scene, query)
+
+    def _strengths(self, placed: Placed, residuals: Residuals, which: Int[Tensor, "b"]) -> tuple:
+        """Signal (b, n, c), opacities (b, n) and attenuations of some queries."""
+        signal, opacities = placed.signal, placed.opacities
+        if residuals.delta_signal is not None:
+            signal = signal + residuals.delta_signal[which]
+        if residuals.delta_opacities is not None:
+            opacities = (opacities + residuals.delta_opacities[which]).clamp(0, 1)
+        attenuations = None if residuals.attenuations is None else residuals.attenuations[which]
+        signal = signal.squeeze(-1)
+        if placed.gains is None:
+            signal = SH_DC * signal
+        elif signal.shape[-1] == 1:
+            signal = signal * placed.gains[which].abs()[..., None]
+        else:
+            signal = torch.view_as_real(
+                torch.complex(*signal.expand(len(which), -1, -1).unbind(-1)) * placed.gains[which]
+            )
+        return signal.expand(len(which), -1, -1), opacities.expand(len(which), -1), attenuations
+
+    def _splats(
+        self, placed: Placed, residuals: Residuals, means: Tensor, which: Int[Tensor, "b"], receiver: int
+    ) -> Splats:
+        """Some queries' Gaussians on the receiver's plane."""
+        quats, scales = placed.quats[None], placed.scales
+        if len(scales) > 1:
+            scales = scales[which]
         if residuals.delta_quats is not None:
-            quats = quats + residuals.delta_quats
+            quats = quats + residuals.delta_quats[which]
         if residuals.delta_scales is not None:
-            scales = scales + residuals.delta_scales
-        pose = self.scene.receivers[receiver].pose
-        return self.projection.project(placed.means[0], covariances(quats, scales), pose)
+            scales = scales + residuals.delta_scales[which]
+        return self.projection.project(
+            means if not self.draws_map else means[0], covariances(quats, scales), self.scene.receivers[receiver].pose
+        )

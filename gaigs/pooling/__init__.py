@@ -3,11 +3,11 @@
 import math
 from abc import ABC, abstractmethod
 
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.directions import Grid
+from gaigs.directions import Directions, Grid
 from gaigs.query import Query
 
 
@@ -19,23 +19,39 @@ class Pooling(nn.Module, ABC):
         grid: Directions of the map that it sums over; None where a label has a value for each direction, and the map is
             rendered in those asked for.
         zone: Lowest and highest elevation from which anything is heard, where it has a grid of its own [rad].
+        takes: What it takes of a rasterizer without pixels: ``lags`` or ``fields`` of ``aperture``; None: it takes maps
+            alone.
     """
 
     channels: int
     grid: Grid | None = None
     zone: tuple[float, float] = (-math.pi / 2, math.pi / 2)
+    takes: str | None = None
 
     def fit(self, links: Links) -> None:
         """Takes what can be computed from the training links at once; by default nothing."""
 
     @abstractmethod
-    def forward(self, image: Float[Tensor, "b c rows columns"], query: Query) -> Tensor:
+    def forward(
+        self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
+    ) -> Tensor:
         """What the receiver reports of each map (b, ...).
 
         Args:
             image: Maps.
             query: The link of each map; all to one receiver.
+            directions: Those asked for, where the label has one value for each and the map a grid of its own; None: all
+                of the task's.
         """
+
+    def hear(self, heard: Complex[Tensor, "b ..."], query: Query, directions: Directions | None = None) -> Tensor:
+        """What the receiver reports of what ``aperture`` gives it, as ``takes`` says.
+
+        Args:
+            heard: Lags (b, l) or fields (b, e, s).
+            query, directions: As for ``forward``.
+        """
+        raise NotImplementedError
 
 
 def sphere(option: str, shape: list[int]) -> Grid:

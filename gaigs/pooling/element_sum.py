@@ -8,6 +8,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.data import Links
+from gaigs.directions import Directions
 from gaigs.pooling import Pooling, sphere
 from gaigs.propagation import array_sign, check_elements, direct_waves, phase_sign
 from gaigs.query import Query
@@ -36,6 +37,8 @@ class ElementSum(Pooling):
         ValueError: The labels are no channels, or an array has another number of elements than they.
     """
 
+    takes = "fields"
+
     def __init__(self, scene: Scene, grid: list[int]):
         super().__init__()
         check_elements("pooling 'element_sum'", scene)
@@ -59,7 +62,9 @@ class ElementSum(Pooling):
         self.sign.fill_(phase_sign(labels, waves, query.receivers))
         self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))
 
-    def forward(self, image: Float[Tensor, "b c rows columns"], query: Query) -> Complex[Tensor, "b e s"]:
+    def forward(
+        self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
+    ) -> Complex[Tensor, "b e s"]:
         """Channels at the elements of the receiver of these links."""
         if not len(query):
             return torch.zeros(0, *self.scene.task.shape, dtype=image.dtype.to_complex(), device=image.device)
@@ -70,6 +75,16 @@ class ElementSum(Pooling):
         frequencies = self.scene.task.frequencies
         direct = direct_waves(self.scene, query, frequencies, int(self.sign), at_elements=False)
         return channels * (self.strength.double() * direct).to(waves)
+
+    def hear(
+        self, heard: Complex[Tensor, "b e s"], query: Query, directions: Directions | None = None
+    ) -> Complex[Tensor, "b e s"]:
+        """Channels of fields over the unit of 1 / distance; free space has lambda / (4 pi) of it."""
+        frequencies = self.scene.task.frequencies.to(heard.real)
+        value = heard * (self.strength.to(frequencies) * speed_of_light / (4 * math.pi * frequencies))
+        if self.sign == 0:  # phases are told between elements and subcarriers alone: the direct path's are taken off
+            value = value * direct_waves(self.scene, query, frequencies, 1, at_elements=False).sgn().to(value)
+        return value.conj() if self.array_sign > 0 else value
 
     def _steering(self, receiver: int, sign: int) -> Complex[Tensor, "s p e"]:
         """What a wave from each direction of the map adds at each element, float64."""

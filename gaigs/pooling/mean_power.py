@@ -1,9 +1,10 @@
 """RSSI by physics: the power that arrives from all directions together."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
+from gaigs.directions import Directions
 from gaigs.pooling import Pooling, sphere
 from gaigs.query import Query
 from gaigs.registry import register
@@ -25,6 +26,8 @@ class MeanPower(Pooling):
         ValueError: An option is out of range.
     """
 
+    takes = "lags"
+
     def __init__(self, grid: list[int], channels: int, floor_db: float):
         super().__init__()
         if channels not in (1, 2):
@@ -36,7 +39,9 @@ class MeanPower(Pooling):
         self.grid = sphere("pooling.grid", grid)
         self.register_buffer("weights", self.grid.solid_angles, persistent=False)
 
-    def forward(self, image: Float[Tensor, "b c rows columns"], query: Query) -> Float[Tensor, "b"]:
+    def forward(
+        self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
+    ) -> Float[Tensor, "b"]:
         """Level relative to the model's trend [dB]; float32 where the map is of half precision.
 
         Raises:
@@ -52,3 +57,10 @@ class MeanPower(Pooling):
         largest = image.detach().abs().amax((1, 2, 3)).clamp(min=self.floor)
         power = (image / largest[:, None, None, None]).square().sum(1).mul(self.weights).sum((1, 2))
         return 20 * largest.log10() + 10 * (power + (self.floor / largest).square()).log10()
+
+    def hear(
+        self, heard: Complex[Tensor, "b l"], query: Query, directions: Directions | None = None
+    ) -> Float[Tensor, "b"]:
+        """Level of the power at an element, lag 0, relative to the model's trend [dB]."""
+        power = heard[:, heard.shape[1] // 2].real
+        return 10 * (power + self.floor**2).log10()

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gaigs.directions import Directions
 from gaigs.pooling import Pooling
 from gaigs.query import Query
 from gaigs.registry import register
@@ -23,6 +24,8 @@ class Spectrum(Pooling):
             raise ValueError(f"pooling 'spectrum' renders 1 real or 2 complex channels, got channels={channels}")
         self.channels = channels
 
-    def forward(self, image: Float[Tensor, "b c rows columns"], query: Query) -> Float[Tensor, "b rows columns"]:
+    def forward(
+        self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
+    ) -> Float[Tensor, "b rows columns"]:
         """The predicted spectrum; where the map is 0, so is its gradient."""
         return image[:, 0].abs() if self.channels == 1 else torch.complex(*image.unbind(1)).abs()

@@ -20,16 +20,16 @@ class Splats:
     """Gaussians on the perception plane of one receiver.
 
     Attributes:
-        means2d: Centres (n, 2) as (u, v); they do not depend on the transmitter.
+        means2d: Centres (n, 2) as (u, v); (b, n, 2) where they follow the transmitter, which ``aperture`` alone takes.
         covariances2d: (1 or b, n, 2, 2); one for all transmitters where nothing deforms the Gaussians.
-        depths: Distance to the receiver (n,) [m].
-        visible: False where a Gaussian has no direction (it sits on the receiver) (n,).
+        depths: Distance to the receiver, as many as centres [m].
+        visible: False where a Gaussian has no direction (it sits on the receiver), as many as centres.
     """
 
-    means2d: Float[Tensor, "n 2"]
+    means2d: Float[Tensor, "*b n 2"]
     covariances2d: Float[Tensor, "b n 2 2"]
-    depths: Float[Tensor, "n"]
-    visible: Bool[Tensor, "n"]
+    depths: Float[Tensor, "*b n"]
+    visible: Bool[Tensor, "*b n"]
 
 
 @dataclass(frozen=True)
@@ -91,11 +91,11 @@ class Projection(ABC):
         u, v = self.coordinates(vectors if vectors.ndim == 3 else vectors[None]).unbind(-1)
         return Plane(u, v, self.period)
 
-    def project(self, means: Float[Tensor, "n 3"], covariances: Float[Tensor, "b n 3 3"], receiver: Pose) -> Splats:
+    def project(self, means: Float[Tensor, "*b n 3"], covariances: Float[Tensor, "b n 3 3"], receiver: Pose) -> Splats:
         """Gaussians as the receiver sees them.
 
         Args:
-            means: Centres, world frame [m].
+            means: Centres, world frame [m]; one set, or one a transmitter.
             covariances: World frame [m²]; one set (b = 1), or one a transmitter.
             receiver: Position [m] and orientation of the antenna array.
         """
@@ -104,7 +104,7 @@ class Projection(ABC):
         depths = points.norm(dim=-1)
         visible = ~(depths < NEAR)  # a centre that is NaN is no reason to hide it
         # A Gaussian on the receiver has no direction: a stand-in keeps values and gradients finite, `visible` hides it.
-        points = torch.where(visible[:, None], points, points.new_tensor([1.0, 0.0, 0.0]))
+        points = torch.where(visible[..., None], points, points.new_tensor([1.0, 0.0, 0.0]))
         half = self.jacobian(points) @ receiver.rotation.mT
         pixel = self.pixel_variance * torch.eye(2, dtype=means.dtype, device=means.device)
         return Splats(self.coordinates(points), half @ covariances @ half.mT + pixel, depths, visible)

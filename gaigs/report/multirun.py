@@ -132,6 +132,8 @@ def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
             row |= {"status": "done", "model": row["model"] or own} | {key: metrics[key] for key in facts}
             row |= scores | {key: metrics.get(key) for key in COSTS}
             for model, scores in others:
+                if model == f"{own}_trend":  # the run's own model without its kriging
+                    continue
                 baseline = {"status": "baseline", "model": model} | scores
                 if "split" in facts:
                     baseline["split"] = metrics["split"]

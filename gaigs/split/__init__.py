@@ -78,6 +78,30 @@ def hold_out(
     return links[~held], links[held]
 
 
+def folds(links: Links, count: int, seed: int) -> list[Split]:
+    """Parts the training links into folds of random whole rows; each split tests on one of them.
+
+    Args:
+        links: With a split, whose validation links all splits keep.
+        count: Of folds.
+        seed: Of the order.
+
+    Raises:
+        ValueError: There are fewer rows than folds.
+    """
+    split = links.split
+    present, row = torch.unique(rows_of(links)[split.train], return_inverse=True)
+    if len(present) < count:
+        raise ValueError(f"{count} folds take as many rows of training links or more, got {len(present)}")
+    fold = (torch.randperm(len(present), generator=torch.Generator().manual_seed(seed)) % count)[row]
+    return [
+        Split(
+            f"{split.name}, fold {i + 1} of {count}", split.train[fold != i], split.validation, split.train[fold == i]
+        )
+        for i in range(count)
+    ]
+
+
 def check_fractions(test: float, validation: float) -> None:
     """Sees to it that both are in range.
 

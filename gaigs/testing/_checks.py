@@ -62,7 +62,7 @@ def require_gradients(outputs: Sequence[Tensor], leaves: dict[str, Tensor]) -> N
 def fixed_sum(values: Tensor) -> Tensor:
     """A real sum with weights that differ but are always the same, so that no two gradients cancel."""
     if values.is_complex():
-        values = torch.view_as_real(values)
+        values = torch.view_as_real(values.resolve_conj())
     weights = torch.arange(values.numel(), device=values.device).cos().to(values)
     return (values.flatten() * weights).sum()
 

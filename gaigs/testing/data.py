@@ -9,6 +9,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.data import Links, Parts, Split
+from gaigs.data.nerf2_spectrum import NORMALISATION
 from gaigs.directions import Grid
 from gaigs.geometry import Pose
 from gaigs.query import Query
@@ -27,13 +28,19 @@ CARRIER = 2.44e9
 """Of the made-up channels [Hz]."""
 
 
-def example_links(task: str = "spectrum") -> Links:
+BANDWIDTH = 5e8
+"""Of the made-up spectra and levels whose carrier is known [Hz]."""
+
+
+def example_links(task: str = "spectrum", carrier: float | None = None) -> Links:
     """A made-up data set: 24 links to two turned receivers.
 
     Args:
         task: ``spectrum``: random spectra of 18 x 36 pixels, each of another place. ``rssi``: random levels of 12
             places that both receivers hear. ``csi``: channels of 12 such places at 4 elements and 5 subcarriers, the
             direct wave and noise.
+        carrier: Of all links, whose bandwidth is then known too, and the array that spectra come from: 3 x 3 patches
+            half its wavelength apart [Hz]. None: unknown.
 
     Raises:
         ValueError: There is no such task here.
@@ -46,7 +53,9 @@ def example_links(task: str = "spectrum") -> Links:
     match task:
         case "spectrum":
             grid = Grid.degrees(range(4, 90, 5), range(0, 360, 10))
-            made = Spectrum(grid.elevations, grid.azimuths, "none")
+            made = Spectrum(grid.elevations, grid.azimuths, "none" if carrier is None else NORMALISATION)
+            if carrier is not None:
+                array = Array.planar(3, 3, speed_of_light / carrier / 2, "cosine")
             labels, rows = torch.rand(24, *grid.shape, generator=generator), None
         case "rssi":
             made, places = Rssi(), places[:12].repeat_interleave(2, 0)
@@ -60,13 +69,14 @@ def example_links(task: str = "spectrum") -> Links:
         case _:
             raise ValueError(f"task must be spectrum, rssi or csi, got {task!r}")
     return Links(
-        query=Query(places, heard_by),
+        query=Query(places, heard_by, None if carrier is None else torch.full((24,), carrier)),
         receivers=tuple(Receiver(f"gateway{i}", pose, array) for i, pose in enumerate(POSES)),
         labels=labels,
         task=made,
         rows=rows,
         official=lambda: torch.arange(24).split((20, 4)),
         split=Split("example", *torch.arange(24).split((16, 4, 4))),
+        bandwidth=None if carrier is None else BANDWIDTH,
     )
 
 
@@ -93,6 +103,9 @@ def check_data(links: Links) -> None:
         require(bool(turn.det() > 0), f"the rotation of {receiver.name} must not mirror")
         require_tensor(f"the elements of {receiver.name}", elements, (len(elements), 3), elements.dtype)
         require(elements.dtype.is_floating_point, f"the elements of {receiver.name} must be floats [m]")
+    width = links.bandwidth
+    known = width is None or 0 <= width < math.inf
+    require(known, f"bandwidth must be 0 or more [Hz], or None where it is unknown, got {width}")
     names = [receiver.name for receiver in links.receivers]
     require(len({*names}) == len(names), "receivers must have different names")
     require_tensor("edges", links.edges, (len(links.edges), 2, 3), torch.float32)

@@ -1,18 +1,19 @@
 """The check of kind ``pooling``."""
 
 import copy
+import functools
 import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.directions import Grid
+from gaigs.directions import Directions, Grid
 from gaigs.pooling import Pooling
 from gaigs.query import Query
-from gaigs.scene import Scene
+from gaigs.scene import Array, Scene
 from gaigs.testing._checks import PRECISION, require, require_close, require_gradients, require_tensor
 
 
@@ -20,8 +21,9 @@ def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch
     """A pooling: the task's value for each map, gradients finite even where the map is 0, independence of the batch.
 
     It is fitted to the links, and its twin has the same state. One that has no grid of its own is given maps over the
-    label's directions and over a list of some of them. One that gives a real number a link must also take maps that are
-    constant, span 12 decades or are of half precision.
+    label's directions and over a list of some of them, any other is asked for these. One that gives a real number a
+    link must also take maps that are constant, span 12 decades or are of half precision. One that takes lags or fields
+    is given some, and silence.
 
     Args:
         build: Makes the pooling for a scene.
@@ -63,8 +65,58 @@ def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch
             require_tensor("the value of a list of rays", single, (b, *row.shape[2:]), wanted, device)
             rule = "a list of rays must have the values of their pixels"
             require_close(single[:, 0], value.flatten(1)[:, ::3], PRECISION[dtype], rule)
+        else:
+            _check_directions(functools.partial(module, image, query), links, value)
+        _check_hearing(module, other, links, query, dtype)
         if task.shape == () and not task.dtype.is_complex:
             _check_hard_maps(module, image.detach(), query)
+
+
+def _check_directions(give: Callable[[Directions], Tensor], links: Links, whole: Tensor) -> None:
+    """Some of the label's directions have their values in the whole."""
+    if links.task.directions is None:
+        return
+    rays = links.task.directions.flatten()[1::3].to(whole.device)
+    rule = "fewer directions must get the same values"
+    require_close(give(rays), whole.flatten(1)[:, 1::3], PRECISION[whole.dtype], rule)
+
+
+def _check_hearing(module: Pooling, twin: Pooling, links: Links, query: Query, dtype: torch.dtype) -> None:
+    """What it makes of lags or fields, if it takes them."""
+    require(module.takes in (None, "lags", "fields"), f"takes must be lags, fields or None, got {module.takes!r}")
+    if module.takes is None:
+        return
+    task, array = links.task, links.receivers[int(query.receivers[0])].array
+    heard = example_fields(module.takes, array, query, task.shape[-1:] or (1,), dtype).requires_grad_()
+    value = module.hear(heard, query)
+    wanted = dtype.to_complex() if task.dtype.is_complex else dtype
+    require_tensor(f"the value of {module.takes}", value, (len(query), *task.shape), wanted, heard.device)
+    require(torch.equal(value, module.hear(heard, query)), "what is heard twice must have the same value")
+    require(torch.equal(value, twin.hear(heard, query)), "all that it takes in fit must be in the state dict")
+    alone = module.hear(heard[-1:], query[-1:])
+    require_close(alone, value[-1:], PRECISION[dtype], "a value must not depend on what others hear")
+    require_gradients([value], {**dict(module.named_parameters()), module.takes: heard})
+    silence = torch.zeros_like(heard).requires_grad_()
+    quiet = module.hear(silence, query)
+    require(bool(quiet.isfinite().all()), "the value of silence must be finite")
+    require_gradients([quiet], {"silence": silence})
+    none = module.hear(heard[:0], query[:0])
+    require(tuple(none.shape) == (0, *task.shape), f"no {module.takes} must give no values, got {tuple(none.shape)}")
+    _check_directions(functools.partial(module.hear, heard, query), links, value)
+
+
+def example_fields(
+    takes: str, array: Array, query: Query, subcarriers: tuple[int, ...], dtype: torch.dtype
+) -> Complex[Tensor, "b ..."]:
+    """Random fields of an array's elements, or their covariance at the array's lags, as ``aperture`` gives them."""
+    generator = torch.Generator().manual_seed(1)
+    shape = len(query), len(array), *subcarriers
+    fields = torch.randn(*shape, dtype=torch.complex128, generator=generator)
+    if takes == "lags":
+        covariances = (fields @ fields.mH).flatten(1) / shape[-1]
+        _, pairs, counts = array.lags
+        fields = covariances.new_zeros(len(query), len(counts)).index_add(1, pairs, covariances) / counts
+    return fields.to(query.transmitters.device, dtype.to_complex())
 
 
 def _check_grid(pooling: Pooling) -> None:

@@ -15,6 +15,12 @@ from gaigs.registry import call, check_type, register
 from gaigs.training import MeanScores, seeded
 from gaigs.training.schedule import make_optimizer, make_schedule
 
+RATES = {*Gaussians.PARAMETERS, "network", "planes", "paths", "obstacles"}
+"""Groups of parameters of the splatting pipeline: rates of those that a configuration leaves out may stay."""
+
+PENALTIES = {"opacity", "obstacles"}
+"""Its penalties: likewise their weights."""
+
 
 @register("training", "descent")
 class Descent(lightning.LightningModule):
@@ -104,8 +110,7 @@ class Descent(lightning.LightningModule):
         """The loss with its penalties, checked and logged."""
         links, places = batch.shares
         total = links * loss
-        default = {"opacity"}  # which not all models have
-        if unknown := self.penalties.keys() - penalties.keys() - default:
+        if unknown := self.penalties.keys() - penalties.keys() - PENALTIES:
             raise ValueError(f"training.penalties has {', '.join(sorted(unknown))}, and the model has no such penalty")
         for name, penalty in penalties.items():
             if name not in self.penalties:
@@ -155,7 +160,7 @@ def check_rates(model: Model, rates: dict[str, float]) -> None:
     groups = set(model.parameter_groups())
     if unset := groups - set(rates):
         raise ValueError(f"training.learning_rates must give a rate for {', '.join(sorted(unset))}")
-    if unknown := set(rates) - groups - {*Gaussians.PARAMETERS, "network"}:
+    if unknown := set(rates) - groups - RATES:
         raise ValueError(
             f"training.learning_rates has {', '.join(sorted(unknown))}, and the model's groups are "
             f"{', '.join(sorted(groups))}"

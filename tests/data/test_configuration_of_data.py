@@ -17,6 +17,9 @@ CHOICES = {
     "synthetic": ("spectrum", "official, validation 0.1, seed 0"),
     "synthetic_rssi": ("rssi", "official, validation 0.1, seed 0"),
     "synthetic_csi": ("csi", "official, validation 0.1, seed 0"),
+    "sionna": ("spectrum", "official, validation 0.1, seed 0"),
+    "sionna_rssi": ("rssi", "official, validation 0.1, seed 0"),
+    "sionna_csi": ("csi", "official, validation 0.1, seed 0"),
 }
 """Task, and name of the split, that each chooses."""
 

@@ -11,7 +11,6 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from gaigs.data.synthetic.image_source import (
-    MATERIALS,
     Box,
     Room,
     bartlett,
@@ -19,13 +18,13 @@ from gaigs.data.synthetic.image_source import (
     min_max,
     passes,
     permittivity,
-    reflection,
     respond,
     rss_dbm,
     trace,
 )
 from gaigs.directions import Grid
 from gaigs.geometry import Pose, from_spherical
+from gaigs.propagation import fresnel
 from gaigs.scene import Array, Receiver
 
 FREQUENCY = 3e9
@@ -231,7 +230,7 @@ def test_gains_are_those_of_the_reflection_points():
                 assert stop[axis] == pytest.approx(side * size[axis], abs=1e-9)
                 cosine = abs(before[axis]) / np.linalg.norm(before)
                 assert cosine == pytest.approx(abs(after[axis]) / np.linalg.norm(after))
-                te, tm = reflection(permittivity(WALLS[2 * axis + side], FREQUENCY), torch.tensor([cosine]))
+                te, tm = fresnel(permittivity(WALLS[2 * axis + side], FREQUENCY), torch.tensor([cosine]))
                 expected = expected * (tm if axis == 2 else te).item()
             assert gain.item() == pytest.approx(expected, rel=1e-9)
 
@@ -329,29 +328,6 @@ def test_turning_room_receiver_and_transmitters_changes_nothing():
     # The receiver left behind sees something else.
     other = spectra(turned, move(TRANSMITTERS), Pose(second.position, first.rotation))
     assert (here - other).abs().max() > 0.1 * here.max()
-
-
-@pytest.mark.parametrize("material", MATERIALS)
-def test_reflection_is_passive_and_total_at_grazing(material):
-    te, tm = reflection(permittivity(material, 5e9), torch.linspace(0, 1, 200, dtype=torch.float64))
-    assert te.abs().max() <= 1
-    assert tm.abs().max() <= 1
-    assert te[0].item() == pytest.approx(-1)
-    assert tm[0].item() == pytest.approx(-1)
-    torch.testing.assert_close(te[-1], -tm[-1])
-
-
-def test_reflection_of_glass_like_and_metal_surfaces():
-    epsilon = 4.0
-    straight = torch.ones(1, dtype=torch.float64)
-    te, _ = reflection(complex(epsilon), straight)
-    assert te.item() == pytest.approx(-1 / 3)  # (1 - n) / (1 + n) with n = 2
-    brewster = math.atan(2.0)
-    _, tm = reflection(complex(epsilon), straight * math.cos(brewster))
-    assert abs(tm.item()) < 1e-12
-    te, tm = reflection(permittivity("metal", 5e9), straight * 0.5)
-    assert te.item() == pytest.approx(-1, abs=1e-3)
-    assert tm.item() == pytest.approx(1, abs=1e-2)
 
 
 def test_permittivity_is_that_of_the_recommendation():

@@ -9,8 +9,9 @@ from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
 from gaigs.data import Split
-from gaigs.model import gaussian_process
-from gaigs.model.gaussian_process import FEWEST, NOISE, GaussianProcess
+from gaigs.model import _process, gaussian_process
+from gaigs.model._process import FEWEST, NOISE, hold_out, misfit
+from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.task.csi import Csi
@@ -36,6 +37,12 @@ def make(task="rssi", count=80, carriers=(), seed=0):
         rows=None,
         split=Split("made up", train, validation, test),
     )
+
+
+def held_out(links, receiver, model):
+    """Links to choose hyperparameters by, where there is one carrier."""
+    residuals = lambda index: torch.cat([part.reshape(len(part), -1) for _, part in model._residuals(index)])
+    return hold_out(links.scene, links, model.known, receiver, None, residuals, 150)
 
 
 def fitted(links, **options):
@@ -68,9 +75,9 @@ def kriged(model, links, receiver, asked, nearest=None):
     values = []
     for place in asked.double().numpy():
         chosen = np.argsort(np.linalg.norm(positions - place, axis=1))[:nearest]
-        covariances = np.exp(-cdist(positions[chosen], positions[chosen]) / model.length)
-        towards = np.exp(-np.linalg.norm(positions[chosen] - place, axis=1) / model.length)
-        weights = np.linalg.solve(covariances + model.noise * np.eye(len(chosen)), towards)
+        covariances = np.exp(-cdist(positions[chosen], positions[chosen]) / model.process.length)
+        towards = np.exp(-np.linalg.norm(positions[chosen] - place, axis=1) / model.process.length)
+        weights = np.linalg.solve(covariances + model.process.noise * np.eye(len(chosen)), towards)
         values.append(mean + np.tensordot(weights, labels[chosen] - mean, 1))
     return np.stack(values)
 
@@ -163,7 +170,7 @@ def test_places_measured_twice_do_not_break_the_matrices(task):
     positions = links.query.transmitters
     positions[4:40] = positions[:4].repeat(9, 1)
     model = fitted(links)
-    model.noise = NOISE[0]
+    model.process = model.process._replace(noise=NOISE[0])
     model.solved = [model._solve(index) for index in model.known]
     found, expected = model.predict(positions[:2], 0), kriged(model, links, 0, positions[:2])
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
@@ -187,7 +194,7 @@ def test_predictions_do_not_depend_on_the_order_of_the_links():
 @pytest.mark.parametrize("validation", [True, False])
 @pytest.mark.parametrize(("length", "noise"), [(0.5, 0.01), (2.0, 0.1), (1.0, 1.0)])
 def test_length_and_noise_are_those_of_the_process(length, noise, validation, monkeypatch):
-    monkeypatch.setattr(gaussian_process, "AROUND", 24)
+    monkeypatch.setattr(_process, "AROUND", 24)
     links = drawn(length, noise)
     if not validation:
         split = links.split
@@ -195,15 +202,15 @@ def test_length_and_noise_are_those_of_the_process(length, noise, validation, mo
     model = fitted(links)
     # Validation links are few.
     tolerance = 0.5 if validation else 0.3
-    assert model.length == pytest.approx(length, rel=tolerance)
-    assert model.noise == pytest.approx(noise, rel=tolerance, abs=0.02)
-    assert model.facts() == {"length_m": model.length, "noise_to_signal": model.noise}
+    assert model.process.length == pytest.approx(length, rel=tolerance)
+    assert model.process.noise == pytest.approx(noise, rel=tolerance, abs=0.02)
+    assert model.facts() == {"length_m": model.process.length, "noise_to_signal": model.process.noise}
 
 
 def test_the_misfit_is_the_density_of_held_out_labels_given_those_around():
     links = make("rssi", 60)
     model = fitted(links)
-    held = model._hold_out(0, None)
+    held = held_out(links, 0, model)
     residuals = links.labels - links.labels[model.known[0]].mean()
     validation = links.split.train[links.query.receivers[links.split.train] == 0]  # fewer than FEWEST validate
     assert torch.equal(held.asked.transmitters, links.query.transmitters[validation])
@@ -225,7 +232,7 @@ def test_the_misfit_is_the_density_of_held_out_labels_given_those_around():
         - multivariate_normal(np.zeros(len(label) - 1), variance * covariances[1:, 1:]).logpdf(label[1:])
         for covariances, label in conditionals
     )
-    found = model._misfit(held, torch.tensor(length), torch.tensor(noise)).item()
+    found = misfit(links.scene, held, torch.tensor(length), torch.tensor(noise)).item()
     assert found == pytest.approx(-2 * total - len(values) * (1 + np.log(2 * np.pi)), rel=1e-6)
 
 
@@ -233,20 +240,20 @@ def test_they_are_the_likeliest_within_their_bounds():
     links = make("spectrum", 100)
     links.labels.add_(links.query.transmitters[:, :1, None].sin())
     model = fitted(links)
-    held = [model._hold_out(receiver, None) for receiver in (0, 1)]
-    misfit = lambda *at: sum(model._misfit(one, *map(torch.tensor, at)).item() for one in held)
-    best = misfit(model.length, model.noise)
+    held = [held_out(links, receiver, model) for receiver in (0, 1)]
+    total = lambda *at: sum(misfit(links.scene, one, *map(torch.tensor, at)).item() for one in held)
+    best = total(model.process.length, model.process.noise)
     edge = (links.scene.upper - links.scene.lower).max().item()
     low, high = (links.scene.spacing, NOISE[0]), (8 * edge, NOISE[1])
     for factors in ((1.2, 1), (1 / 1.2, 1), (1, 1.2), (1, 1 / 1.2), (30, 1), (1 / 30, 1), (1, 30), (1, 1 / 30)):
-        at = np.clip(np.array([model.length, model.noise]) * factors, low, high)
-        assert misfit(*at) >= best - 1e-6, factors
+        at = np.clip(np.array([model.process.length, model.process.noise]) * factors, low, high)
+        assert total(*at) >= best - 1e-6, factors
 
 
 def test_validation_links_are_held_out_from_the_training_links():
     links = make("rssi", 400)
     assert len(links.split.validation) >= FEWEST
-    held = fitted(links)._hold_out(1, None)
+    held = held_out(links, 1, fitted(links))
     heard = lambda part: part[links.query.receivers[part] == 1]
     as_set = lambda places: {tuple(place) for place in places.tolist()}
     places = links.query.transmitters
@@ -256,13 +263,13 @@ def test_validation_links_are_held_out_from_the_training_links():
 
 def test_without_a_validation_copies_of_a_link_do_not_predict_it(monkeypatch):
     """Else noise would pass for signal: every copy has the same noise."""
-    monkeypatch.setattr(gaussian_process, "AROUND", 24)
+    monkeypatch.setattr(_process, "AROUND", 24)
     links = drawn(1.0, 1.0)
     twice = torch.arange(400) % 200
     split = Split("twice", torch.arange(400), torch.arange(0), torch.arange(400, 450))
     query = links.query[torch.cat((twice, torch.arange(200, 250)))]
     labels = links.labels[torch.cat((twice, torch.arange(200, 250)))]
-    assert fitted(replace(links, query=query, labels=labels, split=split)).noise > 0.3
+    assert fitted(replace(links, query=query, labels=labels, split=split)).process.noise > 0.3
 
 
 @TASKS
@@ -272,7 +279,7 @@ def test_labels_that_the_trend_explains_are_predicted_by_it(task):
     model = fitted(links)
     torch.testing.assert_close(model.predict(torch.rand(4, 3)), links.labels[:4], rtol=0, atol=1e-6)
     edge = (links.scene.upper - links.scene.lower).max().item()
-    assert links.scene.spacing < model.length < 8 * edge
+    assert links.scene.spacing < model.process.length < 8 * edge
 
 
 @pytest.mark.parametrize("known", [1, 2])
@@ -294,25 +301,25 @@ def test_the_distance_is_over_place_and_log_frequency():
     links.labels.add_(3 * links.query.frequencies.log() + links.query.transmitters[:, 0])
     model = fitted(links)
     assert model.facts() == {
-        "length_m": model.length,
-        "noise_to_signal": model.noise,
-        "frequency_scale_m": model.scale,
+        "length_m": model.process.length,
+        "noise_to_signal": model.process.noise,
+        "frequency_scale_m": model.process.scale,
     }
     stretched = lambda query: torch.cat(
-        (query.transmitters.double(), model.scale * query.frequencies.double().log()[:, None]), 1
+        (query.transmitters.double(), model.process.scale * query.frequencies.double().log()[:, None]), 1
     )
     index = model.known[0]
     asked = Query(torch.rand(4, 3), torch.zeros(4, dtype=torch.long), torch.tensor([1e9, 1.3e9, 2e9, 5e9]))
     places, towards = stretched(links.query[index]).numpy(), stretched(asked).numpy()
     labels = links.labels[index].double().numpy()
-    covariances = np.exp(-cdist(places, places) / model.length) + model.noise * np.eye(len(index))
-    weights = np.exp(-cdist(towards, places) / model.length) @ np.linalg.inv(covariances)
+    covariances = np.exp(-cdist(places, places) / model.process.length) + model.process.noise * np.eye(len(index))
+    weights = np.exp(-cdist(towards, places) / model.process.length) @ np.linalg.inv(covariances)
     expected = labels.mean() + weights @ (labels - labels.mean())
     np.testing.assert_allclose(model.predict(asked), expected, rtol=0, atol=1e-3)
 
 
 def test_the_scale_of_frequencies_is_that_of_the_process(monkeypatch):
-    monkeypatch.setattr(gaussian_process, "AROUND", 24)
+    monkeypatch.setattr(_process, "AROUND", 24)
     scale, length, noise, count = 3.0, 2.0, 0.05, 250
     links = make("spectrum", count, carriers=(1e9, 1.7e9, 2.9e9, 5e9))
     query = replace(links.query, receivers=torch.zeros(count, dtype=torch.long))
@@ -322,8 +329,8 @@ def test_the_scale_of_frequencies_is_that_of_the_process(monkeypatch):
     split = Split("no validation", torch.arange(200), torch.arange(0), torch.arange(200, count))
     links = replace(links, query=query, receivers=links.receivers[:1], split=split)
     model = fitted(replace(links, labels=torch.from_numpy(draws).float().unflatten(1, (18, 36))))
-    assert model.scale == pytest.approx(scale, rel=0.2)
-    assert model.length == pytest.approx(length, rel=0.2)
+    assert model.process.scale == pytest.approx(scale, rel=0.2)
+    assert model.process.length == pytest.approx(length, rel=0.2)
 
 
 def test_a_missing_frequency_is_refused():

@@ -159,3 +159,49 @@ def test_other_labels_and_arrays_are_refused():
         ElementSum(replace(links, receivers=receivers).scene, [4, 8])
     with pytest.raises(ValueError, match=r"pooling\.grid must be \[rows, columns\], two whole numbers, got \[4\]"):
         ElementSum(links.scene, [4])
+
+
+# --- what the elements hear ---
+
+
+def direct_fields(links, index):
+    """Fields of the direct path at planar elements, over 1 / distance, as plane waves of each subcarrier."""
+    query, array = links.query[index], links.receivers[0].array
+    pose = links.receivers[0].pose
+    local = (query.transmitters.double() - pose.position.double()) @ pose.rotation.double()
+    lengths = local.norm(dim=1)
+    ways = lengths[:, None] - local / lengths[:, None] @ array.elements.double().T
+    phases = -2 * math.pi / speed_of_light * ways[..., None] * FREQUENCIES
+    return torch.polar(1 / lengths[:, None, None].expand_as(phases), phases)
+
+
+@pytest.mark.parametrize("conjugated", [False, True])
+@pytest.mark.parametrize("random_phases", [False, True])
+@pytest.mark.parametrize("gain", [1.0, 3e4])
+def test_a_single_path_is_heard_as_free_space(conjugated, random_phases, gain):
+    """Links some hundred metres long, on which waves are plane."""
+    links = make(conjugated=conjugated, gain=gain, random_phases=random_phases)
+    pooling = fitted(links)
+    far = replace(links, query=replace(links.query, transmitters=100 * links.query.transmitters + 100))
+    index = (links.query.receivers == 0).nonzero()[:, 0]
+    heard = pooling.hear(direct_fields(far, index), far.query[index])
+    sign = 1 if conjugated else -1
+    expected = gain * direct_waves(far.scene, far.query[index], FREQUENCIES, sign)
+    if random_phases:  # which are told between elements and subcarriers alone
+        expected = expected / direct_waves(far.scene, far.query[index], FREQUENCIES, sign, at_elements=False).sgn()
+    scale = expected.abs().amax((1, 2), keepdim=True)
+    assert ((heard - expected).abs() / scale).max() < 2e-3
+
+
+def test_noise_is_heard_for_what_it_is():
+    """Twice the fields are twice the channels, of which each is that of its element and subcarrier alone."""
+    links = make()
+    pooling = fitted(links)
+    query = links.query[torch.tensor([0, 2])]
+    fields = torch.randn(2, 4, 3, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    channels = pooling.hear(fields, query)
+    torch.testing.assert_close(pooling.hear(2 * fields, query), 2 * channels)
+    assert channels.dtype == torch.complex64
+    ratios = channels / fields
+    friis = speed_of_light / (4 * math.pi * FREQUENCIES)  # of free space, over 1 / distance
+    torch.testing.assert_close(ratios.abs(), friis.float().expand(2, 4, 3), rtol=1e-4, atol=0)

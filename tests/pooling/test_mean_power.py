@@ -149,3 +149,30 @@ def test_its_grid_is_the_sphere_in_equal_pixels():
     assert pooling.zone == (-math.pi / 2, math.pi / 2)
     with pytest.raises(ValueError, match="at least 2 rows and 3 columns, got 1 x 9"):
         mean_power(2, -60, (1, 9))
+
+
+# --- what an element hears ---
+
+
+def hear(pooling, powers):
+    """The level of powers at an array of 3 x 3 elements, whose 25 lags have lag 0 in the middle."""
+    lags = torch.zeros(len(powers), 25, dtype=torch.complex128)
+    lags[:, 12] = torch.tensor(powers, dtype=torch.float64)
+    lags[:, :12] = 1e3  # of which nothing is heard
+    query = Query(torch.zeros(len(powers), 3), torch.zeros(len(powers), dtype=torch.long))
+    return pooling.hear(lags, query)
+
+
+def test_the_power_at_an_element_falls_with_the_square_of_the_distance():
+    near, far = hear(mean_power(2, -300.0), [(1 / 3.0) ** 2, (1 / 6.0) ** 2]).tolist()
+    assert near == pytest.approx(-20 * math.log10(3.0))
+    assert near - far == pytest.approx(6.0206, abs=1e-4)
+
+
+def test_silence_at_an_element_is_at_the_floor():
+    assert hear(mean_power(2, -60.0), [0.0]).tolist() == pytest.approx([-60.0])
+    assert hear(mean_power(2, -60.0), [1e-6]).tolist() == pytest.approx([-60.0 + 10 * math.log10(2)])
+    heard = torch.zeros(1, 1, dtype=torch.complex64, requires_grad=True)
+    level = mean_power(2, -60.0).hear(heard, Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long)))
+    (gradient,) = torch.autograd.grad(level.sum(), heard)
+    assert gradient.isfinite().all()

@@ -52,6 +52,25 @@ def test_a_gaussian_peaks_at_the_pixel_of_its_direction_in_the_receivers_frame(k
 
 
 @every
+@pytest.mark.parametrize("sets", [1, 3])
+def test_gaussians_that_stand_elsewhere_for_each_transmitter_are_projected_one_by_one(kind, sets):
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(3, 5, 3, generator=generator)
+    means[1, 2] = 0  # on the receiver
+    half = torch.randn(sets, 5, 3, 3, generator=generator)
+    covariances = half @ half.mT
+    together = kind(PIXEL).project(means, covariances, HERE)
+    assert not together.visible[1, 2]
+    assert together.visible.sum() == 14
+    for k in range(3):
+        alone = kind(PIXEL).project(means[k], covariances[k % sets][None], HERE)
+        torch.testing.assert_close(together.means2d[k], alone.means2d)
+        torch.testing.assert_close(together.covariances2d[k], alone.covariances2d[0])
+        torch.testing.assert_close(together.depths[k], alone.depths)
+        assert torch.equal(together.visible[k], alone.visible)
+
+
+@every
 @pytest.mark.parametrize("place", [(0, 10), (60, 0), (-130, 45), (179, 70), (20, -30)])
 def test_footprints_are_the_covariances_of_projected_samples(kind, place):
     generator = torch.Generator().manual_seed(0)

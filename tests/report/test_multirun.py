@@ -313,3 +313,15 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "[ga]" in printed
     assert "unfinished" in printed
+
+
+def test_a_run_without_its_kriging_is_no_baseline(tmp_path):
+    models = scores(0.9)
+    models = {"gaigs": models["gaigs"], "gaigs_trend": {"ssim_median": 0.8, "mae": 0.2}} | models
+    write_run(tmp_path, "0", ["kriging=true"], models=models)
+    rows, _ = ablation(read_runs(tmp_path))
+    assert [(row["status"], row["model"]) for row in rows] == [
+        ("done", "gaigs"),
+        ("baseline", "mean"),
+        ("baseline", "knn"),
+    ]

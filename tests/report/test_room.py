@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
+from scipy.integrate import quad
 
 from gaigs.geometry import covariances
-from gaigs.report.room import DRAWN, Cloud, room
+from gaigs.report.room import DRAWN, Cloud, paths, room
+from gaigs.report.shapes import LearntRoom, Matter, Path, Plane
 
 
 @pytest.fixture
@@ -61,3 +64,136 @@ def test_room_draws_the_axes_of_arrays_as_seen_from_above_and_aside():
     assert arrows["z"][0] < 0 == arrows["z"][1]
     assert {text.get_text() for text in side.texts} == {"y", "z"}
     assert not room(point + 4, point, point, rotation[:0], np.zeros((0, 2, 3))).axes[0].texts
+
+
+# --- what was learnt ---
+
+BOX = np.array([6.0, 4.0, 3.0])
+POINT = np.array([[1.0, 1, 1]])
+NO_EDGES = np.zeros((0, 2, 3))
+
+
+def face(number, axis, side, share):
+    """A face of ``BOX``."""
+    others = [k for k in range(3) if k != axis]
+    corners = np.zeros((4, 3))
+    corners[:, axis] = side * BOX[axis]
+    corners[:, others] = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * BOX[others]
+    return Plane(number, corners, (2 * side - 1) * np.eye(3)[axis], share)
+
+
+@pytest.fixture
+def walls():
+    shares = 0.4, 0.1, 0.08, 0.05, 0.02, 0.0002
+    return [face(k, k % 3, float(k < 3), share) for k, share in enumerate(shares)]
+
+
+def drawn(ax, kind):
+    return next(artist for artist in ax.collections if isinstance(artist, kind))
+
+
+def labels(ax):
+    return {text.get_text() for text in ax.texts}
+
+
+def test_planes_are_drawn_edge_on_and_as_wide_as_they_are_strong(walls):
+    plan, side = room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom(walls, None, [])).axes
+    assert labels(plan) == {"0: 40 %", "1: 10 %", "3: 5 %", "4: 2 %"}
+    assert labels(side) == {"0: 40 %", "2: 8 %", "3: 5 %"}  # y points at the reader; the floor carries nothing
+    for ax, up in ((plan, 1), (side, 2)):
+        outlines = drawn(ax, PolyCollection)
+        widths = outlines.get_linewidths()
+        assert [*widths] == sorted(widths, reverse=True)
+        assert widths[0] > 1.5 * widths[1]
+        for path in outlines.get_paths():
+            assert np.ptp(path.vertices, 0).min() == 0  # a line
+        assert ax.get_xlim()[0] < 0 < 6 < ax.get_xlim()[1]
+        assert ax.get_ylim()[0] < 0 < BOX[up] < ax.get_ylim()[1]
+
+
+def test_an_oblique_plane_is_seen_in_both_views():
+    corners = np.array([(0.0, 4, 0), (6, 4, 0), (6, 1, 3), (0, 1, 3)])
+    plane = Plane(7, corners, np.array([0, 1, 1]) / np.sqrt(2), 0.3)
+    for ax, view in zip(
+        room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom([plane], None, [])).axes,
+        ([0, 1], [0, 2]),
+        strict=True,
+    ):
+        (path,) = drawn(ax, PolyCollection).get_paths()
+        np.testing.assert_array_equal(path.vertices[:4], corners[:, view])
+
+
+def test_labels_of_planes_keep_clear_of_each_other(walls):
+    close = [plane._replace(number=plane.number + 6, corners=1.01 * plane.corners) for plane in walls]
+    doubled = [*walls, *close]
+    figure = room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom(doubled, None, []))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    for ax in figure.axes:
+        boxes = [text.get_window_extent(canvas.get_renderer()) for text in ax.texts]
+        assert len(boxes) in (8, 6)
+        overlaps = [(a, b) for i, a in enumerate(boxes) for b in boxes[:i] if a.overlaps(b)]
+        assert not overlaps
+
+
+def test_obstacles_are_shown_by_what_they_take_along_the_line_of_sight(walls, rng):
+    matter = Matter(rng.uniform(1, 3, (3, 3)), rng.uniform(0.2, 0.6, (3, 3)), np.array([5.0, 10.0, 20.0]))
+    figure = room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom(walls, matter, []))
+    plan, side, bar = figure.axes
+    assert bar.get_ylabel() == "loss by obstacles along the line of sight [dB]"
+
+    def density(point):
+        return (matter.densities * np.exp(-(((point - matter.centres) / matter.widths) ** 2).sum(1) / 2)).sum()
+
+    for ax, up, along in ((plan, 1, 2), (side, 2, 1)):
+        (image,) = ax.images
+        losses, (left, right, bottom, top) = image.get_array(), image.get_extent()
+        rows, columns = losses.shape
+        for row, column in ((rows // 2, columns // 3), (rows // 3, columns // 2)):
+            point = np.zeros(3)
+            point[0] = left + (column + 0.5) * (right - left) / columns
+            point[up] = bottom + (row + 0.5) * (top - bottom) / rows
+            axis = np.eye(3)[along]
+            expected, _ = quad(lambda t, point=point, axis=axis: density(point + t * axis), -4, 8)
+            assert losses[row, column] == pytest.approx(expected, rel=1e-6)
+        assert image.get_clim()[0] == 0
+
+
+def test_obstacles_that_take_next_to_nothing_stay_pale(walls):
+    matter = Matter(np.full((1, 3), 2.0), np.full((1, 3), 0.5), np.array([0.01]))
+    plan, *_ = room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom(walls, matter, [])).axes
+    assert plan.images[0].get_clim() == (0, 1)
+
+
+def test_paths_are_drawn_from_end_to_end_the_strongest_on_top(walls):
+    ends = np.array([1.0, 1, 1]), np.array([5.0, 3, 2])
+    routes = [
+        Path(np.stack(ends), 0.0),
+        Path(np.stack((ends[0], [6.0, 2.5, 1.75], ends[1])), -9.0),
+        Path(np.stack((ends[0], [2.0, 4, 1.5], [6.0, 3.5, 1.9], ends[1])), -24.0),
+    ]
+    edges = np.array([[[-7.0, 0, 0], [-7.0, 1, 0]]])
+    plan, side, bar = paths(LearntRoom(walls, None, routes), ends[1][None], edges).axes
+    assert plan.get_title() == "The 3 strongest paths of a transmitter at (1.00, 1.00, 1.00) m"
+    assert bar.get_ylabel() == "power over that of the strongest path [dB]"
+    assert plan.get_xlim()[0] < -7
+    for ax, view in ((plan, [0, 1]), (side, [0, 2])):
+        true, folded = (artist for artist in ax.collections if isinstance(artist, LineCollection))
+        assert len(true.get_segments()) == 1
+        assert [*folded.get_array()] == [-24, -9, 0]
+        assert folded.get_clim() == (-24, 0)
+        for segment, route in zip(folded.get_segments(), routes[::-1], strict=True):
+            np.testing.assert_array_equal(segment, route.points[:, view])
+        assert [*folded.get_linewidths()] == sorted(folded.get_linewidths())
+        marks = {line.get_label(): line.get_xydata()[0].tolist() for line in ax.lines}
+        assert marks == {"receivers": ends[1][view].tolist(), "transmitter": ends[0][view].tolist()}
+    assert {"0: 40 %", "1: 10 %", "3: 5 %", "4: 2 %"} == labels(plan)
+
+
+def test_a_single_path_has_a_scale_of_its_own():
+    route = Path(np.array([[1.0, 1, 1], [2, 2, 2]]), 0.0)
+    figure = paths(LearntRoom([], None, [route]), POINT, NO_EDGES)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["receivers", "transmitter"]
+    plan, *_ = figure.axes
+    folded = [artist for artist in plan.collections if isinstance(artist, LineCollection)][-1]
+    assert folded.get_clim() == (-10, 0)

@@ -16,7 +16,7 @@ from gaigs.gaussians import Gaussians
 from gaigs.geometry import Pose
 from gaigs.query import Query
 from gaigs.radio_map import RadioMap
-from gaigs.report import channels, curves, radio_map, room, spectra, style
+from gaigs.report import channels, curves, radio_map, room, shapes, spectra, style
 from gaigs.scene import Array, Receiver
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
@@ -96,6 +96,22 @@ def test_examples_are_at_their_percentiles_of_the_own_model(spectrum_links, tmp_
     )
     np.testing.assert_array_equal(drawn_labels[1], labels[np.argsort(own)[20]])
     np.testing.assert_array_equal(drawn_predictions, 1 - drawn_labels)
+
+
+def test_what_was_learnt_of_the_room_is_drawn(spectrum_links, tmp_path, spy, monkeypatch):
+    labels = spectrum_links.labels[spectrum_links.split.test].numpy().astype(np.float16)
+    np.savez(tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_mirrored=np.ones(1))
+    monkeypatch.setattr(Figure, "savefig", lambda *_, **__: None)
+    seen, folded = spy(room, "room"), spy(room, "paths")
+    route = shapes.Path(np.array([[1.0, 1, 1], [3, 0, 1]]), 0.0)
+    learnt = shapes.LearntRoom([], None, [route])
+    names = {file.stem for file in write_figures(tmp_path, spectrum_links, None, learnt)}
+    assert names == {"room", "paths", "spectra", "spectra_polar", "ssim_cdf"}
+    assert seen[0][0][-1] is learnt
+    assert folded[0][0][0] is learnt
+    np.testing.assert_array_equal(folded[0][0][1], [[3, 0, 1]])
+    names = {file.stem for file in write_figures(tmp_path, spectrum_links, None, learnt._replace(paths=[]))}
+    assert "paths" not in names  # of a transmitter that nobody hears
 
 
 def test_a_baseline_has_neither_losses_nor_gaussians(spectrum_links, tmp_path):

@@ -16,6 +16,7 @@ from gaigs.geometry import Pose
 from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.scene import Receiver
+from gaigs.split import folds
 from gaigs.task.rssi import Rssi
 from gaigs.testing import check_split
 
@@ -298,3 +299,32 @@ def test_a_configuration_has_every_option_with_its_default(file):
 
 def test_every_split_has_a_configuration():
     assert {*registry("split").names()} <= {file.stem for file in (conf_dir() / "split").glob("*.yaml")}
+
+
+# --- folds ---
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_folds_part_the_training_links_by_whole_rows(links, count):
+    rows = torch.arange(N) // 3
+    links = replace(links, rows=rows)
+    links = replace(links, split=part(links, name="random", validation=0.2))
+    parts = folds(links, count, seed=0)
+    split = links.split
+    assert [one.name for one in parts] == [f"{split.name}, fold {i + 1} of {count}" for i in range(count)]
+    assert torch.equal(torch.cat([one.test for one in parts]).sort().values, split.train)
+    for one in parts:
+        assert torch.equal(torch.cat((one.train, one.test)).sort().values, split.train)
+        assert torch.equal(one.validation, split.validation)
+        assert not np.intersect1d(rows[one.train], rows[one.test]).size
+        assert len(rows[one.test].unique()) == pytest.approx(len(rows[split.train].unique()) / count, abs=1)
+    again, others = folds(links, count, seed=0), folds(links, count, seed=1)
+    assert all(torch.equal(a.test, b.test) for a, b in zip(parts, again, strict=True))
+    assert not all(torch.equal(a.test, b.test) for a, b in zip(parts, others, strict=True))
+
+
+def test_more_folds_than_rows_are_refused(links):
+    links = replace(links, rows=torch.arange(N) // 100)
+    links = replace(links, split=part(links, name="random", test=0.25, validation=0.0))
+    with pytest.raises(ValueError, match="4 folds take as many rows of training links or more, got 3"):
+        folds(links, 4, seed=0)

@@ -39,6 +39,16 @@ def test_example_links_keep_the_contract(task):
     assert torch.equal(links.query.transmitters, same.query.transmitters)
 
 
+@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
+def test_example_links_of_a_known_carrier_keep_the_contract(task):
+    links = example_links(task, 5e9)
+    check_data(links)
+    assert links.scene.frequencies.tolist() == [5e9]
+    assert links.scene.bandwidth == 5e8
+    assert torch.equal(links.query.transmitters, example_links(task).query.transmitters)
+    assert len(links.receivers[0].array) == {"spectrum": 9, "rssi": 1, "csi": 4}[task]
+
+
 def test_other_examples_are_refused():
     with pytest.raises(ValueError, match="spectrum, rssi or csi, got 'odour'"):
         example_links("odour")

@@ -1,4 +1,4 @@
-"""Checks of placements, tokenizers, deformations, poolings and losses find what is broken."""
+"""Checks of tokenizers, deformations and losses find what is broken."""
 
 from dataclasses import replace
 
@@ -12,14 +12,10 @@ from gaigs.loss.absolute import Absolute
 from gaigs.loss.l1_ssim import L1Ssim
 from gaigs.loss.nmse import Nmse
 from gaigs.loss.squared import Squared
-from gaigs.placement import Placed, Placement
-from gaigs.pooling import Pooling, sphere
-from gaigs.pooling.spectrum import Spectrum
+from gaigs.placement import Placed
 from gaigs.testing import (
     check_deformation,
     check_loss,
-    check_placement,
-    check_pooling,
     check_tokenizer,
     example_links,
 )
@@ -33,61 +29,6 @@ SCENE = LINKS["rssi"].scene
 @pytest.fixture(autouse=True)
 def seed():
     torch.manual_seed(0)
-
-
-# --- placements ---
-
-
-class Halfway(Placement):
-    """Between the Gaussian and each transmitter, along a path of known length."""
-
-    def forward(self, gaussians, query):
-        means = (gaussians.means + query.transmitters[:, None]) / 2
-        return Placed(means, 2 * (means - query.transmitters[:, None]).norm(dim=-1))
-
-
-class Bare(Halfway):
-    def forward(self, gaussians, query):
-        return super().forward(gaussians, query).means
-
-
-class Shared(Halfway):
-    def forward(self, gaussians, query):
-        return super().forward(gaussians, query)._replace(means=gaussians.means)
-
-
-class Crowded(Halfway):
-    def forward(self, gaussians, query):
-        placed = super().forward(gaussians, query)
-        return placed._replace(means=placed.means + 0.1 * len(query))
-
-
-class Backwards(Halfway):
-    def forward(self, gaussians, query):
-        placed = super().forward(gaussians, query)
-        return placed._replace(lengths=-placed.lengths)
-
-
-class Kinked(Halfway):
-    def forward(self, gaussians, query):
-        placed = super().forward(gaussians, query)
-        return placed._replace(lengths=(0 * placed.lengths).sqrt())
-
-
-@pytest.mark.parametrize(
-    ("placement", "message"),
-    [
-        (Bare, "a placement must give a Placed, got Tensor"),
-        (Shared, r"means must be \(1 or 3, 40, 3\), got \(40, 3\)"),
-        (Crowded, "means must not depend on the other queries"),
-        (Backwards, "lengths must not be negative"),
-        (Kinked, "the gradient of means must be finite"),
-    ],
-)
-def test_a_broken_placement_is_found(placement, message):
-    check_placement(Halfway(), SCENE)
-    with pytest.raises(AssertionError, match=message):
-        check_placement(placement(), SCENE)
 
 
 # --- tokenizers ---
@@ -201,117 +142,6 @@ def test_a_broken_deformation_is_found(deformation, message):
 
 def test_a_deformation_without_tokens_keeps_the_contract():
     check_deformation(lambda **context: Constant(), SCENE)
-
-
-# --- poolings ---
-
-
-class Root(Spectrum):
-    def forward(self, image, query):
-        return image.square().sum(1).sqrt()
-
-
-class Relative(Spectrum):
-    def forward(self, image, query):
-        return super().forward(image, query) / image.abs().max()
-
-
-class Flattened(Spectrum):
-    def forward(self, image, query):
-        return super().forward(image, query).flatten(1)
-
-
-class Windowed(Spectrum):
-    """Weighs the pixels of a grid by their row, and so those of a list alike."""
-
-    def forward(self, image, query):
-        return super().forward(image, query) * torch.linspace(1, 2, image.shape[2]).to(image)[:, None]
-
-
-class Upended(Spectrum):
-    zone = (1.0, -1.0)
-
-
-class Power(Pooling):
-    """Mean power in dB, without a floor."""
-
-    channels = 2
-
-    def __init__(self):
-        super().__init__()
-        self.grid = sphere("pooling.grid", [4, 8])
-
-    def level(self, image):
-        return 10 * image.square().sum(1).mean((1, 2)).log10()
-
-    def forward(self, image, query):
-        return self.level(image.to(torch.promote_types(image.dtype, torch.float32)))
-
-
-class Floored(Power):
-    def level(self, image):
-        return 10 * (image.square().sum(1).mean((1, 2)) + 1e-2).log10()
-
-
-class Narrow(Floored):
-    def forward(self, image, query):
-        return self.level(image).to(torch.promote_types(image.dtype, torch.float32))
-
-
-class Coarse(Floored):
-    def forward(self, image, query):
-        return super().forward(image, query).to(image.dtype)
-
-
-class Clamped(Power):
-    def level(self, image):
-        return 20 * image.square().sum(1).mean((1, 2)).sqrt().clamp(min=1e-3).log10()
-
-
-class Forgetful(Floored):
-    """Fits a level that its state dict does not hold."""
-
-    loudest = 0.0
-
-    def fit(self, links):
-        self.loudest = links.labels.max().item()
-
-    def level(self, image):
-        return super().level(image) + self.loudest
-
-
-@pytest.mark.parametrize(
-    ("build", "task", "message"),
-    [
-        (lambda scene: Root(2), "spectrum", "the gradient of a silent map must be finite"),
-        (lambda scene: Relative(2), "spectrum", "a value must not depend on the other maps"),
-        (lambda scene: Flattened(2), "spectrum", r"the value must be of shape \(3, 18, 36\), got \(3, 648\)"),
-        (lambda scene: Windowed(2), "spectrum", "a list of rays must have the values of their pixels"),
-        (lambda scene: Upended(2), "spectrum", "zone must be two elevations"),
-        (
-            lambda scene: Spectrum(2),
-            "rssi",
-            "labels of task 'rssi' have no directions, so the pooling must have a grid",
-        ),
-        (lambda scene: Power(), "rssi", "the gradient of a silent map must be finite"),
-        (lambda scene: Clamped(), "rssi", "the gradient of a silent map must be finite"),
-        (lambda scene: Narrow(), "rssi", "the value of 12 decades in float16 must be finite"),
-        (
-            lambda scene: Coarse(),
-            "rssi",
-            "the value of a silent map in float16 must be torch.float32, got torch.float16",
-        ),
-        (lambda scene: Forgetful(), "rssi", "all that it takes in fit must be in the state dict"),
-        (lambda scene: Floored(), "csi", r"the value must be of shape \(3, 4, 5\), got \(3,\)"),
-    ],
-)
-def test_a_broken_pooling_is_found(build, task, message):
-    with pytest.raises(AssertionError, match=message):
-        check_pooling(build, LINKS[task])
-
-
-def test_a_pooling_with_a_noise_floor_keeps_the_contract():
-    check_pooling(lambda scene: Floored(), LINKS["rssi"])
 
 
 # --- losses ---

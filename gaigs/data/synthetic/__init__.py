@@ -90,6 +90,7 @@ def furnished_room(
         task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
         rows=rows,
         official=partial(last_fifth, transmitters, rows),
+        bandwidth=bandwidth if spectrum == "band" else 0.0,
         edges=edges(ROOM),
     )
 

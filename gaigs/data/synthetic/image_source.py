@@ -13,7 +13,8 @@ from scipy.constants import epsilon_0, speed_of_light
 from torch import Tensor
 
 from gaigs.directions import Grid
-from gaigs.scene import Array, Receiver
+from gaigs.propagation import fresnel
+from gaigs.scene import Array, Receiver, differences
 
 MATERIALS = {
     "concrete": (5.24, 0.0462, 0.7822),
@@ -72,23 +73,6 @@ def permittivity(material: str, frequency: float) -> complex:
         raise ValueError(f"frequency must lie in 1e9..40e9 Hz, where materials are tabulated, got {frequency:.6g}")
     real, c, d = MATERIALS[material]
     return complex(real, -c * (frequency / 1e9) ** d / (2 * math.pi * epsilon_0 * frequency))
-
-
-def reflection(
-    permittivity: complex, cosines: Float[Tensor, "*batch"]
-) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
-    """Fresnel reflection coefficients of a half-space, electric field across (TE) and in (TM) the plane of incidence.
-
-    Args:
-        permittivity: Complex, relative.
-        cosines: Of the angle of incidence against the surface's normal.
-
-    Source: Fresnel's formulas in the form of ITU-R P.2040-3.
-    """
-    root = torch.sqrt(permittivity - (1 - cosines.square()))
-    te = (cosines - root) / (cosines + root)
-    tm = (permittivity * cosines - root) / (permittivity * cosines + root)
-    return te, tm
 
 
 def cells(order: int) -> Int[Tensor, "p 3"]:
@@ -171,7 +155,7 @@ def trace(
     gains = torch.ones_like(cosines[..., 0], dtype=torch.complex128)
     for wall, material in enumerate(room.walls):
         axis, side = divmod(wall, 2)
-        te, tm = reflection(permittivity(material, frequency), cosines[..., axis])
+        te, tm = fresnel(permittivity(material, frequency), cosines[..., axis])
         # Of m reflections between two opposite walls the one on the image's side takes the odd one.
         towards = cell[:, axis] > 0 if side else cell[:, axis] < 0
         bounces = (cell[:, axis].abs() + towards) // 2
@@ -277,10 +261,7 @@ def bartlett(
     Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
     """
     covariances = responses @ responses.mH / responses.shape[-1]
-    # In half wavelengths; to so many digits the steps between the elements of a regular array are alike.
-    places = array.elements.double() * (2 * frequency / speed_of_light)
-    differences = (places[:, None] - places).flatten(0, 1).round(decimals=9)
-    steps, pair = torch.unique(differences, dim=0, return_inverse=True)
+    steps, pair = differences(array.elements.double() * (2 * frequency / speed_of_light))  # in half wavelengths
     lags = covariances.new_zeros(len(responses), len(steps)).index_add(1, pair, covariances.flatten(1))
     directions = Grid(grid.elevations.double(), grid.azimuths.double()).flatten().vectors()
     phases = math.pi * steps @ directions.T

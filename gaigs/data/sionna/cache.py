@@ -1,0 +1,87 @@
+"""Traced paths, kept on disk: they are the same for every spectrum, bandwidth and number of subcarriers."""
+
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.data.sionna import tracing
+from gaigs.data.sionna.meshes import Room
+from gaigs.data.synthetic.image_source import Paths
+
+log = logging.getLogger(__name__)
+
+VERSION = 1
+"""Of the files; to be raised with every change of ``tracing`` that changes its paths."""
+
+
+def folder() -> Path:
+    """Where the files lie: gaigs/sionna in the user's folder of caches."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "gaigs" / "sionna"
+
+
+def find_paths(room: Room, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float) -> Paths:
+    """The paths in a room, traced the first time and read afterwards.
+
+    Args:
+        room: Walls and furniture.
+        receiver: Position [m].
+        transmitters: Positions [m].
+        frequency: Of the carrier [Hz].
+
+    Raises:
+        ImportError, RuntimeError: As for ``tracing.trace``; the packages have to be there in any case, since paths
+            belong to their versions.
+        ValueError: The frequency is out of range, or the file is damaged.
+    """
+    key = {
+        "version": VERSION,
+        "packages": tracing.find_packages(),
+        "meshes": [(mesh.material, mesh.vertices, mesh.faces) for mesh in room.meshes()],
+        "thickness": tracing.THICKNESS,
+        "receiver": receiver.tolist(),
+        "transmitters": transmitters.tolist(),
+        "frequency": float(frequency),
+        "settings": [tracing.DEPTH, tracing.RAYS, tracing.CANDIDATES, tracing.CHUNK, tracing.WEAKEST],
+    }
+    file = folder() / f"{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:32]}.npz"
+    if file.is_file():
+        return _read(file)
+    log.info("tracing the paths of %d transmitters; next time they are read from %s", len(transmitters), file)
+    paths = tracing.trace(room.meshes(), receiver, transmitters, frequency)
+    if not file.is_file():  # two tracings are not quite alike: that of a process which was faster stays
+        _write(file, paths)
+    return _read(file)  # in its precision, so that the first time gives what every other gives
+
+
+def _read(file: Path) -> Paths:
+    try:
+        with file.open("rb") as stream:  # numpy would not close a file that it cannot read
+            arrays = np.load(stream, allow_pickle=False)
+            images, gains = torch.from_numpy(arrays["images"]), torch.from_numpy(arrays["gains"])
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{file} must be a whole file of paths, and is damaged ({error}); delete it") from error
+    return Paths(images.double(), gains.to(torch.complex128))
+
+
+def _write(file: Path, paths: Paths) -> None:
+    """In one go: whoever reads meanwhile finds a whole file or none."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            np.savez_compressed(
+                stream, images=paths.images.numpy().astype(np.float32), gains=paths.gains.numpy().astype(np.complex64)
+            )
+        os.replace(name, file)
+    except BaseException:
+        os.unlink(name)
+        raise

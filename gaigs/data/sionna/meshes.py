@@ -1,0 +1,197 @@
+"""Rooms that are no boxes, as meshes of planar faces: an L, one with a leaning wall, one full of furniture."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from gaigs.geometry import Pose
+
+THICKNESS = {
+    "concrete": 0.2,
+    "brick": 0.12,
+    "plasterboard": 0.0125,
+    "wood": 0.018,
+    "glass": 0.008,
+    "ceiling_board": 0.02,
+    "metal": 0.002,
+}
+"""Of the slab that a face of each material stands for [m]; furniture is hollow, of boards."""
+
+HEIGHTS = 0.3, 2.0
+"""Of the transmitters [m]."""
+
+WALL_MARGIN, FURNITURE_MARGIN = 0.3, 0.05
+"""How far transmitters stand from walls and from furniture, at least [m]."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """One object of one material.
+
+    Attributes:
+        name: What it is.
+        material: One of ``THICKNESS``.
+        vertices: Corners, world frame [m].
+        faces: Corners of each planar convex face, counted from 0, around it.
+    """
+
+    name: str
+    material: str
+    vertices: tuple[tuple[float, float, float], ...]
+    faces: tuple[tuple[int, ...], ...]
+
+    def triangles(self) -> list[tuple[int, int, int]]:
+        """The faces cut into triangles, as fans about their first corners."""
+        return [(face[0], *pair) for face in self.faces for pair in itertools.pairwise(face[1:])]
+
+
+@dataclass(frozen=True)
+class Cuboid:
+    """A piece of furniture, or a part of one, upright but turned at will.
+
+    Attributes:
+        name: What it is.
+        material: Of its sides, one of ``THICKNESS``.
+        lower, upper: Opposite corners before it is turned, world frame [m].
+        turn: About the vertical through its middle, counterclockwise [deg].
+    """
+
+    name: str
+    material: str
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
+    turn: float = 0.0
+
+    def mesh(self) -> Mesh:
+        """The closed mesh of its six sides; seen from outside they run counterclockwise."""
+        (cos, sin), middle = self._axes(), self._middle()
+        corners = []
+        for k in range(8):
+            x, y, z = (
+                (self.upper if k >> axis & 1 else self.lower)[axis] - (middle[axis] if axis < 2 else 0.0)
+                for axis in range(3)
+            )
+            corners.append((round(middle[0] + cos * x - sin * y, 6), round(middle[1] + sin * x + cos * y, 6), z))
+        sides = (0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)
+        return Mesh(self.name, self.material, tuple(corners), sides)
+
+    def contains(self, points: Float[Tensor, "k 3"], margin: float) -> Bool[Tensor, "k"]:
+        """Whether points [m] lie within it or less than a margin [m] from it, measured along its axes."""
+        (cos, sin), middle = self._axes(), points.new_tensor(self._middle())
+        x, y, z = (points - middle).unbind(-1)
+        own = torch.stack((cos * x + sin * y, cos * y - sin * x, z), -1).abs()
+        half = (points.new_tensor(self.upper) - points.new_tensor(self.lower)) / 2
+        return (own <= half + margin).all(-1)
+
+    def _axes(self) -> tuple[float, float]:
+        return math.cos(math.radians(self.turn)), math.sin(math.radians(self.turn))
+
+    def _middle(self) -> tuple[float, ...]:
+        return tuple((low + high) / 2 for low, high in zip(self.lower, self.upper, strict=True))
+
+
+@dataclass(frozen=True)
+class Room:
+    """A room between a floor and a ceiling with as many corners, its furniture, and who listens there.
+
+    Attributes:
+        floor: Corners (x, y) of the floor, counterclockwise [m].
+        ceiling: Corners of the ceiling, each above that of the floor [m]; where they differ walls lean.
+        height: Of the ceiling [m].
+        convex: Corners of the convex parts that floor and ceiling are cut into.
+        walls: Material of each wall, from a corner to the next.
+        slabs: Materials of floor and ceiling.
+        furniture: What stands in the room.
+        antenna: Position of the receiver with the array [m], the point that it faces [m], and how far it is turned
+            about its normal [deg].
+        gateways: Positions of the receivers with a single antenna, by name [m].
+    """
+
+    floor: tuple[tuple[float, float], ...]
+    ceiling: tuple[tuple[float, float], ...]
+    height: float
+    convex: tuple[tuple[int, ...], ...]
+    walls: tuple[str, ...]
+    slabs: tuple[str, str]
+    furniture: tuple[Cuboid, ...]
+    antenna: tuple[tuple[float, float, float], tuple[float, float, float], float]
+    gateways: tuple[tuple[str, tuple[float, float, float]], ...]
+
+    def meshes(self) -> list[Mesh]:
+        """Walls, floor, ceiling and furniture. Neighbouring walls of one material are one mesh, with a true edge."""
+        count = len(self.floor)
+        corners = (*((x, y, 0.0) for x, y in self.floor), *((x, y, self.height) for x, y in self.ceiling))
+        sides: dict[str, list[tuple[int, ...]]] = {}
+        for k, material in enumerate(self.walls):
+            after = (k + 1) % count
+            sides.setdefault(material, []).append((k, after, count + after, count + k))
+        above = tuple(tuple(count + k for k in part) for part in self.convex)
+        shell = [Mesh(f"{material} walls", material, corners, tuple(faces)) for material, faces in sides.items()]
+        shell += [Mesh("floor", self.slabs[0], corners, self.convex), Mesh("ceiling", self.slabs[1], corners, above)]
+        return [*map(_compact, shell), *(cuboid.mesh() for cuboid in self.furniture)]
+
+    def pose(self) -> Pose:
+        """Of the receiver with the array: its normal points at what it faces."""
+        position, target, turn = self.antenna
+        normal = torch.tensor(target, dtype=torch.float64) - torch.tensor(position, dtype=torch.float64)
+        azimuth, depression = torch.atan2(normal[1], normal[0]), torch.atan2(-normal[2], normal[:2].norm())
+        angles = [azimuth.item(), math.pi / 2 + depression.item(), math.radians(turn)]
+        return Pose.from_xyzw(position, Rotation.from_euler("ZYZ", angles).as_quat())
+
+    def is_free(self, points: Float[Tensor, "k 3"]) -> Bool[Tensor, "k"]:
+        """Whether points [m] lie inside, with the margins from walls and furniture."""
+        share = points[:, 2:] / self.height
+        outline = torch.lerp(points.new_tensor(self.floor), points.new_tensor(self.ceiling), share[..., None])
+        start, end = outline, outline.roll(-1, 1)  # of each wall, at the height of each point
+        along, to = end - start, points[:, None, :2] - start
+        # Even-odd rule: how many walls a ray along x meets.
+        above, below = start[..., 1] > points[:, None, 1], end[..., 1] > points[:, None, 1]
+        cross = along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
+        meets = (above != below) & ((cross > 0) == (end[..., 1] > start[..., 1]))
+        nearest = ((to * along).sum(-1) / along.square().sum(-1)).clamp(0, 1)
+        distances = (to - nearest[..., None] * along).norm(dim=-1).amin(1)
+        free = (meets.sum(1) % 2 == 1) & (distances >= WALL_MARGIN)
+        for cuboid in self.furniture:
+            free &= ~cuboid.contains(points, FURNITURE_MARGIN)
+        return free
+
+
+def _compact(mesh: Mesh) -> Mesh:
+    """The same without corners that no face has."""
+    used = sorted({corner for face in mesh.faces for corner in face})
+    faces = tuple(tuple(used.index(corner) for corner in face) for face in mesh.faces)
+    return Mesh(mesh.name, mesh.material, tuple(mesh.vertices[k] for k in used), faces)
+
+
+def edges(meshes: Sequence[Mesh]) -> Float[Tensor, "k 2 3"]:
+    """Outlines of meshes [m]: each edge once, and none between two faces of a mesh that lie in one plane."""
+    lines = {}
+    for mesh in meshes:
+        corners = torch.tensor(mesh.vertices, dtype=torch.float64)
+        normals: dict[tuple[int, int], list[Tensor]] = {}
+        for face in mesh.faces:
+            normal = torch.linalg.cross(corners[face[1]] - corners[face[0]], corners[face[2]] - corners[face[0]])
+            for start, end in zip(face, (*face[1:], face[0]), strict=True):
+                normals.setdefault((min(start, end), max(start, end)), []).append(normal / normal.norm())
+        for (start, end), found in normals.items():
+            # Of planes alike the normals' product has length 1, but for rounding.
+            if len(found) < 2 or (found[0] @ found[1]).abs() < 1 - 1e-9:
+                lines[tuple(sorted((mesh.vertices[start], mesh.vertices[end])))] = None
+    return torch.tensor([*lines])
+
+
+def wavefront_obj(meshes: Sequence[Mesh]) -> str:
+    """Meshes as a Wavefront OBJ file [m]: one object a mesh, with its material."""
+    lines, before = [], 1
+    for mesh in meshes:
+        lines += [f"o {mesh.name.replace(' ', '_')}", f"usemtl {mesh.material}"]
+        lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in mesh.vertices]
+        lines += ["f " + " ".join(str(before + corner) for corner in face) for face in mesh.faces]
+        before += len(mesh.vertices)
+    return "\n".join(lines) + "\n"

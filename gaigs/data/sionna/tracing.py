@@ -1,0 +1,237 @@
+"""Paths in a room of meshes by the ray tracer Sionna RT, on the processor, and what an array receives along them."""
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from glob import glob
+from importlib import metadata
+
+import numpy as np
+import torch
+from jaxtyping import Complex, Float
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.data.sionna.meshes import THICKNESS, Mesh, Room
+from gaigs.data.synthetic.image_source import MATERIALS, Paths
+from gaigs.propagation import free_space
+from gaigs.scene import Receiver
+
+DEPTH = 3
+"""Largest number of reflections, passages through surfaces and diffractions of a path; a wardrobe is two passages."""
+
+CHUNK = 10
+"""Transmitters traced at a time. Chains of surfaces to all of them share a table in which some are lost to others."""
+
+RAYS, CANDIDATES = 500_000, 1_000_000
+"""Rays shot from a receiver for each chunk, and chains tried, which is the size of that table too. For 50 transmitters
+with 4,000 chains, 80 to each, 1 to 6 dB of the power would be missing at one place in ten."""
+
+WEAKEST = 1e-4
+"""Share of a transmitter's power that its weakest paths may have together to be left out, two in three of them."""
+
+PART = 16
+"""Transmitters whose waves are added up at a time."""
+
+OLDEST_LLVM = 17
+"""With 15 and 16 the process aborts at the first kernel."""
+
+FREQUENCIES = 0.3e9, 40e9
+"""Range of carriers [Hz]: below, furniture is no larger than the wavelength; above, materials are not tabulated."""
+
+
+def find_packages() -> dict[str, str]:
+    """Versions of the packages that trace, by name.
+
+    Raises:
+        ImportError: One is not installed.
+    """
+    try:
+        return {name: metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
+    except metadata.PackageNotFoundError as error:
+        raise ImportError(f"rooms of the ray tracer need {error.name}: pip install 'gaigs[sionna]'") from error
+
+
+def find_llvm() -> str:
+    """The file of libLLVM that is to compile the ray tracer's kernels: that of DRJIT_LIBLLVM_PATH, else the newest.
+
+    Raises:
+        RuntimeError: There is none, or none that is new enough.
+    """
+    chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
+    folders = f"{sys.prefix}/lib", "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib/llvm-*/lib", "/usr/local/lib"
+    names = "libLLVM.so*", "libLLVM-[0-9]*.so*", "libLLVM.dylib"
+    files = [chosen] if chosen else [file for folder in folders for name in names for file in glob(f"{folder}/{name}")]
+    versions = {file: llvm_version(file) for file in dict.fromkeys(map(os.path.realpath, files))}
+    newest = max(versions, key=versions.get, default=None)
+    if newest is None or versions[newest] < OLDEST_LLVM:
+        found = ", ".join(f"{file} ({version or 'no libLLVM of 16 or later'})" for file, version in versions.items())
+        raise RuntimeError(
+            f"the ray tracer needs libLLVM {OLDEST_LLVM} or later, got {found or 'none'}; install it (Debian: apt-get "
+            "install libllvm19), or set DRJIT_LIBLLVM_PATH to its file"
+        )
+    return newest
+
+
+def llvm_version(file: str) -> int:
+    """Major version of a libLLVM; 0 where it has none to tell, as before 16, or cannot be loaded.
+
+    Another process loads it, because one that is too old must not come into this one.
+    """
+    code = (
+        "import ctypes, sys; number = ctypes.c_uint(); "
+        "ctypes.CDLL(sys.argv[1]).LLVMGetVersion(ctypes.byref(number), None, None); print(number.value)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, file], capture_output=True, text=True, check=False)
+    return int(done.stdout) if done.returncode == 0 else 0
+
+
+def trace(
+    meshes: Sequence[Mesh], receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
+) -> Paths:
+    """The paths from transmitters to a receiver point, by shooting and bouncing rays and the image method.
+
+    By reciprocity the rays leave the receiver, of which there is one. Both ends have an antenna that is alike in all
+    directions and vertically polarised: its field runs along the meridians about the vertical. A path that is reflected
+    and passes through surfaces comes as if straight from an image of the transmitter, which lies at the path's length
+    in the direction in which it is heard. Of a diffracted path length and direction are true at the receiver point, and
+    its wave is more curved than that of its image.
+
+    Args:
+        meshes: What stands there.
+        receiver: Position [m].
+        transmitters: Positions [m].
+        frequency: Of the carrier [Hz].
+
+    Returns:
+        Paths by falling strength; where a transmitter has fewer than another its last gains are 0.
+
+    Raises:
+        ImportError: Sionna RT is not installed.
+        RuntimeError: There is no libLLVM that it can use.
+        ValueError: The frequency is out of range, or no path leads to a transmitter.
+
+    Source: Sionna RT technical report, arXiv:2504.21719; materials as in ITU-R P.2040-3, table 3.
+    """
+    low, high = FREQUENCIES
+    if not low <= frequency <= high:
+        raise ValueError(f"frequency must lie in {low:g}..{high:g} Hz, got {frequency:.6g}")
+    find_packages()
+    os.environ["DRJIT_LIBLLVM_PATH"] = find_llvm()  # read once, when the first kernel is compiled
+    import mitsuba
+
+    mitsuba.set_variant("llvm_ad_mono_polarized")  # on the processor, before the import chooses a graphics card
+    from sionna import rt
+
+    scene = rt.load_scene()
+    scene.frequency = frequency
+    _furnish(scene, meshes, frequency)
+    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.add(rt.Transmitter("receiver", receiver.tolist()))
+    solver = rt.PathSolver()
+    found = []
+    for chunk in transmitters.split(CHUNK):
+        names = [f"transmitter {k}" for k in range(len(chunk))]
+        for name, position in zip(names, chunk.tolist(), strict=True):
+            scene.add(rt.Receiver(name, position))
+        paths = solver(scene, max_depth=DEPTH, samples_per_src=RAYS, max_num_paths_per_src=CANDIDATES, diffraction=True)
+        found += _strongest(paths, receiver.double().numpy(), speed_of_light / frequency)
+        scene.remove(names)
+    if deaf := [k for k, (_, gains) in enumerate(found) if not len(gains)]:
+        raise ValueError(f"a path must lead to each transmitter, got none to {transmitters[deaf[0]].tolist()}; move it")
+    most = max(len(gains) for _, gains in found)
+    images = receiver.double() + torch.ones(len(found), most, 3, dtype=torch.float64)
+    padded = torch.zeros(len(found), most, dtype=torch.complex128)
+    for row, (places, gains) in enumerate(found):
+        images[row, : len(gains)] = torch.from_numpy(places)
+        padded[row, : len(gains)] = torch.from_numpy(gains)
+    return Paths(images, padded)
+
+
+def _furnish(scene, meshes: Sequence[Mesh], frequency: float) -> None:
+    """Adds meshes to a scene, their materials by numbers: Sionna's own table of them refuses what lies below 1 GHz."""
+    import mitsuba
+    from sionna import rt
+
+    objects = []
+    materials = {}
+    for name in sorted({mesh.material for mesh in meshes}):
+        permittivity, c, d = MATERIALS[name]
+        materials[name] = rt.RadioMaterial(name, THICKNESS[name], permittivity, c * (frequency / 1e9) ** d)
+    for number, mesh in enumerate(meshes):
+        triangles = mesh.triangles()
+        properties = mitsuba.Properties()
+        properties["face_normals"] = True
+        properties["mesh_bsdf"] = materials[mesh.material]
+        shape = mitsuba.Mesh(f"mesh {number}", len(mesh.vertices), len(triangles), props=properties)
+        parameters = mitsuba.traverse(shape)
+        parameters["vertex_positions"] = np.ravel(mesh.vertices).astype(np.float32)
+        parameters["faces"] = np.ravel(triangles).astype(np.uint32)
+        parameters.update()
+        objects.append(rt.SceneObject(mi_mesh=shape, name=f"mesh {number}", radio_material=materials[mesh.material]))
+    scene.edit(add=objects)
+
+
+def _strongest(paths, receiver: np.ndarray, wavelength: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Images (p, 3) [m] and gains (p,) of each transmitter's paths, without the weakest."""
+    fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, 0, 0]
+    lengths, zenith, azimuth = (array.numpy()[:, 0].astype(float) for array in (paths.tau, paths.theta_t, paths.phi_t))
+    lengths *= speed_of_light
+    horizontal = np.sin(zenith)
+    directions = np.stack((horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.cos(zenith)), -1)
+    images = receiver + lengths[..., None] * directions
+    found = []
+    for k, field in enumerate(fields):
+        order = np.argsort(-np.abs(field), kind="stable")
+        power = np.abs(field[order]) ** 2
+        order = order[np.cumsum(power[::-1])[::-1] > WEAKEST * power.sum()]
+        # What remains without the spreading of free space, wavelength / (4 pi length), is the path's gain.
+        found.append((images[k, order], field[order] * 4 * math.pi * lengths[k, order] / wavelength))
+    return found
+
+
+def respond(
+    paths: Paths, receiver: Receiver, frequency: float, offsets: Float[Tensor, "f"]
+) -> Complex[Tensor, "b elements f"]:
+    """What each element of a receiver's array receives along paths from unit-power transmitters.
+
+    The phase is that of a spherical wave from each image to each element; gains are those at the carrier, and so are
+    the elements' pattern at the array's centre.
+
+    Args:
+        paths: To the array's centre, at the carrier.
+        receiver: Pose and array.
+        frequency: Of the carrier [Hz].
+        offsets: Frequencies to evaluate, relative to the carrier [Hz].
+
+    Raises:
+        ValueError: A frequency is not positive.
+    """
+    frequencies = frequency + offsets.double()
+    if frequencies.min() <= 0:
+        raise ValueError(f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth")
+    position, rotation = receiver.pose.position.double(), receiver.pose.rotation.double()
+    found = []
+    # In parts, because the waves of all paths at all elements and frequencies are many times what they add up to.
+    for images, gains in zip(paths.images.split(PART), paths.gains.split(PART), strict=True):
+        local = (images - position) @ rotation
+        gains = gains * receiver.array.gain(local / local.norm(dim=-1, keepdim=True))
+        distances = (local[:, :, None] - receiver.array.elements.double()).norm(dim=-1)
+        found.append(torch.einsum("bp,bpnf->bnf", gains, free_space(distances[..., None], frequencies)))
+    return torch.cat(found)
+
+
+def frequency_offsets(room: Room, bandwidth: float) -> Float[Tensor, "f"]:
+    """Frequencies that sample a band, relative to its middle [Hz]; so dense that no two paths' beat is aliased.
+
+    Raises:
+        ValueError: The bandwidth is not positive.
+    """
+    if not 0 < bandwidth < math.inf:
+        raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
+    corners = torch.tensor([corner for mesh in room.meshes() for corner in mesh.vertices], dtype=torch.float64)
+    longest = (DEPTH + 1) * (corners.amax(0) - corners.amin(0)).norm().item()
+    count = math.ceil(bandwidth * longest / speed_of_light) + 1
+    return torch.linspace(-bandwidth / 2, bandwidth / 2, count, dtype=torch.float64)

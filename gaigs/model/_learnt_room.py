@@ -1,0 +1,361 @@
+"""The room that mirrored Gaussians have learnt: planes, obstacles and paths for tables, figures and other programs."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from gaigs.data import Links
+from gaigs.gaussians import write_ply
+from gaigs.placement._words import fold, images
+from gaigs.placement.mirrored import Mirrored
+from gaigs.propagation import fresnel
+from gaigs.query import Query
+from gaigs.report import shapes
+
+NEPER = 20 / math.log(10)
+"""Of a field [dB]."""
+
+LOOKED_AT = 256
+"""Most links that shares of power are means over."""
+
+AT_ONCE = 64
+"""Links worked on at a time."""
+
+SEEN = 0.01
+"""Share of a link's power from which on a bounce says how far the room reaches."""
+
+BEYOND = 0.1
+"""By how much the room's box is longer at each end than what it holds, in diagonals: planes meet within it."""
+
+TOLERANCE = 0.02
+"""By how much places may lie behind a wall, in diagonals: places and walls are known to some centimetres."""
+
+EDGE = 2.0
+"""Where a plane's window ends, in its standard deviations: there it reflects 17 dB less than in its middle."""
+
+ALIKE = 0.9
+"""Cosine from which on two planes face the same way, such as a wall and one behind it, and do not cut each other."""
+
+PATHS, FAINTEST_DB = 20, 30.0
+"""Most paths of a transmitter that are drawn, and how far below the strongest [dB]."""
+
+
+class Planes(NamedTuple):
+    """All learnt planes; float64.
+
+    Attributes:
+        normals: Of unit length, out of the room.
+        offsets: Along them, from the world's origin [m].
+        losses: Of a reflection at normal incidence, where the plane reflects best [dB].
+        middles: Where that is [m].
+        extents: Standard deviations of their windows along the world's axes [m].
+    """
+
+    normals: Float[ndarray, "w 3"]
+    offsets: Float[ndarray, "w"]
+    losses: Float[ndarray, "w"]
+    middles: Float[ndarray, "w 3"]
+    extents: Float[ndarray, "w 3"]
+
+
+class Survey(NamedTuple):
+    """What the kept paths of some links carry, and where they run.
+
+    Attributes:
+        words: Of the kept paths.
+        powers: Received by each, free space included; 0 where there is no path.
+        bounces: At the planes of each word; NaN where it has none [m].
+        transmitters, receivers: Where the links begin and end [m].
+    """
+
+    words: Int[ndarray, "n order"]
+    powers: Float[ndarray, "b n"]
+    bounces: Float[ndarray, "b n order 3"]
+    transmitters: Float[ndarray, "b 3"]
+    receivers: Float[ndarray, "b 3"]
+
+    @property
+    def shares(self) -> Float[ndarray, "b n"]:
+        """Of each link's power; 0 where it hears nothing."""
+        total = self.powers.sum(1, keepdims=True)
+        return self.powers / np.where(total > 0, total, 1)
+
+    @property
+    def ends(self) -> Float[ndarray, "k 3"]:
+        """Transmitters and receivers [m]."""
+        return np.concatenate((self.transmitters, self.receivers))
+
+
+def some(query: Query) -> Query:
+    """At most ``LOOKED_AT`` of the links, evenly spread."""
+    count = len(query)
+    return query[torch.linspace(0, count - 1, min(LOOKED_AT, count)).long()]
+
+
+@torch.no_grad()
+def survey(placement: Mirrored, query: Query) -> Survey:
+    """Follows the kept paths of some links.
+
+    Powers are those of the mirrored Gaussians as they are placed, before a deformation or a rasterizer changes them.
+    """
+    device = placement.words.device
+    words, normals, offsets = placement.words[placement.kept], placement.normals, placement.offsets
+    positions = placement.scene.positions(normals)
+    powers, bounces, receivers = [], [], []
+    for part in query.parts(AT_ONCE):
+        part = part.to(device)
+        powers.append(placement(None, part).gains.abs().square())
+        receivers.append(positions[part.receivers])
+        seen = images(part.transmitters, words, normals, offsets)
+        folded = fold(seen, receivers[-1], words, normals, offsets)
+        points = normals.new_full((len(part), *words.shape, 3), torch.nan)
+        for back, met in enumerate(folded.bounces, 1):
+            points[:, met.first :, -back] = met.points
+        bounces.append(points)
+    parts = words, torch.cat(powers).double(), torch.cat(bounces), query.transmitters, torch.cat(receivers)
+    return Survey(*(part.cpu().numpy() for part in parts))
+
+
+# --- tables ---
+
+
+def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
+    """What ``metrics.json`` says of the room.
+
+    Args:
+        placement: Its planes and paths.
+        query: Links over which shares of the received power are means.
+
+    Returns:
+        ``planes``, the strongest first: number, unit normal out of the room, offset along it from the world's origin
+        [m], loss of a reflection at normal incidence [dB], share of the power that comes by way of it, and how many
+        kept paths do. And ``paths``, by their number of bounces: how many are kept, and their share.
+    """
+    found = survey(placement, query)
+    all_planes = _planes(placement, found)
+    shares = _plane_shares(found)
+    planes = [
+        {
+            "number": number,
+            "normal": [round(part, 4) for part in all_planes.normals[number].tolist()],
+            "offset_m": round(all_planes.offsets[number].item(), 4),
+            "loss_db": round(all_planes.losses[number].item(), 2),
+            "share": round(shares[number], 5),
+            "paths": int((found.words == number).any(1).sum()),
+        }
+        for number in shares
+    ]
+    counts = (found.words >= 0).sum(1)
+    means = found.shares.mean(0)
+    paths = [
+        {
+            "bounces": bounces,
+            "kept": int((counts == bounces).sum()),
+            "share": round(means[counts == bounces].sum().item(), 5),
+        }
+        for bounces in range(found.words.shape[1] + 1)
+    ]
+    return {"planes": planes, "paths": paths}
+
+
+@torch.no_grad()
+def _planes(placement: Mirrored, found: Survey) -> Planes:
+    permittivities = torch.complex(1 + placement.log_permittivities.exp(), -placement.log_conductivities.exp())
+    reflected, _ = fresnel(permittivities, torch.ones_like(permittivities.real))
+    gains = reflected.abs().log() + placement.plane_gains
+    parts = placement.normals, placement.offsets, gains, placement.middles, placement.log_extents.exp()
+    normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
+    # A window's middle need not lie on its plane: where it is widest there, and what it takes even there [Np].
+    steep = extents**2 * normals
+    spread = (steep * normals).sum(1)
+    apart = offsets - (normals * middles).sum(1)
+    middles = middles + (apart / spread)[:, None] * steep
+    losses = NEPER * (apart**2 / spread / 2 - gains)
+    centre = (found.ends.min(0) + found.ends.max(0)) / 2
+    signs = np.where(normals @ centre > offsets, -1.0, 1.0)
+    return Planes(signs[:, None] * normals, signs * offsets, losses, middles, extents)
+
+
+def _plane_shares(found: Survey) -> dict[int, float]:
+    """Share of the power by way of each plane that a path uses, the largest first."""
+    means = found.shares.mean(0)
+    numbers = np.unique(found.words[found.words >= 0]).tolist()
+    shares = {number: means[(found.words == number).any(1)].sum().item() for number in numbers}
+    return dict(sorted(shares.items(), key=lambda item: -item[1]))
+
+
+# --- shapes ---
+
+
+def outlines(placement: Mirrored, found: Survey) -> list[shapes.Plane]:
+    """The planes as convex polygons, the strongest first.
+
+    A wall has all transmitters and receivers on one side. It reaches to the other walls, to where it no longer
+    reflects, or to the box around what was surveyed, whichever is nearest. A plane that cuts through the room, as
+    furniture does, is the rectangle in which paths bounce off it, as far as walls and box allow. One that no path
+    meets, or that lies far off and carries next to nothing, is left out.
+    """
+    normals, offsets, _, middles, extents = _planes(placement, found)
+    shares = _plane_shares(found)
+    weights = found.shares
+    seen = np.concatenate((found.ends, found.bounces[weights >= SEEN].reshape(-1, 3)))
+    seen = seen[~np.isnan(seen).any(1)]
+    lower, upper = seen.min(0), seen.max(0)
+    diagonal = np.linalg.norm(upper - lower)
+    box = _sides(lower - BEYOND * diagonal, upper + BEYOND * diagonal)
+    walls = [k for k in shares if (found.ends @ normals[k] - offsets[k] <= TOLERANCE * diagonal).all()]
+    drawn = []
+    for number, share in shares.items():
+        normal, offset = normals[number], offsets[number]
+        link, path, step = np.nonzero((found.words == number) & (weights > 0)[..., None])
+        if not len(link):
+            continue
+        basis = _basis(normal)
+        sides = box + [(normals[k], offsets[k]) for k in walls if k != number and normals[k] @ normal < ALIKE]
+        if number in walls:
+            middle = (lower + upper) / 2
+            middle = middle - (middle @ normal - offset) * normal
+            corners = _rectangle(middle, basis, np.full(2, -2 * diagonal), np.full(2, 2 * diagonal))
+            sides += _sides(middles[number] - EDGE * extents[number], middles[number] + EDGE * extents[number])
+        else:
+            own = weights[link, path]
+            points = found.bounces[link, path, step][own >= SEEN * own.max()]
+            flat = (points - offset * normal) @ basis
+            rim = TOLERANCE * diagonal
+            corners = _rectangle(offset * normal, basis, flat.min(0) - rim, flat.max(0) + rim)
+        for side in sides:
+            corners = _cut(corners, *side)
+        if len(corners):
+            drawn.append(shapes.Plane(number, corners, normal, share))
+    return drawn
+
+
+def _sides(lower: Float[ndarray, "3"], upper: Float[ndarray, "3"]) -> list[tuple[Float[ndarray, "3"], float]]:
+    """A box as six planes: normals outwards, and offsets [m]."""
+    axes = np.eye(3)
+    return [*zip(axes, upper, strict=True), *zip(-axes, -lower, strict=True)]
+
+
+def _basis(normal: Float[ndarray, "3"]) -> Float[ndarray, "3 2"]:
+    """Two unit vectors of a plane, which with its normal are right-handed; the first is level."""
+    level = np.cross((0.0, 0.0, 1.0), normal)
+    length = np.linalg.norm(level)
+    level = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])  # of floor and ceiling any is level
+    return np.stack((level, np.cross(normal, level)), 1)
+
+
+def _rectangle(origin, basis, low, high) -> Float[ndarray, "4 3"]:
+    """Corners, counterclockwise against the normal."""
+    flat = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+    return origin + flat @ basis.T
+
+
+def _cut(corners: Float[ndarray, "c 3"], normal: Float[ndarray, "3"], offset: float) -> Float[ndarray, "k 3"]:
+    """What of a convex polygon lies where normal . x <= offset.
+
+    Source: Sutherland and Hodgman, Reentrant polygon clipping, 1974.
+    """
+    heights = corners @ normal - offset
+    kept = []
+    for k in range(len(corners)):
+        here, there = corners[k - 1], corners[k]
+        above, below = heights[k - 1], heights[k]
+        if (above > 0) != (below > 0):
+            kept.append(here + above / (above - below) * (there - here))
+        if below <= 0:
+            kept.append(there)
+    return np.array(kept).reshape(-1, 3)
+
+
+@torch.no_grad()
+def learnt_room(placement: Mirrored, links: Links) -> shapes.LearntRoom:
+    """What figures show: the room by the training links, and the strongest paths of the first test transmitter."""
+    found = survey(placement, some(links.query[links.split.train]))
+    test = links.query[links.split.test]
+    first = (test.transmitters == test.transmitters[:1]).all(1)
+    if test.frequencies is not None:
+        first &= test.frequencies == test.frequencies[:1]
+    matter = None
+    if placement.obstacles is not None:
+        blobs = placement.obstacles
+        parts = blobs.centres, blobs.widths, NEPER * blobs.densities
+        matter = shapes.Matter(*(part.cpu().double().numpy() for part in parts))
+    return shapes.LearntRoom(outlines(placement, found), matter, strongest(survey(placement, test[first])))
+
+
+def strongest(found: Survey) -> list[shapes.Path]:
+    """The strongest paths of all links, at most ``PATHS`` and no fainter than ``FAINTEST_DB`` below the strongest."""
+    powers = found.powers / found.powers.max(initial=np.finfo(float).tiny)
+    order = np.argsort(-powers, axis=None)[:PATHS]
+    paths = []
+    for link, path in zip(*np.unravel_index(order, powers.shape), strict=True):
+        if powers[link, path] < 10 ** (-FAINTEST_DB / 10):
+            break
+        bounces = found.bounces[link, path][found.words[path] >= 0]
+        points = np.concatenate((found.transmitters[link, None], bounces, found.receivers[link, None]))
+        paths.append(shapes.Path(points, 10 * math.log10(powers[link, path])))
+    return paths
+
+
+# --- files ---
+
+
+def export(placement: Mirrored, query: Query, folder: Path) -> None:
+    """Writes ``planes.obj``, and ``obstacles.ply`` where there are obstacles.
+
+    Args:
+        placement: What is written.
+        query: Links whose paths say how far planes reach.
+        folder: To write into.
+    """
+    found = survey(placement, query)
+    (folder / "planes.obj").write_text(wavefront_obj(placement, found))
+    if placement.obstacles is not None:
+        save_obstacles(placement, folder / "obstacles.ply")
+
+
+def wavefront_obj(placement: Mirrored, found: Survey) -> str:
+    """The planes as a Wavefront OBJ file [m]: an object of one face each, counterclockwise as seen from outside."""
+    planes = _planes(placement, found)
+    lines = [
+        "# Planes learnt by gaigs; coordinates in metres, z up, the world frame of the data.",
+        "# loss: of a reflection at normal incidence; share: of the received power that comes by way of the plane.",
+    ]
+    count = 0
+    for plane in outlines(placement, found):
+        k = plane.number
+        normal = " ".join(f"{part:.4f}" for part in plane.normal)
+        lines += [
+            f"# normal {normal}, offset {planes.offsets[k]:.3f} m, loss {planes.losses[k]:.1f} dB",
+            f"# share {100 * plane.share:.2f} %",
+            f"o plane_{k}",
+            *("v " + " ".join(f"{part:.4f}" for part in corner) for corner in plane.corners),
+            "f " + " ".join(str(count + corner + 1) for corner in range(len(plane.corners))),
+        ]
+        count += len(plane.corners)
+    return "\n".join(lines) + "\n"
+
+
+@torch.no_grad()
+def save_obstacles(placement: Mirrored, path: Path) -> None:
+    """Writes the obstacles as a .ply that 3-D Gaussian splatting viewers open: grey, and opaque as they are lossy.
+
+    The opacity is the share of power that the middle of an obstacle takes, for its mean width.
+    """
+    blobs = placement.obstacles
+    depths = blobs.densities * math.sqrt(2 * math.pi) * blobs.widths.log().mean(1).exp()
+    # log((1 - t) / t) with t = exp(-2 depth), without the difference that would lose all digits of a faint one.
+    logits = 2 * depths + torch.log(-torch.expm1(-2 * depths))
+    parts = {
+        "means": blobs.centres,
+        "quats": torch.tensor([1.0, 0, 0, 0]).expand(len(blobs), 4),
+        "log_scales": blobs.log_widths,
+        "opacity_logits": logits,
+        "signal": torch.zeros(len(blobs), 3, 1),
+    }
+    write_ply(path, parts, "gaigs: obstacles; places in metres; opacity: share of power lost through the middle")

@@ -1,0 +1,177 @@
+"""Mirrored Gaussians: our own predictor, which learns the walls of the room."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+from jaxtyping import Bool
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.data import Links
+from gaigs.model import _learnt_room
+from gaigs.model._plane_search import find_planes
+from gaigs.model.gaigs import GaussianSplatting
+from gaigs.propagation import carriers
+from gaigs.query import Batch, Query
+from gaigs.registry import register
+from gaigs.report.shapes import LearntRoom
+
+REACH, ROOM = 4.0, 0.03
+"""How far a plane is looked for on either side of where powers have put it: in wavelengths, and at least in diagonals
+of the room, since powers tell planes to some centimetres."""
+
+FINDS = 3
+"""Revisions that look for planes; phases count from the next one on."""
+
+TOLERANCE = 1e-3
+"""By how much more of the loss a part may be dropped: a tenth of what a plane must bring to be taken in."""
+
+BANDWIDTHS = (0.01, 1.0, 3.0, 10.0, 30.0, 100.0)
+"""Tried where the data say none, times the speed of light over the room's diagonal: from a carrier, where all paths
+interfere, to a band in which hardly two do."""
+
+STEPS = 10
+"""Steps of that search a wavelength: a reflected path changes by twice of it."""
+
+
+@register("model", "mirrored")
+class Mirrored(GaussianSplatting):
+    """The splatting pipeline with Gaussians at mirror images, learnt from coarse to fine.
+
+    Powers alone are looked at first: they tell planes to some centimetres. Then phases count too: each plane is moved
+    along its normal to where the loss is least, by steps of a fraction of the wavelength, and descent goes on.
+
+    Args:
+        As for ``GaussianSplatting``, with a placement ``mirrored``.
+
+    Source: ours; docs/methods.md.
+    """
+
+    name = "mirrored"
+    revisions = (0.0, 0.06, 0.12, 0.25, 0.5, 0.75)
+
+    places: Query | None = None  # set by fit
+
+    def fit(self, links: Links) -> None:
+        """As the pipeline's; and remembers some places, by which the paths' powers are told."""
+        super().fit(links)
+        self.places = _learnt_room.some(links.query[links.split.train])
+
+    def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
+        """Looks for more planes; has phases count; searches planes by them; drops what does not help."""
+        if number < FINDS:
+            told = find_planes(self, train, validation, loss)
+            self.placement.most.fill_(self.placement.kept.sum())
+            return told
+        if number == FINDS + 2:
+            return self._prune([batch for batch in (train, validation) if batch is not None], loss)
+        placement = self.placement
+        try:
+            wavelength = speed_of_light / carriers(self.scene, train.query).mean().item()
+        except ValueError:
+            return "frequencies are unknown, so powers add to the end"
+        if number == FINDS:
+            placement.sharpen(wavelength)
+            if self.scene.bandwidth is None and placement.log_bandwidth is not None:
+                self._choose_bandwidth(wavelength, train, loss)
+        if placement.fixed:
+            return "phases count"
+        before = loss(train)
+        moved = [self._search(plane, wavelength, train, loss) for plane in placement.used.tolist()]
+        told = ", ".join(f"{move:+.3f}" for move in moved)
+        return f"phases count; planes moved by {told} m; loss {before:.4f} -> {loss(train):.4f}"
+
+    # --- what a run reports of it ---
+
+    def facts(self) -> dict[str, object]:
+        """Beside the rasterizer: how many planes and paths there are and were, and what each plane does."""
+        placement = self.placement
+        facts = super().facts() | {
+            "num_gaussians": int(placement.kept.sum()) + (0 if self.gaussians is None else len(self.gaussians)),
+            "planes_kept": len(placement.used),
+            "paths_kept": int(placement.kept.sum()),
+            "paths_most": int(placement.most),
+        }
+        return facts if self.places is None else facts | _learnt_room.facts(placement, self.places)
+
+    def export(self, folder: Path) -> None:
+        """``planes.obj`` and ``obstacles.ply`` beside the free Gaussians."""
+        super().export(folder)
+        _learnt_room.export(self.placement, self.places, folder)
+
+    def learnt_room(self, links: Links) -> LearntRoom:
+        """Planes, obstacles and paths for figures."""
+        return _learnt_room.learnt_room(self.placement, links)
+
+    # --- which planes ---
+
+    def _prune(self, batches: list[Batch], loss: Callable[[Batch], float]) -> str:
+        """Drops planes, then paths, weakest first, without which the loss is no higher on any of the batches."""
+        placement = self.placement
+        planes, paths = len(placement.used), int(placement.kept.sum())
+        before = [loss(batch) for batch in batches]
+
+        def is_good(kept: Bool[Tensor, "n"]) -> bool:
+            placement.kept.copy_(kept)
+            return all(loss(batch) <= old * (1 + TOLERANCE) for batch, old in zip(batches, before, strict=True))
+
+        best = placement.kept.clone()
+        for plane in placement.used.tolist():
+            without = best & ~(placement.words == plane).any(1)
+            best = without if is_good(without) else best
+        placement.kept.copy_(best)
+        query, _ = batches[0].query.unique(with_receivers=True)
+        powers = placement(None, query).gains.abs().square()
+        shares = (powers / powers.sum(1, keepdim=True)).mean(0)
+        weakest = best.nonzero()[:, 0][shares.argsort()]
+        low, high = 0, len(weakest) - 1
+        while low < high:  # the largest number of them that may go, by bisection
+            middle = (low + high + 1) // 2
+            without = best.index_fill(0, weakest[:middle], False)
+            low, high = (middle, high) if is_good(without) else (low, middle - 1)
+        placement.kept.copy_(best.index_fill(0, weakest[:low], False))
+        return (
+            f"{planes - len(placement.used)} of {planes} planes and {paths - int(placement.kept.sum())} of {paths} "
+            f"paths dropped; loss {before[0]:.4f} -> {loss(batches[0]):.4f}"
+        )
+
+    # --- where planes are ---
+
+    def _choose_bandwidth(self, wavelength: float, batch: Batch, loss: Callable[[Batch], float]) -> None:
+        """Takes the bandwidth with which moving the two strongest planes lowers the loss most.
+
+        Without a bandwidth no plane is right, and without planes no bandwidth is: so both are tried together.
+        """
+        placement = self.placement
+        query, _ = batch.query.unique(with_receivers=True)
+        powers = placement(None, query).gains.abs().square().mean(0)
+        words = placement.words[placement.kept]
+        used = placement.used.tolist()
+        used.sort(key=lambda plane: -powers[(words == plane).any(1)].sum())
+        origin, losses = placement.origin.clone(), {}
+        for rooms in BANDWIDTHS:
+            placement.log_bandwidth.fill_(math.log(rooms * speed_of_light / placement.diagonal))
+            for plane in used[:2]:
+                self._search(plane, wavelength, batch, loss)
+            losses[rooms] = loss(batch)
+            placement.origin.copy_(origin)
+        best = min(losses, key=losses.__getitem__)
+        placement.log_bandwidth.fill_(math.log(best * speed_of_light / placement.diagonal))
+
+    def _search(self, plane: int, wavelength: float, batch: Batch, loss: Callable[[Batch], float]) -> float:
+        """Moves a plane along its normal to where the loss is least; by how much [m]."""
+        origin = self.placement.origin[plane]
+        start = origin[3].item()
+        reach, step = max(REACH * wavelength, ROOM * self.placement.diagonal), wavelength / STEPS
+        count = round(reach / step)
+        moves = [step * k for k in range(-count, count + 1)]
+        losses = []
+        with self.placement.holding():
+            loss(batch)
+            for move in moves:
+                origin[3] = start + move
+                losses.append(loss(batch))
+        best = moves[min(range(len(moves)), key=losses.__getitem__)]
+        origin[3] = start + best
+        return best

@@ -1,0 +1,144 @@
+"""Obstacles: Gaussians that stand in the room and dim every path that passes through them, as in tomography."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+WIDTH = 0.05
+"""Standard deviation at the start, in diagonals of the room: a piece of furniture is some tenths of a room wide."""
+
+DENSITY = 0.8
+"""At the centre, at the start [Np] a diagonal of the room: a path through one is dimmed by a fraction of a decibel."""
+
+UNIT = 0.12
+"""What a step of 1 in their places is, in diagonals of the room, so that learning rates suit rooms of any size."""
+
+MARGIN = 0.05
+"""By how much their box is longer than that of transmitters and receivers at each end, in its edges."""
+
+
+class Obstacles(nn.Module):
+    """Gaussians of matter: along a segment the field falls by exp(-depth).
+
+    depth = sum_i rho_i integral exp(-|S_i^-1 (x - c_i)|² / 2) dx along the segment, S_i = diag(widths), a closed form:
+    with the ray a + t (b - a) in units of the widths, A = |ray|², B = ray . offset, C = |offset|²,
+
+        depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B / sqrt(2 A)))
+
+    Args:
+        count: How many.
+        lower, upper: Corners of the box that holds transmitters and receivers [m].
+
+    Source: the integral of a Gaussian along a line; Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
+    """
+
+    def __init__(self, count: int, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]):
+        super().__init__()
+        edges = upper - lower
+        diagonal = float(edges.norm())
+        low, high = lower - MARGIN * edges, upper + MARGIN * edges
+        self.register_buffer("origin", (low + high) / 2)
+        self.register_buffer("unit", torch.tensor(diagonal * UNIT))
+        self.places = nn.Parameter((torch.rand(count, 3) - 0.5) * (high - low) / self.unit)
+        self.log_widths = nn.Parameter(torch.full((count, 3), math.log(WIDTH * diagonal)))
+        self.log_densities = nn.Parameter(torch.full((count,), math.log(DENSITY / diagonal)))
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    @property
+    def centres(self) -> Float[Tensor, "k 3"]:
+        """World frame [m]."""
+        return self.origin + self.unit * self.places
+
+    @property
+    def widths(self) -> Float[Tensor, "k 3"]:
+        """Standard deviations along the world's axes [m]."""
+        return self.log_widths.exp()
+
+    @property
+    def densities(self) -> Float[Tensor, "k"]:
+        """At the centres [Np/m]."""
+        return self.log_densities.exp()
+
+    def forward(self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Optical depth along segments [Np]."""
+        return _Depth.apply(start, end, self.centres, self.log_widths, self.log_densities)
+
+
+class _Depth(torch.autograd.Function):
+    """The depth with its gradient written by hand, in half the time of the recorded one.
+
+    With r = sqrt(1 / (2 A)), g = exp(-(C - B²/A) / 2), E = erf((A + B) r) - erf(B r), depth = rho l sqrt(pi) r g E, and
+    d E = 2 / sqrt(pi) (e1 d((A + B) r) - e0 d(B r)) with e1 = exp(-((A + B) r)²), e0 = exp(-(B r)²).
+    """
+
+    @staticmethod
+    def forward(ctx, start, end, centres, log_widths, log_densities):
+        ctx.shape = start.shape
+        start, end = start.reshape(-1, 3), end.reshape(-1, 3)
+        *_, r, near, inside, length = _parts(start, end, centres, log_widths)
+        each = near * inside * r * (log_densities.exp() * math.sqrt(math.pi))
+        ctx.save_for_backward(start, end, centres, log_widths, log_densities)
+        return (each.sum(-1) * length).view(ctx.shape[:-1])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        start, end, centres, log_widths, log_densities = ctx.saved_tensors
+        a, b, r, near, inside, length = _parts(start, end, centres, log_widths)
+        gradient = gradient.reshape(-1, 1)
+        scale = gradient * length[:, None] * (log_densities.exp() * math.sqrt(math.pi))
+        rate = scale * near * r  # of the depth by E
+        each = rate * inside
+        ratio = b / a
+        slope = rate * r * (2 / math.sqrt(math.pi))
+        e1 = ((a + b) * r).square_().neg_().clamp_min_(FAINTEST).exp_() * slope
+        e0 = (b * r).square_().neg_().clamp_min_(FAINTEST).exp_() * slope
+        # r = (2 A)^-1/2, so d r = -r / (2 A) dA; d of the exponent: -dC/2 + (B/A) dB - (B/A)²/2 dA.
+        d_a = e1 * (0.5 - 0.5 * ratio) + e0 * (0.5 * ratio) - each * (0.5 / a + 0.5 * ratio * ratio)
+        d_b = e1 - e0 + each * ratio
+        d_c = -0.5 * each
+        widths = (-2 * log_widths).exp()  # inverse squares
+        ray = end - start
+        # A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w: sums are products of matrices.
+        rows, columns = (torch.stack((d_a, d_b, d_c)) @ part for part in (widths, centres * widths))
+        d_ray = 2 * ray * rows[0] + start * rows[1] - columns[1]
+        d_offset = ray * rows[1] + 2 * (start * rows[2] - columns[2])
+        unit = ray / length.clamp_min(1e-30)[:, None]  # a leg of no length has no direction, and its ray is 0
+        d_length = (each.sum(-1) / length.clamp_min(1e-30))[:, None] * unit
+        d_end = d_ray + d_length
+        d_start = d_offset - d_end
+        by_ray, by_start, ones = d_b.T @ ray, d_c.T @ start, d_c.sum(0)[:, None]
+        d_centres = -(by_ray + 2 * (by_start - centres * ones)) * widths
+        # d log width: -2 (A's, B's and C's share of the axis)
+        squares = d_a.T @ ray.square() + d_b.T @ (ray * start) - by_ray * centres
+        squares = squares + d_c.T @ start.square() - 2 * centres * by_start + centres.square() * ones
+        d_densities = each.sum(0)
+        return d_start.view(ctx.shape), d_end.view(ctx.shape), d_centres, -2 * squares * widths, d_densities
+
+
+SHORTEST = 1e-8
+"""Smallest squared length of a ray in widths: a tenth of a thousandth of a width, within which nothing changes."""
+
+FAINTEST = -80.0
+"""Smallest exponent: exp(-80) is nothing, and float32's exponential takes four times as long where it underflows."""
+
+
+def _parts(start, end, centres, log_widths):
+    """A, B, r, g, E of each segment and obstacle (s, k), and the segments' lengths (s,)."""
+    inverse = (-log_widths).exp()
+    weights = inverse.square()
+    ray = end - start
+    # C - B²/A is the squared distance of a line from a centre: small differences of large numbers unless about centres.
+    offsets = [(start[:, axis, None] - centres[:, axis]) * inverse[:, axis] for axis in range(3)]
+    rays = [ray[:, axis, None] * inverse[:, axis] for axis in range(3)]
+    a = (ray.square() @ weights.T).clamp_min_(SHORTEST)
+    b = rays[0] * offsets[0] + rays[1] * offsets[1] + rays[2] * offsets[2]
+    c = offsets[0].square() + offsets[1].square() + offsets[2].square()
+    r = (2 * a).rsqrt()
+    near = (b * b / a - c).clamp_(2 * FAINTEST, 0).div_(2).exp_()
+    inside = torch.erf((a + b) * r) - torch.erf(b * r)
+    return a, b, r, near, inside, ray.norm(dim=-1)

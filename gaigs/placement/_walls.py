@@ -1,0 +1,95 @@
+"""Walls that a user knows: planes from a floor plan or a mesh."""
+
+import itertools
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.data._files import refuse
+from gaigs.data.nerf2_rssi import read_walls
+
+SAME_TURN, SAME_PLACE = 0.02, 0.02
+"""Planes are one where their normals differ by less [rad], and their offsets by less [m]."""
+
+SHORTEST = 1e-3
+"""Walls and edges of faces shorter than this have no direction [m]."""
+
+
+def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> Float[Tensor, "k 4"]:
+    """Planes of a room as rows (normal, offset [m]), those of the largest area first.
+
+    Args:
+        file: ``.csv`` with consecutive vertices x,y of a floor plan [m], whose walls are upright, or ``.obj`` with the
+            faces of a mesh [m].
+        lower, upper: Corners of the box of transmitters and receivers: of a floor plan, floor and ceiling are there.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is of another kind, damaged, or holds no plane.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"no walls at {file}; set placement.walls to a .csv or .obj, or to null")
+    if file.suffix == ".csv":
+        defects: list[str] = []
+        ends = read_walls(file, defects)
+        refuse(file.parent, defects)
+        along = ends[:, 1] - ends[:, 0]
+        lengths = along.norm(dim=1)
+        normals = torch.stack((along[:, 1], -along[:, 0], 0 * lengths), 1)
+        level = torch.tensor([[0.0, 0.0, 1.0, upper[2]], [0.0, 0.0, -1.0, -lower[2]]])
+        walls = _merged(normals[lengths > SHORTEST], ends[lengths > SHORTEST, 0], lengths[lengths > SHORTEST])
+        planes = torch.cat((walls[:4], level, walls[4:]))  # a room has floor and ceiling before a fifth wall
+    elif file.suffix == ".obj":
+        planes = _merged(*_faces(file))
+    else:
+        raise ValueError(f"placement.walls must be a .csv or .obj, got {file.name}")
+    if not len(planes):
+        raise ValueError(f"{file} must hold walls, and there is none longer than {SHORTEST} m")
+    return planes
+
+
+def _faces(file: Path) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f"]]:
+    """Normals, a point and area of each triangle of a mesh."""
+    vertices, triangles = [], []
+    for number, line in enumerate(file.read_text().splitlines(), 1):
+        word, *rest = line.split("#")[0].split() or [""]
+        try:
+            if word == "v":
+                vertices.append([float(value) for value in rest[:3]])
+            elif word == "f":
+                corners = [int(value.split("/")[0]) for value in rest]
+                corners = [k - 1 if k > 0 else len(vertices) + k for k in corners]  # negative ones count from the end
+                triangles += [(corners[0], *pair) for pair in itertools.pairwise(corners[1:])]
+        except ValueError as error:
+            raise ValueError(f"{file}, line {number}, must hold numbers, got {line.strip()!r}") from error
+    count = len(vertices)
+    if any(len(vertex) < 3 for vertex in vertices) or any(not 0 <= k < count for face in triangles for k in face):
+        raise ValueError(f"{file} must hold faces of vertices x y z, and a face or a vertex lacks some")
+    if not triangles:
+        return torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0)
+    corners = torch.tensor(vertices)[torch.tensor(triangles)]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = normals.norm(dim=1) / 2
+    large = areas > SHORTEST**2
+    return normals[large], corners[large, 0], areas[large]
+
+
+def _merged(
+    normals: Float[Tensor, "f 3"], points: Float[Tensor, "f 3"], sizes: Float[Tensor, "f"]
+) -> Float[Tensor, "k 4"]:
+    """Planes through points, those that are one taken together, by falling size."""
+    normals = normals / normals.norm(dim=1, keepdim=True)
+    rows: list[list] = []  # normal, offset, size
+    for normal, point, size in zip(normals, points, sizes, strict=True):
+        offset = normal @ point
+        for row in rows:
+            turned = 1.0 if row[0] @ normal > 0 else -1.0
+            if (row[0] - turned * normal).norm() < SAME_TURN and abs(row[1] - turned * offset) < SAME_PLACE:
+                row[2] += size
+                break
+        else:
+            rows.append([normal, offset, size])
+    rows.sort(key=lambda row: -row[2])
+    return torch.stack([torch.cat((normal, offset[None])) for normal, offset, _ in rows]) if rows else torch.zeros(0, 4)

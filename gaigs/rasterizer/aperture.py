@@ -1,0 +1,153 @@
+"""No pixels: what splats send to each element of a planar array, summed in closed form."""
+
+import math
+
+import torch
+from jaxtyping import Complex, Float
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.projection import Splats
+from gaigs.registry import register
+from gaigs.scene import Array
+
+FLAT = 1e-6
+"""An array whose elements leave its plane by no more than this is planar [m]: float32 places metres no better."""
+
+
+@register("rasterizer", "aperture")
+class Aperture:
+    """Sums splats of the plane of direction cosines in the array's aperture, where a footprint's integral is known.
+
+    A splat holds in all the amplitude A, spread over directions u about its centre as a Gaussian with covariance S. An
+    element at x, in wavelengths, hears of it
+
+        y(x) = A exp(-(2 pi)² x' S x / 2 + j 2 pi x . u)
+
+    and where powers add, the covariance of elements a lag D apart is sum |A|² exp(-(2 pi)² D' S D / 2 + j 2 pi D . u).
+    Nothing hides anything else: there is no depth order, and opacities scale amplitudes alone.
+
+    Attributes:
+        used: As of every rasterizer.
+
+    Source: ours; the Fourier transform of a Gaussian, and Van Trees, Optimum Array Processing, 2002, section 2.2.
+    """
+
+    used = "aperture"
+    draws_map = False
+
+    def fields(
+        self,
+        splats: Splats,
+        amplitudes: Complex[Tensor, "b n"],
+        lengths: Float[Tensor, "b n"],
+        array: Array,
+        carriers: Float[Tensor, "b"],
+        offsets: Float[Tensor, "b s"],
+    ) -> Complex[Tensor, "b e s"]:
+        """What each element hears at several frequencies, all splats interfering.
+
+        Args:
+            splats: On the plane of direction cosines.
+            amplitudes: At the carrier, in the array's middle.
+            lengths: Of the paths, by which phases differ from that at the carrier [m].
+            array: Whose elements; planar.
+            carriers: Of each query [Hz].
+            offsets: Frequencies over the carrier [Hz].
+
+        Raises:
+            ValueError: The array is not planar.
+        """
+        _check_planar(array)
+        steering = self._steering(splats, array, carriers)
+        phases = -2 * math.pi / speed_of_light * lengths[..., None] * offsets[:, None].to(lengths)
+        # The elements' places are a few wavelengths at the most, over which the frequencies of a band hardly differ.
+        waves = _seen(splats, amplitudes)[..., None] * torch.polar(torch.ones_like(phases), phases)
+        return steering.mT @ waves
+
+    def lags(
+        self,
+        splats: Splats,
+        amplitudes: Complex[Tensor, "b n"],
+        lengths: Float[Tensor, "b n"],
+        coherences: Float[Tensor, "n"],
+        bandwidth: Float[Tensor, ""] | None,
+        array: Array,
+        carriers: Float[Tensor, "b"],
+    ) -> Complex[Tensor, "b l"]:
+        """The mean covariance of elements ``array.lags`` apart, of all pairs with that lag; of lag 0 it is the power.
+
+        Two splats interfere by the product of their coherences, and over a band by sinc(bandwidth (t - t')), with t
+        their paths' delays: what averaging over the band leaves of cos(2 pi f (t - t')).
+
+        Args:
+            splats, amplitudes, lengths, array, carriers: As for ``fields``.
+            coherences: Of each splat, in [0, 1].
+            bandwidth: Of the band [Hz]; None: the carrier alone.
+
+        Raises:
+            ValueError: The array is not planar.
+        """
+        _check_planar(array)
+        amplitudes = _seen(splats, amplitudes)
+        steps, pairs, counts = (part.to(amplitudes.device) for part in array.lags)
+        steps, counts = steps.to(lengths), counts.to(lengths)
+        centres, covariances = self._directions(splats, len(amplitudes))
+        wavelengths = speed_of_light / carriers.to(lengths)[:, None, None]
+        # Half of the lags are the conjugates of the others.
+        half = len(steps) // 2
+        angles = 2 * math.pi / wavelengths * (centres @ steps[half:, :2].T)
+        narrow = _footprints(covariances, steps[half:, :2], wavelengths)
+        powers = amplitudes.abs().square() * (1 - coherences.square())
+        real, imaginary = ((powers[..., None] * narrow * part).sum(1) for part in (angles.cos(), angles.sin()))
+        later = torch.complex(real, imaginary)
+        found = torch.cat((later[:, 1:].conj().flip(1), later), 1)
+        if not coherences.any():
+            return found
+        waves = amplitudes * coherences
+        steering = self._steering(splats, array, carriers)
+        if bandwidth is None:
+            heard = (waves[:, None] @ steering).mT
+            covariance = heard @ heard.mH
+        else:
+            delays = lengths / speed_of_light
+            likeness = torch.sinc(bandwidth * (delays[:, :, None] - delays[:, None]))
+            together = waves[:, :, None] * waves[:, None].conj() * likeness
+            covariance = steering.mT @ together @ steering.conj()
+        added = torch.zeros_like(found).index_add(1, pairs, covariance.flatten(1))
+        return found + added / counts
+
+    def _steering(self, splats: Splats, array: Array, carriers: Float[Tensor, "b"]) -> Complex[Tensor, "b n e"]:
+        """What each element hears of a splat of amplitude 1."""
+        centres, covariances = self._directions(splats, len(carriers))
+        elements = array.elements.to(centres)
+        wavelengths = speed_of_light / carriers.to(centres)[:, None, None]
+        angles = 2 * math.pi / wavelengths * (centres @ elements[:, :2].T)
+        return torch.polar(_footprints(covariances, elements[:, :2], wavelengths), angles)
+
+    def _directions(self, splats: Splats, count: int) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2 2"]]:
+        """Centres and covariances of each query's splats."""
+        centres = splats.means2d if splats.means2d.ndim == 3 else splats.means2d[None]
+        return centres.expand(count, -1, -1), splats.covariances2d.expand(count, -1, -1, -1)
+
+
+def _check_planar(array: Array) -> None:
+    heights = array.elements[:, 2].abs()
+    if (heights > FLAT).any():
+        raise ValueError(
+            "rasterizer 'aperture' takes planar arrays, whose elements have z = 0 in the array's frame, got z up to "
+            f"{heights.max():.3g} m; take rasterizer=fastest with pooling=array_response"
+        )
+
+
+def _seen(splats: Splats, amplitudes: Complex[Tensor, "b n"]) -> Complex[Tensor, "b n"]:
+    """Amplitudes, 0 of what sits on the receiver and has no direction."""
+    return torch.where(splats.visible, amplitudes, 0)
+
+
+def _footprints(
+    covariances: Float[Tensor, "b n 2 2"], steps: Float[Tensor, "k 2"], wavelengths: Float[Tensor, "b 1 1"]
+) -> Float[Tensor, "b n k"]:
+    """exp(-(2 pi)² D' S D / 2) of each splat and step D [m]."""
+    squares = (steps[:, :, None] * steps[:, None]).flatten(1)
+    return ((-0.5 * (2 * math.pi / wavelengths) ** 2) * (covariances.flatten(2) @ squares.T)).exp()

@@ -1,0 +1,63 @@
+"""Revisions: what a model changes in itself between two steps."""
+
+import logging
+
+import torch
+from jaxtyping import Int
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor
+
+from gaigs.data import Links
+from gaigs.query import Batch
+from gaigs.training import seeded
+
+log = logging.getLogger(__name__)
+
+LINKS = 48
+"""Links that a revision looks at, of those that train and of those that validate: a search takes hundreds of looks."""
+
+
+class Revision(Callback):
+    """Calls ``Model.revise`` after the shares of the training that the model asks for.
+
+    All processes look at the same links, so that they decide alike.
+
+    Args:
+        links: What is trained on.
+        seed: Says which of them.
+    """
+
+    def __init__(self, links: Links, seed: int):
+        self.links, self.seed = links, seed
+
+    def on_train_start(self, trainer, module) -> None:
+        if trainer.global_step == 0:
+            self._revise(trainer, module)
+
+    def on_train_batch_end(self, trainer, module, *_) -> None:
+        self._revise(trainer, module)
+
+    @torch.no_grad()
+    def _revise(self, trainer, module) -> None:
+        for number, share in enumerate(module.model.revisions):
+            if trainer.global_step != round(share * trainer.max_steps):
+                continue
+            split = self.links.split
+            train, validation = (self._batch(module, part, number) for part in (split.train, split.validation))
+            # As for every prediction that is no training step.
+            module.eval()
+            told = module.model.revise(number, train, validation, lambda batch: loss_of(module, batch))
+            module.train()
+            log.info("step %d: %s", trainer.global_step, told)
+
+    def _batch(self, module, index: Int[Tensor, "k"], number: int) -> Batch | None:
+        if not len(index):
+            return None
+        generator = seeded(self.seed, number, len(index))
+        chosen = index[torch.randperm(len(index), generator=generator)[:LINKS].sort().values]
+        return module.thin(self.links.batch(chosen).to(module.device), generator)
+
+
+def loss_of(module, batch: Batch) -> float:
+    """The loss of a module's model as it stands, without penalties."""
+    return module.loss(module.model(batch).value, batch)[0].item()

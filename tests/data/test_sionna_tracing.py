@@ -1,0 +1,300 @@
+"""The ray tracer's paths against mirror images and slabs, what is needed to run it, and what is kept on disk."""
+
+import math
+import re
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.constants import speed_of_light
+from scipy.spatial.transform import Rotation
+
+from gaigs.data.sionna import cache, tracing
+from gaigs.data.sionna.meshes import THICKNESS, Cuboid, Mesh
+from gaigs.data.sionna.rooms import ROOMS
+from gaigs.data.synthetic import image_source
+from gaigs.geometry import Pose
+from gaigs.scene import Array, Receiver
+
+FREQUENCY = 6e9
+RECEIVER = torch.tensor([0.0, 0.0, 1.0])
+PLATE = ((-3.0, -3.0, 0.0), (3.0, -3.0, 0.0), (3.0, 3.0, 0.0), (-3.0, 3.0, 0.0))
+FLOOR = Mesh("floor", "metal", PLATE, ((0, 1, 2, 3),))
+WALL = Mesh("wall", "metal", tuple((x, 2.0, y + 1.0) for x, y, _ in PLATE), ((0, 1, 2, 3),))
+BOARD = Mesh("board", "wood", tuple((1.0, x, y + 1.0) for x, y, _ in PLATE), ((0, 1, 2, 3),))
+
+
+def strong(paths, row=0):
+    """Images and gains of a transmitter's paths, strongest field first, without the padding."""
+    kept = paths.gains[row] != 0
+    return paths.images[row][kept].numpy(), paths.gains[row][kept].numpy()
+
+
+# --- paths ---
+
+
+@pytest.fixture(scope="module")
+def over_floor(tracer):
+    """Two transmitters over a plate of metal, and more than are traced at a time."""
+    places = torch.tensor([[1.5, 0.5, 0.8], [-1.0, 1.2, 1.6]]).repeat(6, 1)
+    return places, tracer.trace([FLOOR], RECEIVER, places, FREQUENCY)
+
+
+def test_a_floor_of_metal_mirrors_the_transmitter(over_floor):
+    places, paths = over_floor
+    for row, place in enumerate(places.double().numpy()):
+        images, gains = strong(paths, row)
+        assert len(gains) == 2
+        np.testing.assert_allclose(images, [place, place * (1, 1, -1)], atol=1e-4)
+        np.testing.assert_allclose(gains, [1, 1], atol=0.02)  # as a vertical field over a conductor
+
+
+def test_a_wall_of_metal_turns_the_vertical_field_around(tracer):
+    images, gains = strong(tracer.trace([WALL], RECEIVER, torch.tensor([[1.5, -0.5, 1.0]]), FREQUENCY))
+    np.testing.assert_allclose(images, [(1.5, -0.5, 1), (1.5, 4.5, 1)], atol=1e-4)
+    np.testing.assert_allclose(gains, [1, -1], atol=0.02)
+
+
+def test_two_mirrors_make_three_images_and_no_more(tracer):
+    places = torch.tensor([[1.5, -0.5, 0.7]])
+    images, gains = strong(tracer.trace([FLOOR, WALL], RECEIVER, places, FREQUENCY))
+    expected = {(1.5, -0.5, 0.7), (1.5, -0.5, -0.7), (1.5, 4.5, 0.7), (1.5, 4.5, -0.7)}
+    assert {tuple(image) for image in images.round(3).tolist()} == expected
+    np.testing.assert_allclose(np.abs(gains), 1, atol=0.02)
+
+
+@pytest.mark.parametrize("frequency", [0.45e9, 6e9, 28e9])
+def test_a_board_lets_through_what_a_slab_does(tracer, frequency):
+    """At normal incidence: Airy's formula for the slab, with the board's thickness of air left out of the way."""
+    images, gains = strong(tracer.trace([BOARD], RECEIVER, torch.tensor([[2.0, 0.0, 1.0]]), frequency))
+    real, c, d = image_source.MATERIALS["wood"]
+    epsilon = real - 1j * c * (frequency / 1e9) ** d / (2 * math.pi * frequency * 8.8541878128e-12)
+    index = np.sqrt(epsilon)
+    phase = np.exp(-2j * math.pi * frequency / speed_of_light * index * THICKNESS["wood"])
+    r = (1 - index) / (1 + index)
+    expected = (1 - r**2) * phase / (1 - r**2 * phase**2)
+    np.testing.assert_allclose(images[0], (2, 0, 1), atol=1e-4)
+    assert abs(gains[0]) == pytest.approx(abs(expected), rel=1e-3)
+
+
+def test_what_leaves_out_the_weakest_keeps_nearly_all_power(tracer, monkeypatch):
+    room, place = ROOMS["slanted"], torch.tensor([[3.0, 1.5, 1.2]])
+    power = []
+    for weakest in (0.0, tracing.WEAKEST):
+        monkeypatch.setattr(tracing, "WEAKEST", weakest)
+        images, gains = strong(tracer.trace(room.meshes(), room.pose().position, place, FREQUENCY))
+        lengths = np.linalg.norm(images - room.pose().position.numpy(), axis=1)
+        fields = np.abs(gains) / lengths
+        assert (np.diff(fields) <= 1e-9).all(), "strongest first"
+        power.append((len(gains), (fields**2).sum()))
+    (every, whole), (kept, rest) = power
+    assert kept < every
+    assert 1 - 1.1 * tracing.WEAKEST < rest / whole < 1
+
+
+def test_a_wave_bends_around_a_corner(tracer):
+    """A block of metal hides the transmitter; the shortest way leads over its edge, at the height of both."""
+    block = Cuboid("block", "metal", (0.5, 0.5, -3.0), (3.0, 3.0, 5.0)).mesh()
+    receiver, place = torch.tensor([0.0, 1.5, 1.0]), torch.tensor([[1.5, 0.0, 1.0]])
+    images, gains = strong(tracer.trace([block], receiver, place, FREQUENCY))
+    half = np.array([0.5, -1.0, 0.0])  # from the receiver to the edge
+    np.testing.assert_allclose(images, [receiver.numpy() + 2 * half], atol=1e-3)
+    assert 0.01 < abs(gains[0]) < 0.5  # at the shadow's boundary it is half the field
+
+
+def test_channel_is_reciprocal(tracer):
+    here, there = RECEIVER, torch.tensor([[1.5, -0.5, 0.7]])
+    forth = strong(tracer.trace([FLOOR, WALL], here, there, FREQUENCY))
+    back = strong(tracer.trace([FLOOR, WALL], there[0], here[None], FREQUENCY))
+    field = lambda found, start: sorted(np.linalg.norm(found[0] - start, axis=1).round(4))
+    assert field(forth, here.numpy()) == pytest.approx(field(back, there[0].numpy()), abs=2e-4)
+    assert forth[1].sum() == pytest.approx(back[1].sum(), abs=0.02)
+
+
+@pytest.mark.parametrize("frequency", [1e8, 5e10, math.nan])
+def test_frequencies_out_of_range_are_refused(frequency):
+    with pytest.raises(ValueError, match=r"frequency must lie in 3e\+08\.\.4e\+10 Hz, got"):
+        tracing.trace([FLOOR], RECEIVER, torch.tensor([[1.0, 1.0, 1.0]]), frequency)
+
+
+def test_a_transmitter_that_no_path_leads_to_is_named(tracer):
+    chest = Cuboid("chest", "metal", (1.0, 1.0, 0.5), (2.0, 2.0, 1.5)).mesh()
+    with pytest.raises(ValueError, match=r"got none to \[1\.5, 1\.5, 1\.0\]; move it"):
+        tracer.trace([chest], RECEIVER, torch.tensor([[1.5, 0.5, 1.0], [1.5, 1.5, 1.0]]), FREQUENCY)
+
+
+# --- what an array receives ---
+
+
+def test_responses_are_those_of_the_built_in_room_for_the_same_images():
+    room = image_source.Room((7.0, 5.0, 3.0), ("concrete", "glass", "brick", "wood", "concrete", "concrete"))
+    pose = Pose.from_xyzw((0.4, 0.5, 2.2), Rotation.from_euler("ZYX", (40, 130, 10), degrees=True).as_quat())
+    receiver = Receiver("gateway", pose, Array.planar(4, 4, 0.025, "cosine"))
+    places = torch.tensor([6.0, 4.0, 2.5]) * torch.rand(20, 3, generator=torch.Generator().manual_seed(0)) + 0.3
+    offsets = torch.tensor([-2e8, 0.0, 1e8])
+    paths = image_source.trace(room, places, pose.position, FREQUENCY, 2)
+    ours = tracing.respond(paths, receiver, FREQUENCY, offsets)
+    torch.testing.assert_close(ours, image_source.respond(room, places, receiver, FREQUENCY, offsets, 2))
+    with pytest.raises(ValueError, match="frequencies must be positive"):
+        tracing.respond(paths, receiver, FREQUENCY, torch.tensor([-7e9]))
+
+
+def test_a_band_is_sampled_finely_enough_for_its_longest_path():
+    offsets = tracing.frequency_offsets(ROOMS["l_shape"], 500e6)
+    assert offsets[[0, -1]].tolist() == [-250e6, 250e6]
+    assert (offsets[1] - offsets[0]).item() < speed_of_light / ((tracing.DEPTH + 1) * math.hypot(8, 6.6, 2.8))
+    with pytest.raises(ValueError, match="bandwidth must be positive"):
+        tracing.frequency_offsets(ROOMS["l_shape"], 0.0)
+
+
+# --- what it needs ---
+
+
+def test_a_missing_package_is_told_with_the_command_that_installs_it(monkeypatch):
+    def missing(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", missing)
+    with pytest.raises(ImportError, match=r"need sionna-rt: pip install 'gaigs\[sionna\]'"):
+        tracing.find_packages()
+
+
+@pytest.fixture
+def libraries(monkeypatch):
+    """Makes files of libLLVM of made-up versions the only ones that there are."""
+
+    def make(versions):
+        monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+        monkeypatch.setattr(tracing, "glob", lambda pattern: [*versions] if pattern.startswith("/usr/lib64/") else [])
+        monkeypatch.setattr(tracing, "llvm_version", lambda file: versions.get(file, 0))
+
+    return make
+
+
+def test_the_newest_llvm_is_taken(libraries):
+    libraries({"/a/libLLVM-14.so.1": 0, "/a/libLLVM.so.18.1": 18, "/a/libLLVM.so.19.1": 19, "/a/libLLVM-16.so": 16})
+    assert tracing.find_llvm() == "/a/libLLVM.so.19.1"
+
+
+@pytest.mark.parametrize(
+    ("versions", "message"),
+    [
+        ({}, "needs libLLVM 17 or later, got none; install it"),
+        ({"/a/libLLVM-16.so": 16}, r"got /a/libLLVM-16\.so \(16\); install it \(Debian: apt-get install libllvm19\)"),
+        ({"/a/libLLVM-14.so": 0}, r"got /a/libLLVM-14\.so \(no libLLVM of 16 or later\)"),
+    ],
+)
+def test_without_a_new_llvm_nothing_is_traced(libraries, monkeypatch, versions, message):
+    libraries(versions)
+    monkeypatch.setattr(tracing, "find_packages", dict)
+    with pytest.raises(RuntimeError, match=message):
+        tracing.trace([FLOOR], RECEIVER, torch.tensor([[1.0, 1.0, 1.0]]), FREQUENCY)
+
+
+def test_the_chosen_llvm_is_taken_and_checked(libraries, monkeypatch):
+    libraries({"/a/libLLVM.so.19.1": 19, "/b/mine.so": 17, "/b/old.so": 15})
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/b/mine.so")
+    assert tracing.find_llvm() == "/b/mine.so"
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/b/old.so")
+    with pytest.raises(RuntimeError, match=r"got /b/old\.so \(15\)"):
+        tracing.find_llvm()
+
+
+def test_the_version_is_that_of_the_library(tracer, tmp_path):
+    file = tracer.find_llvm()
+    name = re.search(r"libLLVM\D*(\d+)", Path(file).name)
+    if name is None:
+        pytest.skip(f"{file} does not bear its version")
+    assert tracing.llvm_version(file) == int(name[1])
+    (tmp_path / "libLLVM.so").write_text("no library")
+    assert tracing.llvm_version(str(tmp_path / "libLLVM.so")) == 0
+
+
+# --- what is kept on disk ---
+
+PATHS = image_source.Paths(
+    torch.tensor([[[1.0, 2.0, 3.25], [0.5, 0.25, 9.0]]]).double(),
+    torch.tensor([[0.5 - 0.25j, 0.0]], dtype=torch.complex128),
+)
+PLACE = torch.tensor([[2.0, 1.0, 1.0]])
+
+
+@pytest.fixture
+def traced(monkeypatch, tmp_path):
+    """The arguments that the tracer is called with, which gives the same paths always; the cache is empty."""
+    calls = []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(tracing, "find_packages", lambda: {"sionna-rt": "2.2.0"})
+    monkeypatch.setattr(tracing, "trace", lambda *arguments: calls.append(arguments) or PATHS)
+    return calls
+
+
+def test_paths_are_traced_once(traced, tmp_path):
+    room = ROOMS["slanted"]
+    first, again = (cache.find_paths(room, RECEIVER, PLACE, FREQUENCY) for _ in range(2))
+    assert len(traced) == 1
+    assert traced[0][0] == room.meshes()
+    for paths in (first, again):
+        assert torch.equal(paths.images, PATHS.images)
+        assert torch.equal(paths.gains, PATHS.gains)
+    (file,) = (tmp_path / "gaigs" / "sionna").iterdir()
+    assert file.suffix == ".npz", "and nothing half-written is left"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda patch: ("l_shape", RECEIVER, PLACE, FREQUENCY),
+        lambda patch: ("slanted", RECEIVER + 0.1, PLACE, FREQUENCY),
+        lambda patch: ("slanted", RECEIVER, PLACE + 0.1, FREQUENCY),
+        lambda patch: ("slanted", RECEIVER, PLACE, 5e9),
+        lambda patch: patch.setattr(tracing, "DEPTH", 2),
+        lambda patch: patch.setattr(tracing, "find_packages", lambda: {"sionna-rt": "2.3.0"}),
+        lambda patch: patch.setitem(tracing.THICKNESS, "wood", 0.03),
+        lambda patch: patch.setattr(cache, "VERSION", 2),
+    ],
+)
+def test_other_paths_are_traced_anew(traced, monkeypatch, change):
+    same = "slanted", RECEIVER, PLACE, FREQUENCY
+    cache.find_paths(ROOMS["slanted"], *same[1:])
+    name, *rest = change(monkeypatch) or same
+    cache.find_paths(ROOMS[name], *rest)
+    assert len(traced) == 2
+
+
+def test_paths_of_a_faster_process_stay(traced, monkeypatch):
+    other = image_source.Paths(2 * PATHS.images, 2 * PATHS.gains)
+
+    def slow(*arguments):
+        monkeypatch.setattr(tracing, "trace", lambda *arguments: other)
+        cache.find_paths(ROOMS["slanted"], RECEIVER, PLACE, FREQUENCY)
+        return PATHS
+
+    monkeypatch.setattr(tracing, "trace", slow)
+    assert torch.equal(cache.find_paths(ROOMS["slanted"], RECEIVER, PLACE, FREQUENCY).images, other.images)
+
+
+def test_a_damaged_file_is_named(traced, tmp_path):
+    cache.find_paths(ROOMS["slanted"], RECEIVER, PLACE, FREQUENCY)
+    (file,) = (tmp_path / "gaigs" / "sionna").iterdir()
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(ValueError, match=rf"{file} must be a whole file of paths, and is damaged .*; delete it"):
+        cache.find_paths(ROOMS["slanted"], RECEIVER, PLACE, FREQUENCY)
+
+
+def test_a_file_that_cannot_be_written_leaves_nothing(traced, tmp_path, monkeypatch):
+    def full(*arguments, **arrays):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match="No space left"):
+        cache.find_paths(ROOMS["slanted"], RECEIVER, PLACE, FREQUENCY)
+    assert not [*(tmp_path / "gaigs" / "sionna").iterdir()]
+
+
+def test_the_cache_lies_in_the_users_folder(monkeypatch, tmp_path):
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache.folder() == tmp_path / ".cache" / "gaigs" / "sionna"

@@ -1,0 +1,203 @@
+"""Mirrored Gaussians in the pipeline: told the walls, they predict what the simulator does."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from pipeline import NONE, PARTS
+from scipy.constants import speed_of_light
+
+from gaigs.data import Links, Split
+from gaigs.data.nerf2_spectrum import NORMALISATION
+from gaigs.data.synthetic import POSE, ROOM, patch_array, place, spectra
+from gaigs.data.synthetic.image_source import permittivity, respond, rss_dbm
+from gaigs.directions import Grid
+from gaigs.model.gaigs import GaussianSplatting
+from gaigs.model.mirrored import Mirrored
+from gaigs.query import Query
+from gaigs.scene import Array, Receiver
+from gaigs.task.csi import Csi
+from gaigs.task.rssi import Rssi
+from gaigs.task.spectrum import Spectrum
+from gaigs.testing import check_model, example_links
+
+CARRIER, BANDWIDTH = 6.4896e9, 499.2e6
+EMPTY = replace(ROOM, furniture=())
+MIRRORED = {"name": "mirrored", "planes": 6, "order": 2, "obstacles": 0}
+OPTIONS = PARTS | NONE | {
+    "gaussians": None,
+    "placement": MIRRORED,
+    "projection": {"name": "direction_cosine"},
+    "rasterizer": {"name": "aperture"},
+    "pooling": {"name": "array_response", "grid": [24, 48]},
+}  # fmt: skip
+FREQUENCIES = CARRIER + torch.linspace(-2e7, 2e7, 5, dtype=torch.float64)
+
+
+def build(links, **options):
+    torch.manual_seed(0)
+    return Mirrored(links.scene, **(OPTIONS | options))
+
+
+def told(model):
+    """The model with the planes of the built-in room and what they are made of; each path a single direction."""
+    placement = model.placement
+    with torch.no_grad():
+        for wall, material in enumerate(EMPTY.walls):
+            axis, side = divmod(wall, 2)
+            placement.place(wall, torch.eye(3)[axis] * (1 if side else -1), EMPTY.size[axis] if side else 0.0)
+            epsilon = permittivity(material, CARRIER)
+            placement.log_permittivities[wall] = math.log(epsilon.real - 1)
+            placement.log_conductivities[wall] = math.log(-epsilon.imag)
+        placement.log_extents.fill_(20.0)
+        placement.log_spreads.fill_(-10.0)
+        placement.log_blurs.fill_(-10.0)
+    return model
+
+
+def links_of(labels, task, receiver, bandwidth=None):
+    count = len(labels)
+    return Links(
+        query=Query(place(count, 0), torch.zeros(count, dtype=torch.long), torch.full((count,), CARRIER)),
+        receivers=(receiver,),
+        labels=labels,
+        task=task,
+        split=Split("most", torch.arange(count - 2), torch.arange(0), torch.arange(count - 2, count)),
+        bandwidth=bandwidth,
+    )
+
+
+def room_spectra(spectrum, count=12):
+    grid, receiver = Grid.degrees(range(1, 91, 3), range(0, 360, 6)), patch_array(CARRIER)
+    labels = spectra(EMPTY, place(count, 0), receiver, grid, spectrum, CARRIER, BANDWIDTH, 2)
+    task = Spectrum(grid.elevations, grid.azimuths, NORMALISATION)
+    return links_of(labels, task, receiver, BANDWIDTH if spectrum == "band" else 0.0)
+
+
+@pytest.mark.parametrize(("spectrum", "powers", "waves"), [("band", 0.03, 0.004), ("carrier", 0.08, 0.005)])
+def test_told_the_walls_it_predicts_the_labels(spectrum, powers, waves):
+    """Where powers add what interferes is missing; with phases all but the waves' curvature over the array is there."""
+    links = room_spectra(spectrum)
+    model = told(build(links))
+    batch = links.batch(torch.arange(12))
+    with torch.no_grad():
+        missing = (model(batch).value - batch.labels).abs().mean()
+        model.placement.sharpen(speed_of_light / CARRIER)
+        errors = (model(batch).value - batch.labels).abs()
+    assert waves < missing < powers
+    assert errors.mean() < waves
+    assert errors.max() < 0.04
+
+
+def test_told_the_walls_it_predicts_channels():
+    receiver = Receiver("gateway1", POSE, Array.planar(2, 2, speed_of_light / CARRIER / 2))
+    offsets = FREQUENCIES - CARRIER
+    labels = respond(EMPTY, place(12, 0), receiver, CARRIER, offsets, 2).to(torch.complex64)
+    links = links_of(labels, Csi(4, FREQUENCIES), receiver)
+    model = told(build(links, pooling={"name": "element_sum", "grid": [6, 12]}))
+    model.placement.sharpen(speed_of_light / CARRIER)
+    with torch.no_grad():
+        found = model(links.batch(torch.arange(12))).value
+    assert found.dtype == torch.complex64
+    noise = (found - labels).abs().square().sum((1, 2)) / labels.abs().square().sum((1, 2))
+    assert -10 * noise.log10().mean() > 25
+
+
+def test_told_the_walls_it_predicts_signal_strength():
+    """Relative to that at a metre of free space; paths interfere by a decibel or two."""
+    receiver = Receiver("gateway1", POSE)
+    offsets = torch.linspace(-BANDWIDTH / 2, BANDWIDTH / 2, 201, dtype=torch.float64)
+    rss = rss_dbm(respond(EMPTY, place(12, 0), receiver, CARRIER, offsets, 2)).float()
+    links = links_of(rss, Rssi(), receiver, BANDWIDTH)
+    model = told(build(links, pooling={"name": "mean_power", "grid": [4, 8], "channels": 2, "floor_db": -100.0}))
+    at_a_metre = 20 * math.log10(speed_of_light / CARRIER / (4 * math.pi))
+    with torch.no_grad():
+        powers = model(links.batch(torch.arange(12))).value + at_a_metre
+        model.placement.sharpen(speed_of_light / CARRIER)
+        band = model(links.batch(torch.arange(12))).value + at_a_metre
+    assert 0.5 < (powers - rss).abs().mean() < 2
+    assert (band - rss).abs().mean() < 0.1
+
+
+@pytest.mark.parametrize("rasterizer", ["torch", "aperture"])
+@pytest.mark.parametrize("gaussians", [None, PARTS["gaussians"]])
+def test_it_keeps_the_contract_of_models(rasterizer, gaussians):
+    placement = MIRRORED | {"planes": 7, "obstacles": 3, "order": 1}
+    parts = {"rasterizer": {"name": rasterizer}, "gaussians": gaussians, "placement": placement}
+    if rasterizer == "torch":  # a map of the whole sphere
+        parts["projection"] = {"name": "mercator"}
+    links = example_links("spectrum", 5e9)
+
+    def make(scene):
+        torch.manual_seed(0)
+        return Mirrored(scene, **(OPTIONS | parts))
+
+    check_model(make, links)
+
+
+def test_levels_need_no_carrier():
+    """Powers of a single element are the same at any frequency."""
+    pooling = {"name": "mean_power", "grid": [4, 8], "channels": 2, "floor_db": -60.0}
+    unknown, known = example_links("rssi"), example_links("rssi", 5e9)
+    model = build(unknown, pooling=pooling)
+    other = build(known, pooling=pooling)
+    other.load_state_dict(model.state_dict())
+    index = torch.arange(6)
+    torch.testing.assert_close(model(unknown.batch(index)).value, other(known.batch(index)).value)
+    check_model(lambda scene: build(replace(unknown, receivers=scene.receivers), pooling=pooling), unknown)
+
+
+def test_gradients_reach_all_that_paths_have():
+    links = room_spectra("band", count=5)
+    model = build(links, placement=MIRRORED | {"obstacles": 5})
+    model.placement.sharpen(speed_of_light / CARRIER)
+    value, penalties = model(links.batch(torch.arange(5)))
+    assert list(penalties) == ["obstacles"]
+    (value.square().mean() + penalties["obstacles"]).backward()
+    silent = {"placement.receiver_gains"}  # which no spectrum from its minimum to its maximum shows
+    for name, parameter in model.named_parameters():
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any() or name in silent, name
+
+
+def test_groups_name_what_learning_rates_are_given_for():
+    links = example_links("spectrum", 5e9)
+    assert list(build(links).parameter_groups()) == ["planes", "paths"]
+    groups = build(links, gaussians=PARTS["gaussians"]).parameter_groups()
+    assert list(groups) == ["means", "quats", "log_scales", "opacity_logits", "signal", "planes", "paths"]
+
+
+def test_a_receiver_hears_each_transmitter_as_if_it_were_alone():
+    """Links of two receivers, some of the same place, come out in their order."""
+    links = example_links("spectrum", 5e9)
+    model = build(links)
+    index = torch.tensor([3, 0, 1, 3, 2])
+    together = model(links.batch(index)).value
+    alone = torch.cat([model(links.batch(i[None])).value for i in index])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-4)
+
+
+# --- what is refused ---
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (
+            {"projection": {"name": "mercator"}},
+            "takes projection=direction_cosine and a pooling for it .*, got mercator",
+        ),
+        ({"pooling": {"name": "spectrum", "channels": 2}}, "got direction_cosine and spectrum"),
+        ({"placement": {"name": "free"}}, "placement 'free' places free Gaussians alone; set gaussians=lattice"),
+    ],
+)
+def test_parts_that_do_not_go_together_are_refused(parts, message):
+    with pytest.raises(ValueError, match=message):
+        build(example_links("spectrum", 5e9), **parts)
+
+
+def test_results_of_mirrored_gaussians_do_not_go_by_the_papers_name():
+    links = example_links("spectrum", 5e9)
+    with pytest.raises(ValueError, match=r"placement 'mirrored' makes another predictor, .* set model=mirrored"):
+        GaussianSplatting(links.scene, **OPTIONS)

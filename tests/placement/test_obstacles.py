@@ -1,0 +1,162 @@
+"""Optical depths of Gaussian obstacles against numerical integrals, and where closed forms break."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gaigs.placement._obstacles import Obstacles
+
+LOWER, UPPER = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([6.0, 4.0, 3.0])
+
+
+@pytest.fixture
+def obstacles():
+    """Seven of different shapes, float64."""
+    torch.manual_seed(0)
+    made = Obstacles(7, LOWER, UPPER).double()
+    with torch.no_grad():
+        made.log_widths.uniform_(math.log(0.1), math.log(1.5))
+        made.log_densities.uniform_(math.log(0.05), math.log(5.0))
+    return made
+
+
+def segments(count, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return (UPPER * torch.rand(2, count, 3, generator=generator)).double()
+
+
+def integral(obstacles, start, end, steps=4000):
+    """The density along a segment by Gauss and Legendre's rule, piece by piece."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    edges = np.linspace(0, 1, steps // 8 + 1)
+    t = (edges[:-1, None] + np.diff(edges)[:, None] * (nodes + 1) / 2).ravel()
+    w = (np.diff(edges)[:, None] * weights / 2).ravel()
+    points = start + t[:, None] * (end - start)
+    parts = (obstacles.centres, obstacles.widths, obstacles.densities)
+    centres, widths, densities = (part.detach().numpy() for part in parts)
+    squares = (((points[:, None] - centres) / widths) ** 2).sum(-1)
+    return np.linalg.norm(end - start) * (w[:, None] * densities * np.exp(-squares / 2)).sum()
+
+
+def test_the_depth_is_the_integral_of_the_density(obstacles):
+    starts, ends = segments(30)
+    depths = obstacles(starts, ends)
+    for start, end, depth in zip(starts.numpy(), ends.numpy(), depths.tolist(), strict=True):
+        assert depth == pytest.approx(integral(obstacles, start, end), rel=1e-7)
+    assert depths.max() > 1
+
+
+def test_through_the_middle_of_a_ball_it_is_that_of_a_bell_curve():
+    ball = Obstacles(1, LOWER, UPPER).double()
+    with torch.no_grad():
+        ball.log_widths.fill_(math.log(0.3))
+        ball.log_densities.fill_(math.log(2.0))
+    ray = torch.tensor([[0.0, 30.0, 40.0]], dtype=torch.float64)
+    depth = ball(ball.centres - ray, ball.centres + ray)
+    assert depth.item() == pytest.approx(2.0 * 0.3 * math.sqrt(2 * math.pi))
+
+
+def test_pieces_of_a_way_add_up_and_its_direction_does_not_matter(obstacles):
+    starts, ends = segments(20)
+    middles = torch.lerp(starts, ends, 0.3)
+    whole = obstacles(starts, ends)
+    torch.testing.assert_close(obstacles(starts, middles) + obstacles(middles, ends), whole)
+    torch.testing.assert_close(obstacles(ends, starts), whole)
+
+
+def test_any_shape_of_segments(obstacles):
+    starts, ends = segments(12)
+    whole = obstacles(starts, ends)
+    assert obstacles(starts[0], ends[0]).shape == ()
+    torch.testing.assert_close(obstacles(starts.view(3, 4, 3), ends.view(3, 4, 3)), whole.view(3, 4))
+    assert obstacles(starts[:0], ends[:0]).shape == (0,)
+
+
+def test_gradients_are_the_derivatives(obstacles):
+    starts, ends = (part.requires_grad_() for part in segments(6))
+    leaves = [starts, ends, obstacles.places, obstacles.log_widths, obstacles.log_densities]
+
+    def depth(start, end, places, log_widths, log_densities):
+        values = {"places": places, "log_widths": log_widths, "log_densities": log_densities}
+        return torch.func.functional_call(obstacles, values, (start, end))
+
+    assert torch.autograd.gradcheck(depth, leaves)
+
+
+def test_no_way_has_no_depth(obstacles):
+    start = segments(5)[0].requires_grad_()
+    end = start.detach().clone().requires_grad_()
+    depth = obstacles(start, end)
+    assert torch.equal(depth, torch.zeros(5, dtype=torch.float64))
+    for gradient in torch.autograd.grad(depth.sum(), [start, end, *obstacles.parameters()]):
+        assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_far_away_there_is_nothing(obstacles, dtype):
+    obstacles.to(dtype)
+    start = torch.tensor([[100.0, 0, 0], [0, 1e4, 0], [1e6, 1e6, 1e6]], dtype=dtype, requires_grad=True)
+    depth = obstacles(start, start.detach() + torch.tensor([0, 0, 50.0], dtype=dtype))
+    assert (depth < 1e-20).all()
+    for gradient in torch.autograd.grad(depth.sum(), [start, *obstacles.parameters()]):
+        assert gradient.isfinite().all()
+        assert gradient.abs().max() < 1e-15
+
+
+def test_single_precision_is_near_double(obstacles):
+    starts, ends = segments(40)
+    true = obstacles(starts, ends)
+    weights = torch.arange(40.0).cos().double()
+    exact = torch.autograd.grad((true * weights).sum(), [*obstacles.parameters()])
+    obstacles.float()
+    found = obstacles(starts.float(), ends.float())
+    gradients = torch.autograd.grad((found * weights.float()).sum(), [*obstacles.parameters()])
+    torch.testing.assert_close(found.double(), true, rtol=1e-4, atol=1e-5)
+    for gradient, expected in zip(gradients, exact, strict=True):
+        torch.testing.assert_close(gradient.double(), expected, rtol=0, atol=1e-4 * expected.abs().max().item())
+
+
+@pytest.mark.parametrize("width", [1e-4, 1e-2, 1.0, 1e2, 1e5])
+@pytest.mark.parametrize("density", [1e-12, 1.0, 1e6])
+def test_extreme_obstacles_have_finite_gradients(width, density):
+    torch.manual_seed(0)
+    obstacles = Obstacles(20, LOWER, UPPER)
+    with torch.no_grad():
+        obstacles.log_widths.fill_(math.log(width))
+        obstacles.log_widths[::2, 0] += 3  # not all are balls
+        obstacles.log_densities.fill_(math.log(density))
+    starts, ends = (part.float().requires_grad_() for part in segments(50))
+    with torch.no_grad():
+        starts[0] = obstacles.centres[0]
+        starts[1], ends[1] = obstacles.centres[1] - 1e-6, obstacles.centres[1] + 1e-6
+    depth = obstacles(starts, ends)
+    assert depth.isfinite().all()
+    assert (depth >= 0).all()
+    for gradient in torch.autograd.grad(depth.sum(), [starts, ends, *obstacles.parameters()]):
+        assert gradient.isfinite().all()
+
+
+def test_wide_obstacles_are_uniform_matter():
+    """The depth is then the density times the way."""
+    obstacles = Obstacles(3, LOWER, UPPER).double()
+    with torch.no_grad():
+        obstacles.log_widths.fill_(math.log(1e4))
+        obstacles.log_densities.copy_(torch.tensor([0.1, 0.2, 0.4]).log())
+    starts, ends = segments(10)
+    torch.testing.assert_close(obstacles(starts, ends), 0.7 * (ends - starts).norm(dim=1), rtol=1e-5, atol=0)
+
+
+def test_they_start_in_the_room_faint_and_all_over_it():
+    torch.manual_seed(0)
+    obstacles = Obstacles(500, LOWER, UPPER)
+    assert len(obstacles) == 500
+    margin = 0.05 * (UPPER - LOWER)
+    assert (obstacles.centres >= LOWER - margin).all()
+    assert (obstacles.centres <= UPPER + margin).all()
+    spread = obstacles.centres.std(0) / (UPPER - LOWER)
+    torch.testing.assert_close(spread, torch.full((3,), 1.1 / math.sqrt(12)), rtol=0.1, atol=0)
+    one = Obstacles(1, LOWER, UPPER)
+    ray = torch.tensor([10.0, 0, 0])
+    assert 0 < one(one.centres[0] - ray, one.centres[0] + ray) < 0.12  # a decibel is 0.115 Np
