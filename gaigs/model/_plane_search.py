@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from gaigs.directions import Grid
 from gaigs.gaussians import fibonacci_lattice
 from gaigs.placement._words import reflect
 from gaigs.placement.mirrored import CONDUCTIVITY, PERMITTIVITY
@@ -29,6 +30,9 @@ MARGIN = 0.1
 
 GAIN = 0.01
 """By how much a plane must lower the loss to be taken in: less is the chance of the links looked at."""
+
+LINKS, ROWS = 48, 12
+"""Links and rows of their labels that searches look at: a search takes hundreds of looks."""
 
 AT_ONCE = 4000
 """Pairs of a link and a plane worked on at a time."""
@@ -69,6 +73,16 @@ def find_planes(model, train: Batch, validation: Batch | None, loss: Callable[[B
     return f"{' and '.join(told) or 'no plane'} found; loss {before:.4f} -> {loss(train):.4f}"
 
 
+def fewer(batch: Batch) -> Batch:
+    """Some of a batch's links, and where their labels have a grid some of its rows and columns."""
+    index = torch.linspace(0, len(batch) - 1, min(LINKS, len(batch))).long().to(batch.labels.device)
+    labels, directions = batch.labels[index], batch.directions
+    if isinstance(directions, Grid):
+        every = slice(None, None, max(1, directions.shape[0] // ROWS))
+        labels, directions = labels[:, every, every], directions.thin(every, every)
+    return Batch(batch.query[index], directions, labels)
+
+
 def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
     """The plane whose reflections lower the mean absolute error most."""
     placement = model.placement
@@ -90,6 +104,7 @@ def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
     offsets = low[:, None] + (high - low)[:, None] * shares
     pitch = float((high - low).max()) / (OFFSETS - 1)
     normals, offsets = normals[:, None].expand(-1, OFFSETS, -1).flatten(0, 1), offsets.flatten()
+    batch = fewer(batch)
     heard, query = _heard(model, batch)
     turn = TURN
     for _ in range(ROUNDS + 1):
@@ -155,12 +170,7 @@ def _with_one_more(model, batch: Batch, heard, own, receiver: int, normals, offs
         splats, flat(gains), flat(lengths), normals.new_zeros(1), None, antenna.array, model._carriers(query)
     )
     lags = heard.repeat_interleave(count, 0) + more
-    directions = batch.directions
-    labels = batch.labels[own]
-    if directions is not None:
-        step = max(1, directions.shape[0] // 12)
-        directions = directions.thin(slice(None, None, step), slice(None, None, step))
-        labels = labels[:, ::step, ::step]
+    directions, labels = batch.directions, batch.labels[own]
     value = model.pooling.hear(lags, query, directions)
     value = model._on_trend(value, Batch(query, directions))
     errors = (value.unflatten(0, (len(own), count)) - labels[:, None]).abs()

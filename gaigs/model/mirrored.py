@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.model import _learnt_room
-from gaigs.model._plane_search import find_planes
+from gaigs.model._plane_search import fewer, find_planes
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.propagation import carriers
 from gaigs.query import Batch, Query
@@ -18,10 +18,10 @@ from gaigs.registry import register
 from gaigs.report.shapes import LearntRoom
 
 REACH, ROOM = 4.0, 0.03
-"""How far a plane is looked for on either side of where powers have put it: in wavelengths, and at least in diagonals
-of the room, since powers tell planes to some centimetres."""
+"""How far a plane is looked for on either side of where it is: in wavelengths, and the first time at least in diagonals
+of the room, since powers tell distant planes to some decimetres."""
 
-FINDS = 3
+FINDS = 2
 """Revisions that look for planes; phases count from the next one on."""
 
 TOLERANCE = 1e-3
@@ -49,7 +49,7 @@ class Mirrored(GaussianSplatting):
     """
 
     name = "mirrored"
-    revisions = (0.0, 0.06, 0.12, 0.25, 0.5, 0.75)
+    revisions = (0.0, 0.06, 0.25, 0.5, 0.75)
 
     places: Query | None = None  # set by fit
 
@@ -64,7 +64,7 @@ class Mirrored(GaussianSplatting):
             told = find_planes(self, train, validation, loss)
             self.placement.most.fill_(self.placement.kept.sum())
             return told
-        if number == FINDS + 2:
+        if number == len(self.revisions) - 1:
             return self._prune([batch for batch in (train, validation) if batch is not None], loss)
         placement = self.placement
         try:
@@ -74,11 +74,14 @@ class Mirrored(GaussianSplatting):
         if number == FINDS:
             placement.sharpen(wavelength)
             if self.scene.bandwidth is None and placement.log_bandwidth is not None:
-                self._choose_bandwidth(wavelength, train, loss)
+                self._choose_bandwidth(wavelength, fewer(train), loss)
         if placement.fixed:
             return "phases count"
-        before = loss(train)
-        moved = [self._search(plane, wavelength, train, loss) for plane in placement.used.tolist()]
+        before, some = loss(train), fewer(train)
+        reach = REACH * wavelength
+        if number == FINDS:
+            reach = max(reach, ROOM * placement.diagonal)
+        moved = [self._search(plane, reach, wavelength / STEPS, some, loss) for plane in self._by_strength(train)]
         told = ", ".join(f"{move:+.3f}" for move in moved)
         return f"phases count; planes moved by {told} m; loss {before:.4f} -> {loss(train):.4f}"
 
@@ -144,26 +147,30 @@ class Mirrored(GaussianSplatting):
         Without a bandwidth no plane is right, and without planes no bandwidth is: so both are tried together.
         """
         placement = self.placement
-        query, _ = batch.query.unique(with_receivers=True)
-        powers = placement(None, query).gains.abs().square().mean(0)
-        words = placement.words[placement.kept]
-        used = placement.used.tolist()
-        used.sort(key=lambda plane: -powers[(words == plane).any(1)].sum())
+        used = self._by_strength(batch)
         origin, losses = placement.origin.clone(), {}
         for rooms in BANDWIDTHS:
             placement.log_bandwidth.fill_(math.log(rooms * speed_of_light / placement.diagonal))
             for plane in used[:2]:
-                self._search(plane, wavelength, batch, loss)
+                self._search(plane, REACH * wavelength, wavelength / STEPS, batch, loss)
             losses[rooms] = loss(batch)
             placement.origin.copy_(origin)
         best = min(losses, key=losses.__getitem__)
         placement.log_bandwidth.fill_(math.log(best * speed_of_light / placement.diagonal))
 
-    def _search(self, plane: int, wavelength: float, batch: Batch, loss: Callable[[Batch], float]) -> float:
+    def _by_strength(self, batch: Batch) -> list[int]:
+        """The planes in use, that by way of which most power comes first: the others' phases count against it."""
+        placement = self.placement
+        query, _ = batch.query.unique(with_receivers=True)
+        powers = placement(None, query).gains.abs().square()
+        shares = (powers / powers.sum(1, keepdim=True)).mean(0)
+        words = placement.words[placement.kept]
+        return sorted(placement.used.tolist(), key=lambda plane: -shares[(words == plane).any(1)].sum().item())
+
+    def _search(self, plane: int, reach: float, step: float, batch: Batch, loss: Callable[[Batch], float]) -> float:
         """Moves a plane along its normal to where the loss is least; by how much [m]."""
         origin = self.placement.origin[plane]
         start = origin[3].item()
-        reach, step = max(REACH * wavelength, ROOM * self.placement.diagonal), wavelength / STEPS
         count = round(reach / step)
         moves = [step * k for k in range(-count, count + 1)]
         losses = []

@@ -1,4 +1,4 @@
-"""Rasterizers composite splats front to back into a map over directions."""
+"""Rasterizers composite splats front to back into a map over directions, or sum up what an array hears of them."""
 
 from typing import Protocol
 
@@ -28,9 +28,15 @@ class Rasterizer(Protocol):
     not ``visible`` do nothing. Every input but depths is differentiable: means2d, covariances2d, signal, opacities,
     attenuations. A signal may have any number of channels.
 
+    A rasterizer with ``draws_map = False`` is not called. It has two methods in place of that, on splats of the plane of
+    direction cosines, with each splat's amplitude (b, n) and path length (b, n) [m]; ``aperture`` says their arguments:
+    ``fields``, what each element of the array hears at each frequency (b, e, s), and ``lags``, the mean covariance of
+    elements at each of ``array.lags`` (b, l). Which of them is asked for is ``Pooling.takes``.
+
     Attributes:
         used: What drew the last map, as a run's metrics have it: the name, and the device where there is a choice.
             None where that shows with the first map only.
+        draws_map: Whether it is called for maps; may be left out, and then it is.
 
     Source: GAI-GS, "Mapping, Projection and Render Module"; the area over which d_j acts is ours (docs/methods.md).
     """

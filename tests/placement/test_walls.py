@@ -1,0 +1,186 @@
+"""Planes of walls that a user knows, against the floor plans and cuboids they were written from."""
+
+import math
+
+import pytest
+import torch
+
+from gaigs.data.synthetic import ROOM, wavefront_obj
+from gaigs.data.synthetic.image_source import Room
+from gaigs.placement._walls import read_planes
+from gaigs.placement.mirrored import Mirrored
+from gaigs.testing import example_links
+
+LOWER, UPPER = torch.tensor([0.5, 0.5, 0.4]), torch.tensor([3.5, 2.5, 2.2])
+EMPTY = Room((7.0, 5.0, 3.0), ("concrete",) * 6)
+PLAN = "x,y\n0,0\n4,0\n4,3\n0,3\n0,0\n"
+
+
+def write(folder, name, text):
+    file = folder / name
+    file.write_text(text)
+    return file
+
+
+def outward(planes, inside):
+    """Rows with normals that point away from a place, as tuples of rounded numbers."""
+    signs = torch.where(planes[:, :3] @ torch.as_tensor(inside) > planes[:, 3], -1.0, 1.0)
+    return [tuple(round(value, 4) + 0.0 for value in row) for row in (signs[:, None] * planes).tolist()]
+
+
+def test_a_floor_plan_has_upright_walls_by_length_then_floor_and_ceiling_of_the_box(tmp_path):
+    planes = read_planes(write(tmp_path, "plan.csv", PLAN), LOWER, UPPER)
+    found = outward(planes, [2.0, 1.5, 1.0])
+    assert {*found[:2]} == {(0, -1, 0, 0), (0, 1, 0, 3)}
+    assert {*found[2:4]} == {(1, 0, 0, 4), (-1, 0, 0, 0)}
+    assert {*found[4:]} == {(0, 0, 1, 2.2), (0, 0, -1, -0.4)}
+
+
+def test_walls_at_any_angle_hold_their_own_ends(tmp_path):
+    ends = [(1.0, 2.0), (4.0, 6.0), (2.5, 7.0)]
+    planes = read_planes(write(tmp_path, "plan.csv", "".join(f"{x},{y}\n" for x, y in ends)), LOWER, UPPER)
+    for row, pair in zip(planes[:2], ((0, 1), (1, 2)), strict=True):  # 5 m, then 1.8 m
+        assert row[:3].norm().item() == pytest.approx(1)
+        for end in pair:
+            for height in (0.0, 2.0):
+                assert row[:3] @ torch.tensor([*ends[end], height]) == pytest.approx(row[3].item(), abs=1e-5)
+
+
+def test_floor_and_ceiling_come_before_a_fifth_wall(tmp_path):
+    plan = "0,0\n6,0\n6,5\n3,5\n3,4\n0,4\n0,0\n"
+    planes = read_planes(write(tmp_path, "plan.csv", plan), LOWER, UPPER)
+    assert len(planes) == 8
+    assert planes[4:6, 2].abs().tolist() == [1, 1]
+    assert not planes[:4, 2].any()
+    assert not planes[6:, 2].any()
+
+
+def test_pieces_of_one_wall_are_one_plane_and_count_together(tmp_path):
+    """Two pieces of 2 m about a niche are longer than a wall of 3 m, whichever way they run."""
+    plan = "0,0\n2,0\n2,-0.5\n3,-0.5\n3,0\n5,0\n5,3\n"
+    planes = read_planes(write(tmp_path, "plan.csv", plan), LOWER, UPPER)
+    assert outward(planes, [2.5, 1.0, 1.0])[:2] == [(0, -1, 0, 0), (1, 0, 0, 5)]
+    back_and_forth = read_planes(write(tmp_path, "twice.csv", "0,0\n4,0\n0,0.001\n"), LOWER, UPPER)
+    assert len(back_and_forth) == 3
+    apart = read_planes(write(tmp_path, "apart.csv", "0,0\n4,0\n4,0.1\n0,0.1\n"), LOWER, UPPER)
+    assert sorted(row[3] for row in outward(apart, [2.0, 0.05, 1.0]) if row[2] == 0 and row[0] == 0) == [0.0, 0.1]
+
+
+def test_a_repeated_vertex_is_no_wall(tmp_path):
+    once = read_planes(write(tmp_path, "once.csv", PLAN), LOWER, UPPER)
+    twice = read_planes(write(tmp_path, "twice.csv", PLAN.replace("4,0\n", "4,0\n4,0\n")), LOWER, UPPER)
+    assert torch.equal(once, twice)
+
+
+def test_a_mesh_has_its_cuboids_faces_by_area(tmp_path):
+    planes = read_planes(write(tmp_path, "room.obj", wavefront_obj(EMPTY)), LOWER, UPPER)
+    found = outward(planes, [3.5, 2.5, 1.5])
+    assert {*found[:2]} == {(0, 0, 1, 3), (0, 0, -1, 0)}  # 35 m²
+    assert {*found[2:4]} == {(0, 1, 0, 5), (0, -1, 0, 0)}  # 21 m²
+    assert {*found[4:]} == {(1, 0, 0, 7), (-1, 0, 0, 0)}  # 15 m²
+
+
+def test_furniture_adds_its_faces_to_the_walls_it_stands_at(tmp_path):
+    planes = read_planes(write(tmp_path, "room.obj", wavefront_obj(ROOM)), LOWER, UPPER)
+    areas = {}
+    for lower, upper in [((0.0, 0.0, 0.0), ROOM.size), *((box.lower, box.upper) for box in ROOM.furniture)]:
+        edges = [high - low for low, high in zip(lower, upper, strict=True)]
+        for axis in range(3):
+            for side in (lower, upper):
+                key = axis, round(side[axis], 4)
+                areas[key] = areas.get(key, 0) + math.prod(edges) / edges[axis]
+    found = [(int(row[:3].abs().argmax()), round(abs(row[3].item()), 4)) for row in planes]
+    assert sorted(found) == sorted(areas)
+    sizes = [areas[key] for key in found]
+    assert sizes == pytest.approx(sorted(sizes, reverse=True))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "v 0 0 1\nv 2 0 1\nv 2 1 1\nv 0 1 1\nf 1 2 3 4\n",
+        "# a floor\nv 0 0 1 # a corner\nv 2 0 1\nvn 0 0 1\nv 2 1 1\nv 0 1 1\n\nf 1/1/1 2//1 3/2 4\n",
+        "v 0 0 1\nv 2 0 1\nv 2 1 1\nv 0 1 1\nf -4 -3 -2 -1\n",
+        "v 0 0 1\nv 2 0 1\nv 2 1 1\nv 0 1 1\nf 1 2 3\nf 4 3 1\n",
+        "v 0 0 1\nv 2 0 1\nv 2 1 1\nv 0 1 1\nf 1 2 3 4\nf 1 1 2\n",
+    ],
+    ids=["plain", "with comments, normals and textures", "counted from the end", "turned triangles", "an empty face"],
+)
+def test_faces_in_all_their_ways_of_writing(tmp_path, text):
+    planes = read_planes(write(tmp_path, "floor.obj", text), LOWER, UPPER)
+    assert outward(planes, [0.0, 0.0, 2.0]) == [(0, 0, -1, -1)]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("walls.stl", "solid", r"must be a \.csv or \.obj, got walls\.stl"),
+        ("walls.csv", "0,0\n1,zero\n", "line 2"),
+        ("walls.csv", "0,0\n", "two wall vertices or more, got 1"),
+        ("walls.csv", "", "empty"),
+        ("walls.obj", "v 0 0 0\nv 1 0 zero\n", "line 2, must hold numbers, got 'v 1 0 zero'"),
+        ("walls.obj", "v 0 0 0\nv 1 0 0\nf 1 2 3\n", "must hold faces of vertices x y z"),
+        ("walls.obj", "v 0 0 0\nv 1 0 0\nv 1 1\nf 1 2 3\n", "must hold faces of vertices x y z"),
+        ("walls.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\n", "must hold walls"),
+        ("walls.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "must hold walls"),
+    ],
+)
+def test_defects_are_refused(tmp_path, name, text, message):
+    with pytest.raises(ValueError, match=message):
+        read_planes(write(tmp_path, name, text), LOWER, UPPER)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.csv; set placement\.walls"):
+        read_planes(tmp_path / "nowhere.csv", LOWER, UPPER)
+
+
+@pytest.fixture
+def links():
+    return example_links("spectrum")
+
+
+def started(links, file, planes=8, **options):
+    torch.manual_seed(0)
+    placement = Mirrored(links.scene, 2, planes, 1, 0, walls=None if file is None else str(file), **options)
+    placement.fit(links)
+    return placement
+
+
+def test_a_placement_starts_from_the_walls(tmp_path, links):
+    file = write(tmp_path, "room.obj", wavefront_obj(EMPTY))
+    placement = started(links, file)
+    expected = read_planes(file, *placement.box)
+    torch.testing.assert_close(placement.normals[:6], expected[:, :3])
+    torch.testing.assert_close(placement.offsets[:6], expected[:, 3])
+    assert placement.used.tolist() == [*range(6)]
+    assert int(placement.kept.sum()) == 7  # the direct path, and one by way of each wall
+    assert placement.shifts.requires_grad
+    assert not torch.allclose(started(links, None).offsets[:6], expected[:, 3])
+
+
+def test_of_more_walls_than_planes_the_largest_are_taken(tmp_path, links):
+    file = write(tmp_path, "room.obj", wavefront_obj(ROOM))
+    placement = started(links, file, planes=6)
+    torch.testing.assert_close(placement.offsets, read_planes(file, *placement.box)[:6, 3])
+    assert placement.used.tolist() == [*range(6)]
+
+
+def test_of_fewer_walls_no_other_plane_is_used(tmp_path, links):
+    file = write(tmp_path, "floor.obj", "v 0 0 -1\nv 2 0 -1\nv 2 1 -1\nf 1 2 3\n")
+    assert started(links, file).used.tolist() == [0]
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+def test_fixed_walls_stay_while_all_else_is_learnt(tmp_path, links, fixed):
+    placement = started(links, write(tmp_path, "room.obj", wavefront_obj(EMPTY)), fixed=fixed)
+    before = placement.normals.clone(), placement.offsets.clone(), placement.plane_gains.clone()
+    groups = placement.parameter_groups()
+    assert ("planes" in groups) != fixed
+    optimizer = torch.optim.SGD([parameter for group in groups.values() for parameter in group], lr=0.1)
+    placed = placement(None, links.query)
+    (placed.gains.abs().square().sum() + placed.lengths.mean()).backward()
+    optimizer.step()
+    assert torch.equal(placement.normals, before[0]) == fixed
+    assert torch.equal(placement.offsets, before[1]) == fixed
+    assert not torch.equal(placement.plane_gains, before[2])
