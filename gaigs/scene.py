@@ -84,8 +84,10 @@ class Array:
 
         What powers alone say of a field, its covariance, an array hears by these only: 49 for a 4 x 4 array.
         """
-        steps, pairs = differences(self.elements.double())
-        return steps, pairs, torch.bincount(pairs).double()
+        # Kept beyond this call: made in inference mode they could not be saved for a later backward pass.
+        with torch.inference_mode(False):
+            steps, pairs = differences(self.elements.clone().double())
+            return steps, pairs, torch.bincount(pairs).double()
 
     def gain(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Field gain of an element towards unit vectors in the array's frame."""

@@ -31,8 +31,8 @@ MARGIN = 0.1
 GAIN = 0.01
 """By how much a plane must lower the loss to be taken in: less is the chance of the links looked at."""
 
-LINKS, ROWS = 48, 12
-"""Links and rows of their labels that searches look at: a search takes hundreds of looks."""
+ROWS = 12
+"""Rows of the labels that searches look at: a search takes hundreds of looks."""
 
 AT_ONCE = 4000
 """Pairs of a link and a plane worked on at a time."""
@@ -74,13 +74,12 @@ def find_planes(model, train: Batch, validation: Batch | None, loss: Callable[[B
 
 
 def fewer(batch: Batch) -> Batch:
-    """Some of a batch's links, and where their labels have a grid some of its rows and columns."""
-    index = torch.linspace(0, len(batch) - 1, min(LINKS, len(batch))).long().to(batch.labels.device)
-    labels, directions = batch.labels[index], batch.directions
+    """A batch with some of its labels' rows and columns, where these have a grid."""
+    labels, directions = batch.labels, batch.directions
     if isinstance(directions, Grid):
         every = slice(None, None, max(1, directions.shape[0] // ROWS))
         labels, directions = labels[:, every, every], directions.thin(every, every)
-    return Batch(batch.query[index], directions, labels)
+    return Batch(batch.query, directions, labels)
 
 
 def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:

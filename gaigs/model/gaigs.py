@@ -39,6 +39,7 @@ class GaussianSplatting(Model):
     """
 
     name = "gaigs"
+    own_placement: str | None = None  # the only one that makes a model of this name; None: any
 
     def __init__(
         self,
@@ -100,6 +101,11 @@ class GaussianSplatting(Model):
             raise ValueError(
                 f"placement {placement['name']!r} makes another predictor, whose results have a name of their own; set "
                 f"model={self.placement.model}"
+            )
+        if self.own_placement not in (None, placement["name"]):
+            raise ValueError(
+                f"model {self.name!r} takes placement={self.own_placement}, got {placement['name']}; take "
+                f"+experiment={self.name}, which has all its parts"
             )
         if gaussians is None and not self.placement.has_own:
             raise ValueError(f"placement {placement['name']!r} places free Gaussians alone; set gaussians=lattice")

@@ -23,6 +23,9 @@ from gaigs.scene import Scene
 SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Shares of the trained model that are tried; of equally likely ones the first is taken."""
 
+WEIGHTS = (1.0, 0.75, 0.5, 0.25, 0.0)
+"""Weights of the kriged value beside the trained model's that are tried; of equally good ones the first is taken."""
+
 ASKED = 1000
 """By how many held-out links length and noise are chosen once the share is: a trained model leaves little over that
 places tell, and by few links that seems to be what their chance is."""
@@ -40,12 +43,13 @@ EXACT = 512
 
 @register("model", "kriging")
 class Kriging(Model):
-    """share * trend + (1 - share) * fallback + z, z the kriged residual: what is left over of the labels.
+    """weight (share trend + (1 - share) fallback + z) + (1 - weight) trend, z the kriged residual.
 
     The trend is a trained model, the fallback one that is fitted at once. z is the mean of a Gaussian process over
     places with the Matern-1/2 kernel, as in ``gaigs.model.gaussian_process``. Share, length and noise are those with
     which the validation links are likeliest, each given the training links around it. So at a share of 0 it is that
-    process, and far from all known links it is trend and fallback alone.
+    process, and far from all known links it is trend and fallback alone. Likelihood is no score: the weight is that of
+    ``WEIGHTS`` with which the validation links, predicted from the training links, score best.
 
     A checkpoint holds it whole, in a compact form: residuals as a few principal components. Of a receiver with more
     than ``LIMIT`` known links an even part is looked at.
@@ -79,7 +83,8 @@ class Kriging(Model):
                 "gaussian_process in task.baselines"
             )
         self.chunk, self.trained_by = self.trend.chunk, self.trend.trained_by
-        for name, value in {"share": 1.0, "length": math.nan, "noise": math.nan, "scale": math.nan}.items():
+        for name in ("share", "weight", "length", "noise", "scale"):
+            value = 1.0 if name in ("share", "weight") else math.nan
             self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
         self.fields = nn.ModuleList(Field(scene) for _ in scene.receivers)
 
@@ -162,6 +167,24 @@ class Kriging(Model):
         twin.solve(unseen, values[: len(split.train)])
         return twin.to(self.share.device)
 
+    @torch.no_grad()
+    def weigh(self, links: Links, values: Tensor, blind: "Kriging") -> None:
+        """Takes the weight with which the validation links score best, and gives it to ``blind`` too.
+
+        Args:
+            links, values: As for ``choose``.
+            blind: What ``without_validation`` gives.
+        """
+        task, index = links.task, links.split.validation
+        if not len(index):
+            return
+        labels, trend, kriged = links.labels[index], values[len(links.split.train) :], predicted(blind, links, index)
+        score = lambda weight: task.scores(labels, trend + weight * (kriged - trend))[task.watched].mean().item()
+        sign = 1 if task.larger_is_better else -1
+        best = max(WEIGHTS, key=lambda weight: sign * score(weight))
+        self.weight.fill_(best)
+        blind.weight.fill_(best)
+
     @property
     def process(self) -> Hyperparameters:
         """Length, noise and scale."""
@@ -177,9 +200,12 @@ class Kriging(Model):
     # --- prediction ---
 
     def forward(self, batch: Batch) -> Prediction:
-        query, share, value = batch.query, self.share.item(), 0
+        query, share, weight, value = batch.query, self.share.item(), self.weight.item(), 0
+        trend = self.trend(batch).value if share > 0 or weight < 1 else None
+        if weight == 0:
+            return Prediction(trend, {})
         if share > 0:
-            value = share * self.trend(batch).value
+            value = share * trend
         if share < 1:
             value = value + (1 - share) * self.fallback(batch).value
         places = coordinates(self.scene, query, self.scale if self.scene.has_band else None)
@@ -187,7 +213,8 @@ class Kriging(Model):
         for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver
             added[own] = self.fields[receiver](places[own], self.length, batch)
-        return Prediction(value + added, {})
+        value = value + added
+        return Prediction(value if weight == 1 else trend + weight * (value - trend), {})
 
     # --- what a run reports of it: the trend's ---
 
@@ -204,7 +231,8 @@ class Kriging(Model):
             "links": sum(len(field.places) for field in self.fields),
             "components": max(len(field.components) for field in self.fields),
         }
-        return self.trend.facts() | {"kriging": {"share": self.share.item()} | self.process.facts() | kept}
+        chosen = {"weight": self.weight.item(), "share": self.share.item()}
+        return self.trend.facts() | {"kriging": chosen | self.process.facts() | kept}
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
         return self.trend.rendering(batch)

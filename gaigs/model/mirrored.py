@@ -4,7 +4,8 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from jaxtyping import Bool
+import torch
+from jaxtyping import Bool, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
@@ -48,7 +49,7 @@ class Mirrored(GaussianSplatting):
     Source: ours; docs/methods.md.
     """
 
-    name = "mirrored"
+    name, own_placement = "mirrored", "mirrored"
     revisions = (0.0, 0.06, 0.25, 0.5, 0.75)
 
     places: Query | None = None  # set by fit
@@ -60,7 +61,9 @@ class Mirrored(GaussianSplatting):
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
         """Looks for more planes; has phases count; searches planes by them; drops what does not help."""
-        if number < FINDS:
+        if number < FINDS and self.placement.fixed:
+            return "planes stay where they were put"
+        if number < FINDS and not self._adds_waves:
             told = find_planes(self, train, validation, loss)
             self.placement.most.fill_(self.placement.kept.sum())
             return told
@@ -71,7 +74,7 @@ class Mirrored(GaussianSplatting):
             wavelength = speed_of_light / carriers(self.scene, train.query).mean().item()
         except ValueError:
             return "frequencies are unknown, so powers add to the end"
-        if number == FINDS:
+        if not placement.coherent:
             placement.sharpen(wavelength)
             if self.scene.bandwidth is None and placement.log_bandwidth is not None:
                 self._choose_bandwidth(wavelength, fewer(train), loss)
@@ -79,11 +82,16 @@ class Mirrored(GaussianSplatting):
             return "phases count"
         before, some = loss(train), fewer(train)
         reach = REACH * wavelength
-        if number == FINDS:
+        if number == (0 if self._adds_waves else FINDS):
             reach = max(reach, ROOM * placement.diagonal)
         moved = [self._search(plane, reach, wavelength / STEPS, some, loss) for plane in self._by_strength(train)]
         told = ", ".join(f"{move:+.3f}" for move in moved)
         return f"phases count; planes moved by {told} m; loss {before:.4f} -> {loss(train):.4f}"
+
+    @property
+    def _adds_waves(self) -> bool:
+        """Whether labels take the sum of waves, so that powers alone tell nothing and phases count from the start."""
+        return self.draws_map or self.pooling.takes == "fields"
 
     # --- what a run reports of it ---
 
@@ -92,6 +100,7 @@ class Mirrored(GaussianSplatting):
         placement = self.placement
         facts = super().facts() | {
             "num_gaussians": int(placement.kept.sum()) + (0 if self.gaussians is None else len(self.gaussians)),
+            "num_gaussians_start": int(placement.most),
             "planes_kept": len(placement.used),
             "paths_kept": int(placement.kept.sum()),
             "paths_most": int(placement.most),
@@ -101,7 +110,8 @@ class Mirrored(GaussianSplatting):
     def export(self, folder: Path) -> None:
         """``planes.obj`` and ``obstacles.ply`` beside the free Gaussians."""
         super().export(folder)
-        _learnt_room.export(self.placement, self.places, folder)
+        if self.places is not None:
+            _learnt_room.export(self.placement, self.places, folder)
 
     def learnt_room(self, links: Links) -> LearntRoom:
         """Planes, obstacles and paths for figures."""
@@ -110,7 +120,7 @@ class Mirrored(GaussianSplatting):
     # --- which planes ---
 
     def _prune(self, batches: list[Batch], loss: Callable[[Batch], float]) -> str:
-        """Drops planes, then paths, weakest first, without which the loss is no higher on any of the batches."""
+        """Drops planes, then paths, weakest first, without which the loss is next to no higher on any batch."""
         placement = self.placement
         planes, paths = len(placement.used), int(placement.kept.sum())
         before = [loss(batch) for batch in batches]
@@ -120,14 +130,11 @@ class Mirrored(GaussianSplatting):
             return all(loss(batch) <= old * (1 + TOLERANCE) for batch, old in zip(batches, before, strict=True))
 
         best = placement.kept.clone()
-        for plane in placement.used.tolist():
+        for plane in reversed(self._by_strength(batches[0])):
             without = best & ~(placement.words == plane).any(1)
             best = without if is_good(without) else best
         placement.kept.copy_(best)
-        query, _ = batches[0].query.unique(with_receivers=True)
-        powers = placement(None, query).gains.abs().square()
-        shares = (powers / powers.sum(1, keepdim=True)).mean(0)
-        weakest = best.nonzero()[:, 0][shares.argsort()]
+        weakest = best.nonzero()[:, 0][self._shares(batches[0]).argsort()]
         low, high = 0, len(weakest) - 1
         while low < high:  # the largest number of them that may go, by bisection
             middle = (low + high + 1) // 2
@@ -160,12 +167,16 @@ class Mirrored(GaussianSplatting):
 
     def _by_strength(self, batch: Batch) -> list[int]:
         """The planes in use, that by way of which most power comes first: the others' phases count against it."""
-        placement = self.placement
-        query, _ = batch.query.unique(with_receivers=True)
-        powers = placement(None, query).gains.abs().square()
-        shares = (powers / powers.sum(1, keepdim=True)).mean(0)
+        placement, shares = self.placement, self._shares(batch)
         words = placement.words[placement.kept]
         return sorted(placement.used.tolist(), key=lambda plane: -shares[(words == plane).any(1)].sum().item())
+
+    def _shares(self, batch: Batch) -> Float[Tensor, "n"]:
+        """Of the power that arrives, by the kept paths' order; a link that hears nothing has none."""
+        query, _ = batch.query.unique(with_receivers=True)
+        powers = self.placement(None, query).gains.abs().square()
+        total = powers.sum(1, keepdim=True)
+        return (powers / torch.where(total > 0, total, 1)).mean(0)
 
     def _search(self, plane: int, reach: float, step: float, batch: Batch, loss: Callable[[Batch], float]) -> float:
         """Moves a plane along its normal to where the loss is least; by how much [m]."""

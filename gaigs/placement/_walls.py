@@ -40,7 +40,9 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
         normals = torch.stack((along[:, 1], -along[:, 0], 0 * lengths), 1)
         level = torch.tensor([[0.0, 0.0, 1.0, upper[2]], [0.0, 0.0, -1.0, -lower[2]]])
         walls = _merged(normals[lengths > SHORTEST], ends[lengths > SHORTEST, 0], lengths[lengths > SHORTEST])
-        planes = torch.cat((walls[:4], level, walls[4:]))  # a room has floor and ceiling before a fifth wall
+        planes = (
+            torch.cat((walls[:4], level, walls[4:])) if len(walls) else walls
+        )  # a room has floor and ceiling before a fifth wall
     elif file.suffix == ".obj":
         planes = _merged(*_faces(file))
     else:

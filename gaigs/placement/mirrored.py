@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.constants import speed_of_light
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 from torch.nn import functional
 
 from gaigs.algebra import PROJECTIVE
@@ -240,6 +240,9 @@ class Mirrored(Placement):
             phases = self.path_phases[self.kept] - 2 * math.pi * (turns - turns.detach().round())
             gains = gains * torch.polar(torch.ones_like(phases), phases)
             coherences = (-self.log_blurs[self.kept].exp().square() / 2).exp()
+        if distributed.is_available() and distributed.is_initialized():
+            # Of several processes each waits for the gradients of all parameters, also of those not in use yet.
+            gains = gains + 0 * sum(parameter.sum() for parameter in self.parameters() if parameter.requires_grad)
         signal = lengths.new_zeros(len(words), self.channels, 1)
         signal[:, 0] = 1
         scales = (lengths * self.log_spreads[self.kept].exp())[..., None].expand(-1, -1, 3)

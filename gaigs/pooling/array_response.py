@@ -118,17 +118,23 @@ class ArrayResponse(Pooling):
         key = int(query.receivers[0]), carrier, directions.shape, parts.dtype, parts.device
         basis = self._kept.get(key) if is_kept else None
         if basis is None:
-            array = self._array(query)
-            steps, _, counts = array.lags
-            half = len(steps) // 2
-            # Of two opposite lags, which are each other's conjugates, one stands for both.
-            weights = counts[half:] / len(array) * torch.where(torch.arange(len(steps) - half) > 0, 2, 1)
-            vectors = directions.to(steps).flatten().vectors()
-            phases = 2 * math.pi * carrier / speed_of_light * (steps[half:] @ vectors.T)
-            basis = torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None])).to(parts)
+            # Kept beyond this call: made in inference mode it could not be saved for a later backward pass.
+            with torch.inference_mode(False):
+                basis = self._basis(carrier, query, directions).to(parts)
             if is_kept:
                 self._kept[key] = basis
         return (parts @ basis).clamp_min(SILENT).sqrt()
+
+    def _basis(self, carrier: float, query: Query, directions: Directions) -> Float[Tensor, "2l k"]:
+        """What real and imaginary parts of the lags add to the power in each direction, float64."""
+        array = self._array(query)
+        steps, _, counts = array.lags
+        half = len(steps) // 2
+        # Of two opposite lags, which are each other's conjugates, one stands for both.
+        weights = counts[half:] / len(array) * torch.where(torch.arange(len(steps) - half) > 0, 2, 1)
+        vectors = directions.to(steps).flatten().vectors()
+        phases = 2 * math.pi * carrier / speed_of_light * (steps[half:] @ vectors.T)
+        return torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None]))
 
     def _array(self, query: Query):
         return self.scene.receivers[int(query.receivers[0]) if len(query) else 0].array

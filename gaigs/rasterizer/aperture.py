@@ -102,15 +102,16 @@ class Aperture:
         real, imaginary = ((powers[..., None] * narrow * part).sum(1) for part in (angles.cos(), angles.sin()))
         later = torch.complex(real, imaginary)
         found = torch.cat((later[:, 1:].conj().flip(1), later), 1)
-        if not coherences.any():
+        sure = coherences.nonzero()[:, 0]  # pairs of the others have no phase: they cost nothing
+        if not len(sure):
             return found
-        waves = amplitudes * coherences
-        steering = self._steering(splats, array, carriers)
+        waves = (amplitudes * coherences)[:, sure]
+        steering = self._steering(splats, array, carriers)[:, sure]
         if bandwidth is None:
             heard = (waves[:, None] @ steering).mT
             covariance = heard @ heard.mH
         else:
-            delays = lengths / speed_of_light
+            delays = lengths[:, sure] / speed_of_light
             likeness = torch.sinc(bandwidth * (delays[:, :, None] - delays[:, None]))
             together = waves[:, :, None] * waves[:, None].conj() * likeness
             covariance = steering.mT @ together @ steering.conj()

@@ -86,14 +86,16 @@ def krige(model: Model, links: Links, config: dict, folder: Path, train: Callabl
     left = kriged.choose(links, all_values)
     kriged.solve(links, all_values)
     blind = kriged.without_validation(links, all_values)
+    kriged.weigh(links, all_values, blind)
     checkpoint.exchange_model(
         folder / "best.ckpt", {"name": "kriging", "trend": config["model"], "fallback": fallback}, kriged
     )
     seconds += time.monotonic() - start
     facts = kriged.facts()["kriging"]
     log.info(
-        "kriging: share %g of %s, length %.3g m, noise %.3g of the signal, %d components, in %.0f s",
-        *(facts["share"], name, facts["length_m"], facts["noise_to_signal"], facts["components"], seconds),
+        "kriging: weight %g, share %g of %s, length %.3g m, noise %.3g of the signal, %d components, in %.0f s",
+        *(facts["weight"], facts["share"], name),
+        *(facts["length_m"], facts["noise_to_signal"], facts["components"], seconds),
     )
     if left < BY_HEART and not len(index):
         log.info(

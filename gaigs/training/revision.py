@@ -43,7 +43,9 @@ class Revision(Callback):
             if trainer.global_step != round(share * trainer.max_steps):
                 continue
             split = self.links.split
-            train, validation = (self._batch(module, part, number) for part in (split.train, split.validation))
+            convert = trainer.precision_plugin.convert_input
+            parts = (self._batch(module, part, number) for part in (split.train, split.validation))
+            train, validation = (None if part is None else convert(part) for part in parts)
             # As for every prediction that is no training step.
             module.eval()
             told = module.model.revise(number, train, validation, lambda batch: loss_of(module, batch))

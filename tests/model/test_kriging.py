@@ -294,6 +294,7 @@ def test_what_is_reported_is_the_trends_and_the_krigings():
     model = kriged(links)
     facts = model.facts()["kriging"]
     assert facts == {
+        "weight": 1.0,
         "share": model.share.item(),
         "length_m": model.process.length,
         "noise_to_signal": model.process.noise,
@@ -302,6 +303,35 @@ def test_what_is_reported_is_the_trends_and_the_krigings():
     }
     assert model.primitives is None
     assert model.rendering(links.batch(links.split.test)) is None
+
+
+# --- the weight ---
+
+
+@pytest.mark.parametrize(("known_noise", "weight"), [(0.0, 1.0), (30.0, 0.0)])
+def test_the_weight_is_that_with_which_validation_links_score_best(known_noise, weight):
+    # Where the training labels are broken, what is kriged from them does harm.
+    links = make("rssi", smooth=3.0, trained=1.0)
+    values = predicted(Trained(links.scene), links, known(links))
+    model = Kriging(links.scene, Trained(links.scene))
+    model.choose(links, values)
+    generator = torch.Generator().manual_seed(3)
+    train = links.split.train
+    links.labels[train] += known_noise * torch.randn(len(train), generator=generator)
+    model.solve(links, values)
+    blind = model.without_validation(links, values)
+    model.weigh(links, values, blind)
+    assert model.weight == blind.weight == weight
+    if weight == 0:
+        assert torch.equal(model.predict(links.query), model.trend.predict(links.query))
+
+
+def test_the_weight_mixes_the_kriged_value_with_the_trends():
+    links = make("rssi", smooth=1.0, trained=1.0)
+    model = kriged(links)
+    whole, trend = (part.predict(links.query) for part in (model, model.trend))
+    model.weight.fill_(0.25)
+    torch.testing.assert_close(model.predict(links.query), 0.25 * whole + 0.75 * trend)
 
 
 # --- what is refused ---

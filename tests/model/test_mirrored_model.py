@@ -189,7 +189,10 @@ def test_a_receiver_hears_each_transmitter_as_if_it_were_alone():
             "takes projection=direction_cosine and a pooling for it .*, got mercator",
         ),
         ({"pooling": {"name": "spectrum", "channels": 2}}, "got direction_cosine and spectrum"),
-        ({"placement": {"name": "free"}}, "placement 'free' places free Gaussians alone; set gaussians=lattice"),
+        (
+            {"placement": {"name": "free"}},
+            "model 'mirrored' takes placement=mirrored, got free; take .*experiment=mirrored",
+        ),
     ],
 )
 def test_parts_that_do_not_go_together_are_refused(parts, message):

@@ -85,7 +85,7 @@ def test_the_trend_has_a_row_of_its_own(finished, plain):
 def test_what_the_kriging_was_is_told(finished):
     config, folder, metrics = finished
     facts, split = metrics["kriging"], load(config["data"], config["split"]).split
-    assert list(facts) == ["share", "length_m", "noise_to_signal", "links", "components", "seconds"]
+    assert list(facts) == ["weight", "share", "length_m", "noise_to_signal", "links", "components", "seconds"]
     assert facts["links"] == len(split.train) + len(split.validation)
     assert facts["seconds"] > 0
     assert metrics["checkpoint_bytes"] == (folder / "best.ckpt").stat().st_size
@@ -222,6 +222,7 @@ def test_rssi_falls_back_on_the_trend_of_its_process(tmp_path):
     assert model.fallback_options == {"name": "path_loss"}
     assert [*metrics["receivers"]["west"]] == ["gaigs", "gaigs_trend", "mean"]
     level = model.predict([[1e4, 0.0, 0.0]], "west")
-    share = metrics["kriging"]["share"]
+    share, weight = metrics["kriging"]["share"], metrics["kriging"]["weight"]
     trend, fallback = (part.predict([[1e4, 0.0, 0.0]], "west") for part in (model.trend, model.fallback))
-    torch.testing.assert_close(level, share * trend + (1 - share) * fallback)
+    far = share * trend + (1 - share) * fallback
+    torch.testing.assert_close(level, weight * far + (1 - weight) * trend)
