@@ -102,16 +102,20 @@ class ArrayResponse(Pooling):
         relative = heard[:, half:] / torch.where(power > 0, power, 1)[:, None]
         parts = torch.cat((relative.real, relative.imag), 1)
         is_whole = _are_same(asked, own)
-        spectra = parts.new_zeros(len(query), math.prod(asked.shape))
+        spectra, order = [parts.new_zeros(0, math.prod(asked.shape))], [torch.zeros(0).long().to(parts.device)]
         for carrier, links in self._by_carrier(query):
             amplitudes = self._look(parts[links], carrier, query, asked, is_whole)
             shown = amplitudes
             if not is_whole:
                 shown = torch.cat((amplitudes, self._look(parts[links], carrier, query, self.coarse, True)), 1)
             low, high = shown.amin(1, keepdim=True), shown.amax(1, keepdim=True)
-            spread = high - low
-            spectra[links] = (amplitudes - low) / torch.where(spread > 0, spread, 1)
-        return spectra.unflatten(1, asked.shape)
+            spread = torch.where(high > low, high - low, 1)
+            # Pixels are many, and each pass over them in memory costs as much as the beamformer itself.
+            scaled = (amplitudes - low) / spread if torch.is_grad_enabled() else amplitudes.sub_(low).div_(spread)
+            spectra.append(scaled)
+            order.append(links)
+        whole = spectra[1] if len(spectra) == 2 else torch.cat(spectra)[torch.cat(order).argsort()]
+        return whole.unflatten(1, asked.shape)
 
     def _look(self, parts: Tensor, carrier: float, query: Query, directions: Directions, is_kept: bool) -> Tensor:
         """Amplitudes of the beamformer in some directions (b, k)."""
@@ -123,7 +127,8 @@ class ArrayResponse(Pooling):
                 basis = self._basis(carrier, query, directions).to(parts)
             if is_kept:
                 self._kept[key] = basis
-        return (parts @ basis).clamp_min(SILENT).sqrt()
+        power = parts @ basis
+        return power.clamp_min(SILENT).sqrt() if torch.is_grad_enabled() else power.clamp_min_(SILENT).sqrt_()
 
     def _basis(self, carrier: float, query: Query, directions: Directions) -> Float[Tensor, "2l k"]:
         """What real and imaginary parts of the lags add to the power in each direction, float64."""
