@@ -7,7 +7,7 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.directions import Directions
+from gaigs.directions import Directions, Grid
 from gaigs.pooling import Pooling, sphere
 from gaigs.propagation import carriers
 from gaigs.query import Query
@@ -20,6 +20,9 @@ NORMALISATIONS = ("min-max of each spectrum's amplitude",)
 COARSE = 16
 """At least so many rows, and columns in proportion, of the label's directions show its extremes: 6 degrees apart in a
 hemisphere, a quarter of what 16 elements resolve."""
+
+KEPT = 64
+"""Most grids, carriers and receivers whose sines and cosines are kept: thinning by a stride of 4 has 16 grids."""
 
 SILENT = 1e-6
 """Smallest power over the mean over all pixels: sums of tens of float32 terms round at this, and below it the slope of
@@ -104,10 +107,10 @@ class ArrayResponse(Pooling):
         is_whole = _are_same(asked, own)
         spectra, order = [parts.new_zeros(0, math.prod(asked.shape))], [torch.zeros(0).long().to(parts.device)]
         for carrier, links in self._by_carrier(query):
-            amplitudes = self._look(parts[links], carrier, query, asked, is_whole)
+            amplitudes = self._look(parts[links], carrier, query, asked)
             shown = amplitudes
             if not is_whole:
-                shown = torch.cat((amplitudes, self._look(parts[links], carrier, query, self.coarse, True)), 1)
+                shown = torch.cat((amplitudes, self._look(parts[links], carrier, query, self.coarse)), 1)
             low, high = shown.amin(1, keepdim=True), shown.amax(1, keepdim=True)
             spread = torch.where(high > low, high - low, 1)
             # Pixels are many, and each pass over them in memory costs as much as the beamformer itself.
@@ -117,15 +120,20 @@ class ArrayResponse(Pooling):
         whole = spectra[1] if len(spectra) == 2 else torch.cat(spectra)[torch.cat(order).argsort()]
         return whole.unflatten(1, asked.shape)
 
-    def _look(self, parts: Tensor, carrier: float, query: Query, directions: Directions, is_kept: bool) -> Tensor:
+    def _look(self, parts: Tensor, carrier: float, query: Query, directions: Directions) -> Tensor:
         """Amplitudes of the beamformer in some directions (b, k)."""
-        key = int(query.receivers[0]), carrier, directions.shape, parts.dtype, parts.device
-        basis = self._kept.get(key) if is_kept else None
+        key, basis = None, None
+        if isinstance(directions, Grid):  # training thins one grid in a few ways, time and again; rays hardly come back
+            axes = (axis.cpu().numpy().tobytes() for axis in (directions.elevations, directions.azimuths))
+            key = int(query.receivers[0]), carrier, parts.dtype, parts.device, *axes
+            basis = self._kept.get(key)
         if basis is None:
             # Kept beyond this call: made in inference mode it could not be saved for a later backward pass.
             with torch.inference_mode(False):
                 basis = self._basis(carrier, query, directions).to(parts)
-            if is_kept:
+            if key is not None:
+                if len(self._kept) >= KEPT:
+                    self._kept.clear()
                 self._kept[key] = basis
         power = parts @ basis
         return power.clamp_min(SILENT).sqrt() if torch.is_grad_enabled() else power.clamp_min_(SILENT).sqrt_()
