@@ -1,8 +1,5 @@
 """Received signal strength in the ray tracer's rooms, as Bluetooth gateways on their walls report it."""
 
-import math
-from functools import partial
-
 import torch
 
 from gaigs.data import Links
@@ -11,12 +8,9 @@ from gaigs.data.sionna import find_room, place
 from gaigs.data.sionna.cache import find_paths
 from gaigs.data.sionna.meshes import edges
 from gaigs.data.sionna.tracing import frequency_offsets, respond
-from gaigs.data.synthetic import last_fifth
 from gaigs.data.synthetic.image_source import rss_dbm
-from gaigs.data.synthetic_rssi import BANDWIDTH, FREQUENCY
-from gaigs.query import Query
+from gaigs.data.synthetic_rssi import BANDWIDTH, FREQUENCY, as_readings, check_noise
 from gaigs.registry import register
-from gaigs.task.rssi import Rssi
 
 
 @register("data", "sionna_rssi")
@@ -45,8 +39,7 @@ def traced_room_rssi(
         RuntimeError: There is no libLLVM that it can use.
         ValueError: An option is out of range, or a gateway hears nothing.
     """
-    if not 0 <= noise < math.inf:
-        raise ValueError(f"noise must be a standard deviation, 0 or more [dB], got {noise}")
+    check_noise(noise)
     walls = find_room(room)
     places = place(walls, transmitters, seed)
     offsets = frequency_offsets(walls, BANDWIDTH)
@@ -55,29 +48,5 @@ def traced_room_rssi(
     for receiver in receivers:
         paths = find_paths(walls, receiver.pose.position, places, FREQUENCY)
         strengths.append(rss_dbm(respond(paths, receiver, FREQUENCY, offsets)))
-    readings = torch.stack(strengths, 1)
-    # A seed of its own: from the places' seed come the random numbers that the places are made of.
-    generator = torch.Generator().manual_seed(hash((seed, 1)) % 2**63)
-    readings += noise * torch.randn(readings.shape, dtype=readings.dtype, generator=generator)
-    heard = readings >= sensitivity
-    for receiver, any_heard in zip(receivers, heard.any(0), strict=True):
-        if not any_heard:
-            raise ValueError(
-                f"sensitivity must let each gateway hear a reading, but {receiver.name!r} hears none of {transmitters} "
-                f"at {sensitivity:g} dBm; lower it"
-            )
-    rows, columns = heard.nonzero(as_tuple=True)
-    return Links(
-        query=Query(places[rows], columns, torch.full((len(rows),), FREQUENCY)),
-        receivers=receivers,
-        labels=readings[heard].float(),
-        task=Rssi(),
-        rows=rows,
-        official=partial(last_fifth, transmitters, rows),
-        bandwidth=BANDWIDTH,
-        edges=edges(walls.meshes()),
-        remarks=(
-            f"{len(rows)} readings of {transmitters} places at {len(receivers)} gateways; "
-            f"{int((~heard).sum())} below {sensitivity:g} dBm were not heard and are left out"
-        ),
-    )
+    strengths = torch.stack(strengths, 1)
+    return as_readings(places, receivers, strengths, noise, sensitivity, seed, edges(walls.meshes()))
