@@ -55,7 +55,10 @@ class ArrayResponse(Pooling):
         super().__init__()
         task = scene.task
         if task.directions is None:
-            raise ValueError(f"pooling 'array_response' gives spectra, and labels of task {task.name!r} are none")
+            raise ValueError(
+                f"pooling 'array_response' gives spectra, and labels of task {task.name!r} are none; take mean_power "
+                "for RSSI, element_sum for channels"
+            )
         if task.normalisation not in NORMALISATIONS:
             raise ValueError(
                 f"pooling 'array_response' takes labels scaled by {' or '.join(NORMALISATIONS)}, got "
