@@ -16,6 +16,7 @@ from gaigs.placement.mirrored import Mirrored
 from gaigs.propagation import fresnel
 from gaigs.query import Query
 from gaigs.report import shapes
+from gaigs.scene import Scene
 
 NEPER = 20 / math.log(10)
 """Of a field [dB]."""
@@ -95,6 +96,18 @@ def some(query: Query) -> Query:
     """At most ``LOOKED_AT`` of the links, evenly spread."""
     count = len(query)
     return query[torch.linspace(0, count - 1, min(LOOKED_AT, count)).long()]
+
+
+def all_over(scene: Scene) -> Query:
+    """Links evenly spread over the training transmitters' box, the receivers and the carriers."""
+    number = torch.arange(LOOKED_AT)
+    shares = torch.quasirandom.SobolEngine(3).draw(LOOKED_AT).to(scene.lower)
+    known = scene.frequencies
+    return Query(
+        scene.lower + (scene.upper - scene.lower) * shares,
+        number % len(scene.receivers),
+        known[number % len(known)] if len(known) else None,
+    )
 
 
 @torch.no_grad()

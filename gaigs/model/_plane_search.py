@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -14,7 +14,7 @@ from gaigs.placement._words import reflect
 from gaigs.placement.mirrored import CONDUCTIVITY, PERMITTIVITY
 from gaigs.projection import Splats
 from gaigs.propagation import NEAREST, fresnel
-from gaigs.query import Batch, Query
+from gaigs.query import Batch
 
 SLANTS, OFFSETS = 24, 24
 """Normals over the sphere, beside the axes and the normals there are, and offsets across the room, of the first try."""
@@ -33,6 +33,9 @@ GAIN = 0.01
 
 ROWS = 12
 """Rows of the labels that searches look at: a search takes hundreds of looks."""
+
+FEW = 6
+"""Rows where only powers are looked at, which change slowly with direction."""
 
 AT_ONCE = 4000
 """Pairs of a link and a plane worked on at a time."""
@@ -73,11 +76,11 @@ def find_planes(model, train: Batch, validation: Batch | None, loss: Callable[[B
     return f"{' and '.join(told) or 'no plane'} found; loss {before:.4f} -> {loss(train):.4f}"
 
 
-def fewer(batch: Batch) -> Batch:
+def fewer(batch: Batch, rows: int = ROWS) -> Batch:
     """A batch with some of its labels' rows and columns, where these have a grid."""
     labels, directions = batch.labels, batch.directions
     if isinstance(directions, Grid):
-        every = slice(None, None, max(1, directions.shape[0] // ROWS))
+        every = slice(None, None, max(1, directions.shape[0] // rows))
         labels, directions = labels[:, every, every], directions.thin(every, every)
     return Batch(batch.query, directions, labels)
 
@@ -103,11 +106,11 @@ def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
     offsets = low[:, None] + (high - low)[:, None] * shares
     pitch = float((high - low).max()) / (OFFSETS - 1)
     normals, offsets = normals[:, None].expand(-1, OFFSETS, -1).flatten(0, 1), offsets.flatten()
-    batch = fewer(batch)
-    heard, query = _heard(model, batch)
+    batch = fewer(batch, FEW)
+    heard = _heard(model, batch)
     turn = TURN
     for _ in range(ROUNDS + 1):
-        errors = _errors(model, batch, heard, query, normals, offsets)
+        errors = _errors(model, batch, heard, normals, offsets)
         best = int(errors.argmin())
         normal, offset = normals[best], offsets[best]
         normals = functional.normalize(normal + turn * torch.randn(CLOSER, 3).to(normal), dim=1)
@@ -119,34 +122,31 @@ def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
     return normal, offset.item()
 
 
-def _heard(model, batch: Batch) -> tuple[Tensor, Query]:
-    """The lags that each link hears now."""
+def _heard(model, batch: Batch) -> list[tuple[int, Int[Tensor, "k"], Complex[Tensor, "k l"]]]:
+    """Each receiver, its links, and the lags that they hear now."""
     query = batch.query
     excited = model._excite(query)
-    parts = torch.zeros(0)
+    heard = []
     for receiver in query.receivers.unique().tolist():
         own = (query.receivers == receiver).nonzero()[:, 0]
-        lags = model._sum(*excited, own, receiver, query[own])
-        if not len(parts):
-            parts = lags.new_zeros(len(query), lags.shape[1])
-        parts[own] = lags
-    return parts, query
+        heard.append((receiver, own, model._sum(*excited, own, receiver, query[own])))
+    return heard
 
 
-def _errors(model, batch: Batch, heard: Tensor, query: Query, normals: Tensor, offsets: Tensor) -> Float[Tensor, "c"]:
+def _errors(model, batch: Batch, heard: list[tuple], normals: Tensor, offsets: Tensor) -> Float[Tensor, "c"]:
     """Mean absolute error with the reflection at one more plane, of each of some planes."""
     totals = []
-    size = max(1, AT_ONCE // len(query))
+    count = len(batch.query)
+    size = max(1, AT_ONCE // count)
     for n, d in zip(normals.split(size), offsets.split(size), strict=True):
-        errors = heard.real.new_zeros(len(query), len(n))
-        for receiver in query.receivers.unique().tolist():
-            own = (query.receivers == receiver).nonzero()[:, 0]
-            errors[own] = _with_one_more(model, batch, heard[own], own, receiver, n, d)
+        errors = normals.new_zeros(count, len(n))
+        for receiver, own, lags in heard:
+            errors[own] = _with_one_more(model, batch, lags, own, receiver, n, d)
         totals.append(errors.mean(0))
     return torch.cat(totals)
 
 
-def _with_one_more(model, batch: Batch, heard, own, receiver: int, normals, offsets) -> Float[Tensor, "b c"]:
+def _with_one_more(model, batch: Batch, lags, own, receiver: int, normals, offsets) -> Float[Tensor, "b c"]:
     placement, count = model.placement, len(normals)
     antenna = model.scene.receivers[receiver]
     pose = antenna.pose.to(normals)
@@ -159,7 +159,7 @@ def _with_one_more(model, batch: Batch, heard, own, receiver: int, normals, offs
     directions = (seen / lengths[..., None]) @ pose.rotation
     te, tm = fresnel(complex(PERMITTIVITY, -CONDUCTIVITY), (seen * normals).sum(-1).abs() / lengths)
     level = normals[:, 2].square()
-    gains = ((1 - level) * te + level * tm) * antenna.array.gain(directions) * (sides > 0) / lengths
+    gains = ((1 - level) * te + level * tm) * placement.pattern(receiver, directions) * (sides > 0) / lengths
     gains = gains * placement.receiver_gains[receiver].exp()
     flat = lambda values: values.flatten(0, 1)[:, None]
     splats = Splats(flat(directions[..., :2]), normals.new_zeros(1, 1, 2, 2), flat(lengths), flat(sides > 0))
@@ -168,7 +168,7 @@ def _with_one_more(model, batch: Batch, heard, own, receiver: int, normals, offs
     more = model.rasterizer.lags(
         splats, flat(gains), flat(lengths), normals.new_zeros(1), None, antenna.array, model._carriers(query)
     )
-    lags = heard.repeat_interleave(count, 0) + more
+    lags = lags.repeat_interleave(count, 0) + more
     directions, labels = batch.directions, batch.labels[own]
     value = model.pooling.hear(lags, query, directions)
     value = model._on_trend(value, Batch(query, directions))

@@ -10,7 +10,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.model import _learnt_room
+from gaigs.model import Prediction, _learnt_room
 from gaigs.model._plane_search import fewer, find_planes
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.propagation import carriers
@@ -93,6 +93,19 @@ class Mirrored(GaussianSplatting):
         """Whether labels take the sum of waves, so that powers alone tell nothing and phases count from the start."""
         return self.draws_map or self.pooling.takes == "fields"
 
+    def forward(self, batch: Batch) -> Prediction:
+        """As the pipeline's.
+
+        Raises:
+            ValueError: In half precision, which would lose the phases.
+        """
+        offsets = self.placement.offsets
+        if torch.is_autocast_enabled(offsets.device.type) or torch.finfo(offsets.dtype).bits < 32:
+            raise ValueError(
+                "model 'mirrored' counts wavelengths along paths; set trainer.precision to 32-true or 64-true"
+            )
+        return super().forward(batch)
+
     # --- what a run reports of it ---
 
     def facts(self) -> dict[str, object]:
@@ -108,10 +121,14 @@ class Mirrored(GaussianSplatting):
         return facts if self.places is None else facts | _learnt_room.facts(placement, self.places)
 
     def export(self, folder: Path) -> None:
-        """``planes.obj`` and ``obstacles.ply`` beside the free Gaussians."""
+        """``planes.obj`` and ``obstacles.ply`` beside the free Gaussians.
+
+        Planes end where the training links' paths meet them; of a model that was loaded, those of places all over the
+        training transmitters' box.
+        """
         super().export(folder)
-        if self.places is not None:
-            _learnt_room.export(self.placement, self.places, folder)
+        places = _learnt_room.all_over(self.scene) if self.places is None else self.places
+        _learnt_room.export(self.placement, places, folder)
 
     def learnt_room(self, links: Links) -> LearntRoom:
         """Planes, obstacles and paths for figures."""

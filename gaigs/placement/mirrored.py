@@ -1,5 +1,6 @@
 """Mirrored Gaussians: each stands at an image of the transmitter in planes that are learnt, the walls of the room."""
 
+import logging
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +24,8 @@ from gaigs.propagation import NEAREST, carriers, fresnel
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene
+
+log = logging.getLogger(__name__)
 
 BOX = 6
 """Planes at the start: one beyond each face of the box that holds transmitters and receivers."""
@@ -158,7 +161,13 @@ class Mirrored(Placement):
         """
         if self.walls is None:
             return
-        planes = read_planes(Path(self.walls), *self.box)[: len(self.origin)].to(self.origin)
+        planes = read_planes(Path(self.walls), *self.box).to(self.origin)
+        most = len(self.origin)
+        if len(planes) > most:
+            log.warning(
+                "%s has %d planes, of which the first %d are taken: placement.planes", self.walls, len(planes), most
+            )
+        planes = planes[:most]
         for plane, (*normal, offset) in enumerate(planes):
             self.place(plane, torch.stack(normal), offset.item())
         self.kept.copy_(self.words_of(torch.arange(len(planes), device=self.kept.device)))
@@ -268,16 +277,18 @@ class Mirrored(Placement):
             left = torch.cat((left[:, :first], left[:, first:] * reflected), 1)
         return left
 
+    def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Field gain of a receiver's elements in its frame; of an array also what was learnt, cos^q."""
+        array = self.scene.receivers[receiver].array
+        gain = array.gain(directions)
+        return gain if len(array) == 1 else gain * directions[..., 2].clamp_min(GRAZING) ** self.directivity
+
     def _patterns(self, query: Query, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
-        """Field gain of the receivers' elements towards points; of arrays also what was learnt, cos^q."""
+        """Field gain of the receivers' elements towards points."""
         gains = torch.ones_like(points[..., 0])
         for receiver in query.receivers.unique().tolist():
-            own, antenna = query.receivers == receiver, self.scene.receivers[receiver]
-            directions = functional.normalize(antenna.pose.to(points).local(points[own]), dim=-1)
-            gain = antenna.array.gain(directions)
-            if len(antenna.array) > 1:
-                gain = gain * directions[..., 2].clamp_min(GRAZING) ** self.directivity
-            gains[own] = gain
+            own, pose = query.receivers == receiver, self.scene.receivers[receiver].pose.to(points)
+            gains[own] = self.pattern(receiver, functional.normalize(pose.local(points[own]), dim=-1))
         return gains
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

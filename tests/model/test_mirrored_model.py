@@ -204,3 +204,24 @@ def test_results_of_mirrored_gaussians_do_not_go_by_the_papers_name():
     links = example_links("spectrum", 5e9)
     with pytest.raises(ValueError, match=r"placement 'mirrored' makes another predictor, .* set model=mirrored"):
         GaussianSplatting(links.scene, **OPTIONS)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_is_refused(dtype):
+    links = room_spectra("band", 4)
+    model, batch = build(links), links.batch(links.split.train)
+    with torch.autocast("cpu", torch.bfloat16), pytest.raises(ValueError, match=r"set trainer\.precision to 32-true"):
+        model(batch)
+    with pytest.raises(ValueError, match=r"set trainer\.precision to 32-true"):
+        model.to(dtype)(batch)
+
+
+def test_a_loaded_model_exports_its_planes(tmp_path):
+    links = room_spectra("band")
+    model = build(links)
+    model.load_state_dict(told(build(links)).state_dict())
+    model.export(tmp_path)
+    vertices = [line.split()[1:] for line in (tmp_path / "planes.obj").read_text().splitlines() if line[:2] == "v "]
+    vertices = torch.tensor([[float(value) for value in vertex] for vertex in vertices])
+    assert torch.allclose(vertices.amin(0), torch.zeros(3), atol=1e-3)
+    assert torch.allclose(vertices.amax(0), torch.tensor(EMPTY.size), atol=1e-3)

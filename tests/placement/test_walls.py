@@ -159,10 +159,12 @@ def test_a_placement_starts_from_the_walls(tmp_path, links):
     assert not torch.allclose(started(links, None).offsets[:6], expected[:, 3])
 
 
-def test_of_more_walls_than_planes_the_largest_are_taken(tmp_path, links):
+def test_of_more_walls_than_planes_the_largest_are_taken(tmp_path, links, caplog):
     file = write(tmp_path, "room.obj", wavefront_obj(ROOM))
     placement = started(links, file, planes=6)
-    torch.testing.assert_close(placement.offsets, read_planes(file, *placement.box)[:6, 3])
+    planes = read_planes(file, *placement.box)
+    torch.testing.assert_close(placement.offsets, planes[:6, 3])
+    assert f"room.obj has {len(planes)} planes, of which the first 6 are taken" in caplog.text
     assert placement.used.tolist() == [*range(6)]
 
 

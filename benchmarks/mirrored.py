@@ -1,0 +1,116 @@
+"""Times predictions of mirrored Gaussians, without a map and by way of one, interleaved in one process.
+
+    python benchmarks/mirrored.py
+    python benchmarks/mirrored.py data=synthetic_rssi pooling=mean_power --links 256
+    python benchmarks/mirrored.py --checkpoint runs/a-run/best.ckpt
+
+Overrides are those of ``python -m gaigs +experiment=mirrored``. Every rasterizer gets the same Gaussians: those of a
+checkpoint, without its kriging, or untrained ones, of which none has been pruned. Phases count. Rendering is the
+rasterizer alone, of aperture with the projection; a prediction is everything from position to label. Times are
+medians for one link; judge them by their ratios within one run, as other work on the machine slows all of them.
+"""
+
+import argparse
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from scipy.constants import speed_of_light
+
+import gaigs
+from gaigs import configuration
+from gaigs.data import Links, load
+from gaigs.evaluation import device_name
+from gaigs.model import Model
+from gaigs.propagation import carriers
+from gaigs.query import Batch
+from gaigs.registry import registry
+
+WAYS = {"aperture": [], "torch": ["rasterizer=torch", "projection=mercator"]}
+WAYS["opencl"] = ["rasterizer=opencl", "projection=mercator"]
+"""Overrides by rasterizer."""
+
+MAPS = 8
+"""Links of which a map rasterizer draws maps at a time: it takes one after the other anyway."""
+
+
+def build(overrides: list[str], checkpoint: Path | None) -> tuple[Model, Links]:
+    """A model with phases, and its data."""
+    with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
+        config = compose("config", ["+experiment=mirrored", *overrides])
+    config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    torch.manual_seed(config["seed"])
+    links = load(config["data"], config["split"])
+    model = registry("model").build(config["model"], scene=links.scene)
+    model.fit(links)
+    if checkpoint is None:
+        model.placement.sharpen(speed_of_light / carriers(links.scene, links.query).mean().item())
+    else:
+        trained = gaigs.load(checkpoint)
+        model.placement.load_state_dict(getattr(trained, "trend", trained).placement.state_dict())
+    return model.eval(), links
+
+
+def median_times(ways: dict[str, tuple[Callable, int]], repeats: int) -> dict[str, float]:
+    """Milliseconds for one link, by way: a function and the links that it takes at a time."""
+    times = defaultdict(list)
+    for _ in range(repeats + 1):
+        for name, (function, links) in ways.items():
+            start = time.perf_counter()
+            function()
+            times[name].append(1e3 * (time.perf_counter() - start) / links)
+    return {name: statistics.median(values[1:]) for name, values in times.items()}
+
+
+@torch.no_grad()
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
+    parser.add_argument("--checkpoint", type=Path, help="of a model trained with the same overrides")
+    parser.add_argument("--links", type=int, default=64, help="links predicted at a time")
+    parser.add_argument("--repeats", type=int, default=20)
+    options = parser.parse_intermixed_args()
+    if min(options.links, options.repeats) < 1:
+        parser.error(f"--links and --repeats must be at least 1, got {options.links} and {options.repeats}")
+    configuration.install()
+    renderings, predictions, refusals = {}, {}, []
+    for name, overrides in WAYS.items():
+        try:
+            model, links = build([*options.overrides, *overrides], options.checkpoint)
+            count = options.links if name == "aperture" else MAPS
+            query = links.query[torch.arange(count) % len(links)]
+            batch = Batch(query, links.task.directions)
+            rendering = model.rendering(batch)
+            rendering()
+        except (ValueError, RuntimeError) as error:
+            refusals.append(f"{name}: {error}")
+            continue
+        own = int((query.receivers == query.receivers[0]).sum())
+        renderings[name] = rendering, own
+        predictions[name] = lambda model=model, batch=batch: model.evaluate(batch), count
+        paths = int(model.placement.kept.sum())
+    if not renderings:
+        parser.error("; ".join(refusals))
+    rendering, prediction = (median_times(ways, options.repeats) for ways in (renderings, predictions))
+    title = f"{paths} paths, task {links.task.name}; {device_name(torch.device('cpu'))}"
+    table = Table("", *map(str, rendering), title=title, box=SIMPLE_HEAD)
+    for what, times in ("rendering", rendering), ("prediction", prediction):
+        table.add_row(f"{what} [ms]", *(f"{value:.3f}" for value in times.values()))
+        ratios = (value / times["aperture"] for value in times.values()) if "aperture" in times else ()
+        table.add_row("over aperture's", *(f"{ratio:.1f}" for ratio in ratios))
+    console = Console()
+    console.print(table)
+    for refusal in refusals:
+        console.print(refusal, markup=False)
+
+
+if __name__ == "__main__":
+    main()
