@@ -16,9 +16,15 @@ from omegaconf.errors import OmegaConfBaseException
 from gaigs import configuration, processes
 from gaigs.processes import Stopped, forward_to_children, limit_threads, stopping
 from gaigs.registry import check_type
+from gaigs.report import at_end
+
+log = logging.getLogger("gaigs")
 
 BASIC_LAUNCHER = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 """Hydra's default, which runs the jobs of a multirun one after the other in this process."""
+
+JOBLIB_LAUNCHER = "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLauncher"
+"""One whose processes each run several jobs."""
 
 
 def run(config: DictConfig) -> float | None:
@@ -68,7 +74,7 @@ def train(config: DictConfig) -> float | None:
     except OmegaConfBaseException as error:  # whose message Hydra adds
         raise CompactHydraException("gaigs: the configuration is not complete") from error
     except (TypeError, ValueError) as error:
-        raise CompactHydraException(f"gaigs: {error}") from error
+        raise failed(error) from error
     # Slow to import: here, once the configuration has proved good.
     from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
@@ -77,7 +83,7 @@ def train(config: DictConfig) -> float | None:
     for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
         logging.getLogger(name).setLevel(logging.WARNING)
     try:
-        with stopping():
+        with stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
             metrics = experiment.run(plain, Path(settings.runtime.output_dir))
     except KeyboardInterrupt as stop:
         mode = "sweep" if is_sweep else "run"
@@ -95,8 +101,16 @@ def train(config: DictConfig) -> float | None:
         if settings.verbose:
             os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra leaves most of the traceback out
             raise
-        raise CompactHydraException(f"gaigs: {error}") from error
+        raise failed(error) from error
     return None if metrics is None else metrics["validation_score"]
+
+
+def failed(error: Exception) -> CompactHydraException:
+    """What Hydra prints of a failure. Of a multirun's jobs it does so for the first alone, once all have ended: so each
+    says it in its log, too."""
+    if HydraConfig.get().mode is RunMode.MULTIRUN:
+        log.error("gaigs: %s", error)
+    return CompactHydraException(f"gaigs: {error}")
 
 
 def list_devices() -> None:
@@ -130,6 +144,11 @@ def main() -> None:
     handler = signal.signal(signal.SIGTERM, stop)
     try:
         hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
+        at_end.write()
+    except SystemExit as end:
+        if end.code == 1 and not signals:  # a job has failed, and the others have ended
+            at_end.write()
+        raise
     except Stopped:
         print("gaigs: stopped", file=sys.stderr)
         raise SystemExit(128 + signal.SIGTERM) from None

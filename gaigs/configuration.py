@@ -2,6 +2,8 @@
 
 import difflib
 import hashlib
+import logging
+from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,6 +13,8 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
 from gaigs.registry import KINDS, find_holders
+
+log = logging.getLogger(__name__)
 
 HARMLESS = (
     "command", "save_every", "tensorboard", "threads", "trainer.enable_progress_bar", "trainer.enable_model_summary"
@@ -97,7 +101,28 @@ def run_folder(overrides: str) -> str:
     return name.encode()[: LONGEST - len(digest) - 1].decode(errors="ignore") + "-" + digest
 
 
-OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)  # at import: a launcher's workers need it too
+def installed(*names: str) -> str:
+    """Those models of a list that are installed, as a sweep takes them; the log tells of the others."""
+    holders, _ = find_holders("model")
+    known = {holder.name for holder in holders}
+    if missing := [name for name in names if name not in known]:
+        log.warning("left out, as not installed: model=%s", ",".join(missing))
+    return ",".join(name for name in names if name in known)
+
+
+def launcher(name: str) -> str:
+    """A launcher that joblib is needed for, where it is installed; else Hydra's own, which runs job by job."""
+    try:
+        metadata.version("hydra-joblib-launcher")
+    except metadata.PackageNotFoundError:
+        return "basic"
+    return name
+
+
+# At import: a launcher's workers need them too.
+OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
+OmegaConf.register_new_resolver("installed", installed, replace=True, use_cache=True)
+OmegaConf.register_new_resolver("launcher", launcher, replace=True)
 
 
 def install() -> None:

@@ -72,7 +72,7 @@ def _rearrange(
     pick_state: Callable[[Tensor], Tensor],
 ) -> None:
     """New parameters in place of the old ones, in the module and in the optimizer."""
-    for name in Gaussians.PARAMETERS:
+    for name in gaussians.PARAMETERS:
         old = getattr(gaussians, name)
         new = nn.Parameter(pick(old.detach()), old.requires_grad)
         setattr(gaussians, name, new)

@@ -85,6 +85,8 @@ def test(models: Mapping[str, Model], baselines: Mapping[str, Mapping], links: L
     }
     if query.frequencies is not None:
         content["frequencies"] = query.frequencies.numpy()
+    if task.directions is not None:
+        content |= {"elevations": task.directions.elevations.numpy(), "azimuths": task.directions.azimuths.numpy()}
     scores = {}
     for key in [*models, *baselines]:
         values = predict(models[key] if key in models else fit(baselines[key], links), links, index)

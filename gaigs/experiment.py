@@ -29,6 +29,7 @@ from gaigs.processes import STOPPING, Stopped, is_first, only_run
 from gaigs.registry import call, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.training.batches import Batches, InOrder
+from gaigs.training.budget import ENDLESS, make_budget
 from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine
 from gaigs.training.kriging import check_kriging, krige
 from gaigs.training.revision import Revision
@@ -205,7 +206,10 @@ def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) ->
     module = registry("training").build(config["training"], **context)
     last, best = folder / "last.ckpt", folder / "best.ckpt"
     timer, keep_last = Timer(), KeepLast(last, config["save_every"])
+    options, budget = make_budget(config["trainer"], timer)
     callbacks = [timer, KeepBest(best, module.patience), keep_last]  # Lightning puts the last two behind all others
+    if budget is not None:
+        callbacks.insert(1, budget)
     if module.density is not None:
         callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))
     if model.revisions:
@@ -216,9 +220,10 @@ def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) ->
     if config["tensorboard"]:
         loggers.append(tensorboard_logger(folder))
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
-    trainer = call("trainer", lightning.Trainer, config["trainer"], **context)
+    trainer = call("trainer", lightning.Trainer, options, **context)
     check_trainer(trainer)
-    batches = Batches(links, links.split.train, module.batch_size, config["seed"], trainer.max_steps)
+    steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
+    batches = Batches(links, links.split.train, module.batch_size, config["seed"], steps)
     validation = InOrder(links, links.split.validation, module.batch_size) if len(links.split.validation) else None
     resume = None
     if last.is_file():

@@ -34,12 +34,17 @@ class Gaussians(nn.Module):
         spread: Standard deviation at the start, as a fraction of the distance to the next Gaussian of the lattice.
         opacity: At the start, in (0, 1).
         signal: Standard deviation of the signal's random start.
+        degree: Of the spherical harmonics over the direction in which a transmitter sees a Gaussian, by which the
+            signal changes from one transmitter to another; those above 0 start at zero.
+
+    Attributes:
+        degree: Up to which the harmonics count, ``degree`` at the start; less leaves the signal smoother.
 
     Raises:
         ValueError: An option is out of range.
 
-    Source: parametrisation of Kerbl et al., 3D Gaussian Splatting, 2023, with SH degree 0: a direction-dependent signal
-    adds nothing where there is one receiver; where there are several, all hear the same from a Gaussian.
+    Source: parametrisation of Kerbl et al., 3D Gaussian Splatting, 2023. The camera's place is by reciprocity the
+    transmitter's: a receiver sees each Gaussian from one direction, in which harmonics would add nothing.
     """
 
     PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "signal")
@@ -55,6 +60,7 @@ class Gaussians(nn.Module):
         spread: float,
         opacity: float,
         signal: float,
+        degree: int = 0,
     ):
         super().__init__()
         receivers = len(scene.receivers)
@@ -68,6 +74,9 @@ class Gaussians(nn.Module):
             raise ValueError(f"gaussians.opacity must lie between 0 and 1, got {opacity}")
         if not 0 <= signal < math.inf:
             raise ValueError(f"gaussians.signal must be at least 0, got {signal}")
+        if not degree >= 0:
+            raise ValueError(f"gaussians.degree must be at least 0, got {degree}")
+        self.degree = degree
         shares = [count // receivers + (i < count % receivers) for i in range(receivers)]
         means, scales = [], []
         low, high = zone
@@ -81,7 +90,8 @@ class Gaussians(nn.Module):
         self.quats = nn.Parameter(torch.randn(count, 4))
         self.log_scales = nn.Parameter(torch.cat(scales).log()[:, None].repeat(1, 3))
         self.opacity_logits = nn.Parameter(torch.full((count,), opacity).logit())
-        self.signal = nn.Parameter(signal * torch.randn(count, channels, 1))
+        bands = torch.zeros(count, channels, (degree + 1) ** 2 - 1)
+        self.signal = nn.Parameter(torch.cat((signal * torch.randn(count, channels, 1), bands), -1))
 
     def __len__(self) -> int:
         return len(self.means)
@@ -106,6 +116,11 @@ class Gaussians(nn.Module):
         """World frame [m²]."""
         return covariances(self.quats, self.scales)
 
+    @property
+    def bands(self) -> Float[Tensor, "n c k"]:
+        """The signal's coefficients that count."""
+        return self.signal[..., : (self.degree + 1) ** 2]
+
     def resize(self, count: int) -> None:
         """Makes room for another number of Gaussians; their values are undefined until they are loaded."""
         for name in self.PARAMETERS:
@@ -122,7 +137,8 @@ class Gaussians(nn.Module):
         """Writes the Gaussians as a .ply that 3-D Gaussian splatting viewers open.
 
         Positions [m], log scales, quaternions (w, x, y, z), opacity logits; the signal's first three channels stand in
-        f_dc_*, absent ones as 0, further ones in f_rest_*.
+        f_dc_*, absent ones as 0. In f_rest_* come, one channel after the other, these three's higher coefficients and
+        all that further ones have.
         """
         write_ply(path, dict(self.named_parameters()), f"gaigs: {self.signal.shape[1]} signal channels")
 
@@ -137,19 +153,21 @@ class Gaussians(nn.Module):
             vertices = PlyData.read(str(path))["vertex"].data
         except (PlyParseError, KeyError) as error:
             raise ValueError(f"{path} must be a whole .ply file with an element 'vertex': {error}") from error
-        channels = self.signal.shape[1]
-        wanted = {name: columns for name, columns in _ply_names(channels).items() if name != "normals"}
+        _, channels, bands = self.signal.shape
+        wanted = {name: columns for name, columns in _ply_names(channels, bands).items() if name != "normals"}
         lacking = [column for columns in wanted.values() for column in columns if column not in vertices.dtype.names]
         if lacking:
+            each = f" of {bands} coefficients" if bands > 1 else ""
             raise ValueError(
-                f"{path} must hold Gaussian splats with {channels} signal channels; it lacks {', '.join(lacking)}"
+                f"{path} must hold Gaussian splats with {channels} signal channels{each}; it lacks {', '.join(lacking)}"
             )
         self.resize(len(vertices))
         with torch.no_grad():
             for name, columns in wanted.items():
-                values = np.stack([vertices[column] for column in columns], -1).astype(np.float32)
+                values = torch.from_numpy(np.stack([vertices[column] for column in columns], -1).astype(np.float32))
                 parameter = getattr(self, name)
-                parameter.copy_(torch.from_numpy(values)[:, : parameter[0].numel()].reshape(parameter.shape))
+                values = _from_columns(values, channels) if name == "signal" else values.view_as(parameter)
+                parameter.copy_(values)
 
 
 def fibonacci_lattice(count: int, low: float, high: float) -> Float[Tensor, "count 3"]:
@@ -174,24 +192,39 @@ def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> N
         values: Raw parameters of n Gaussians, by the names in ``Gaussians.PARAMETERS``.
         comment: A line for the file's head.
     """
-    n, channels, _ = values["signal"].shape
+    n, channels, bands = values["signal"].shape
     columns = {}
-    for name, properties in _ply_names(channels).items():
-        filled = np.zeros((n, len(properties)), np.float32)
+    for name, properties in _ply_names(channels, bands).items():
+        filled = torch.zeros(n, len(properties))
         if name != "normals":
-            own = values[name].detach().cpu().numpy().reshape(n, -1)
-            filled[:, : own.shape[1]] = own
-        columns |= zip(properties, filled.T, strict=True)
+            own = values[name].detach().cpu()
+            filled[:] = _to_columns(own) if name == "signal" else own.reshape(n, -1)
+        columns |= zip(properties, filled.numpy().T, strict=True)
     vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
     PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(path))
 
 
-def _ply_names(channels: int) -> dict[str, list[str]]:
+def _to_columns(signal: Float[Tensor, "n c k"]) -> Float[Tensor, "n columns"]:
+    """The signal as a .ply has it, absent ones of the first three channels as 0."""
+    shown = nn.functional.pad(signal, (0, 0, 0, max(0, 3 - signal.shape[1])))
+    return torch.cat((shown[:, :3, 0], shown[:, :3, 1:].flatten(1), shown[:, 3:].flatten(1)), 1)
+
+
+def _from_columns(columns: Float[Tensor, "n columns"], channels: int) -> Float[Tensor, "n c k"]:
+    """The inverse of ``_to_columns``."""
+    bands = columns.shape[1] // max(3, channels)
+    shown, further = columns[:, 3 : 3 * bands], columns[:, 3 * bands :]
+    first = torch.cat((columns[:, :3, None], shown.unflatten(1, (3, bands - 1))), -1)
+    return torch.cat((first, further.reshape(len(columns), -1, bands)), 1)[:, :channels]
+
+
+def _ply_names(channels: int, bands: int) -> dict[str, list[str]]:
     """Properties of a splatting .ply for each parameter, in the order viewers expect."""
+    rest = 3 * (bands - 1) + bands * max(0, channels - 3)
     return {
         "means": ["x", "y", "z"],
         "normals": ["nx", "ny", "nz"],
-        "signal": [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(channels - 3)],
+        "signal": [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(rest)],
         "opacity_logits": ["opacity"],
         "log_scales": [f"scale_{i}" for i in range(3)],
         "quats": [f"rot_{i}" for i in range(4)],

@@ -1,5 +1,6 @@
-"""Poses, quaternions, covariances and spherical coordinates; the conventions stand in docs/conventions.md."""
+"""Poses, quaternions, covariances, spherical coordinates and harmonics; conventions stand in docs/conventions.md."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -100,3 +101,41 @@ def from_spherical(azimuths: Float[Tensor, "*batch"], elevations: Float[Tensor, 
     """Unit vectors towards azimuths and elevations [rad]; the inverse of ``to_spherical``."""
     horizontal = torch.cos(elevations)
     return torch.stack((horizontal * torch.cos(azimuths), horizontal * torch.sin(azimuths), torch.sin(elevations)), -1)
+
+
+def spherical_harmonics(vectors: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch k"]:
+    """Real spherical harmonics in directions, of all degrees n up to one, which is k = (degree + 1)² of them.
+
+    Number n² + n + m is sqrt(2) N P_n^|m|(z) times cos(m az) for m > 0, sin(|m| az) for m < 0, and N P_n(z) for m = 0.
+    P has the factor (-1)^m, and with N the mean square over the sphere is 1 / 4 pi, as .ply viewers have them.
+
+    The recurrence over n runs on N P_n^m / sin^m of the polar angle, a polynomial in z; the sine goes with the
+    azimuth's functions into (x + j y)^m. So values and gradients are finite at the poles too.
+
+    Args:
+        vectors: Unit vectors.
+        degree: The highest n.
+
+    Source: Holmes and Featherstone, A unified approach to the Clenshaw summation, 2002, section 3.
+    """
+    x, y, z = vectors.unbind(-1)
+    cosines, sines = torch.ones_like(z), torch.zeros_like(z)  # of m az, times sin^m of the polar angle
+    harmonics = [z] * (degree + 1) ** 2
+    first = 0.5 / math.sqrt(math.pi)
+    for m in range(degree + 1):
+        if m:
+            first *= -math.sqrt((2 * m + 1) / (2 * m))
+            cosines, sines = x * cosines - y * sines, x * sines + y * cosines
+        last, legendre = torch.zeros_like(z), torch.full_like(z, first)
+        for n in range(m, degree + 1):
+            if n > m:
+                step = math.sqrt((4 * n**2 - 1) / (n**2 - m**2))
+                back = math.sqrt(((n - 1) ** 2 - m**2) / (4 * (n - 1) ** 2 - 1))
+                last, legendre = legendre, step * (z * legendre - back * last)
+            middle = n**2 + n
+            if m:
+                harmonics[middle + m] = math.sqrt(2) * legendre * cosines
+                harmonics[middle - m] = math.sqrt(2) * legendre * sines
+            else:
+                harmonics[middle] = legendre
+    return torch.stack(harmonics, -1)

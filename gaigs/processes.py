@@ -92,8 +92,13 @@ def only_run(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stopping() -> Iterator[None]:
-    """Has SIGTERM stop a run as Ctrl-C does; what handlers there were come back."""
+def stopping(waits: bool = False) -> Iterator[None]:
+    """Has SIGTERM stop a run as Ctrl-C does; what handlers there were come back.
+
+    Args:
+        waits: Whether the process waits for another run then. SIGTERM does not end it while it does, as its launcher
+            would wait for it for ever.
+    """
     if threading.current_thread() is not threading.main_thread():  # others may set no handlers
         yield
         return
@@ -108,6 +113,8 @@ def stopping() -> Iterator[None]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
+        if waits:
+            signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
 
 
 def forward_to_children(number: int) -> None:

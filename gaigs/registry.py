@@ -145,8 +145,10 @@ class Registry:
         return call(f"{self.kind} {name!r}", self.get(name), options, **context)
 
     def _load(self, holder: Holder) -> Callable:
-        if holder.root is not None and str(holder.root) not in sys.path:
-            sys.path.append(str(holder.root))  # last, so that nothing in ./plugins shadows what is installed
+        if holder.root is not None:
+            # A package in ./plugins may need another one there, as installed ones may need each other.
+            roots = {str(root): None for root in (holder.root, *_sources(Path.cwd() / "plugins"))}
+            sys.path += [root for root in roots if root not in sys.path]  # last: nothing shadows what is installed
         name, _, attribute = holder.target.partition(":")
         try:
             module = importlib.import_module(name.strip())
@@ -274,8 +276,7 @@ def _scan(kind: str, folder: Path, package: str, root: Path | None = None) -> tu
         where = str(file.relative_to(root or Path(__file__).parents[1]))
         try:
             if file.name == "pyproject.toml":
-                # Packages lie in src where there is one, else beside the pyproject.toml.
-                source = file.parent / "src" if (file.parent / "src").is_dir() else file.parent
+                source = _source(file.parent)
                 holders += [Holder(name, where, target, root=source) for name, target in _entry_points(kind, file)]
             else:
                 holders += [Holder(name, where, module, file, root) for name in _decorated(kind, file)]
@@ -294,6 +295,16 @@ def _files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
         elif (path / "__init__.py").is_file():
             yield f"{package}.{path.name}", path / "__init__.py"
             yield from _files(path, f"{package}.{path.name}")
+
+
+def _source(project: Path) -> Path:
+    """Where an installable project's packages lie: in src where there is one, else beside the pyproject.toml."""
+    return project / "src" if (project / "src").is_dir() else project
+
+
+def _sources(folder: Path) -> list[Path]:
+    """Where the packages of all installable projects in a folder lie."""
+    return [_source(file.parent) for file in sorted(folder.glob("[!_.]*/pyproject.toml"))]
 
 
 def _entry_points(kind: str, file: Path) -> Iterable[tuple[str, str]]:

@@ -57,11 +57,14 @@ SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "syntheti
 MADE_FOR = {
     "loss": {"l1_ssim": ["spectrum"], "absolute": ["spectrum", "rssi"], "squared": ["spectrum", "rssi"]}
     | {"huber": ["spectrum", "rssi"], "nmse": ["csi"]},
-    "model": {"array_response": ["spectrum"], "path_loss": ["rssi"], "friis": ["csi"]}
-    | {"kriging": []},  # it is made of a trained model alone
+    "model": {"path_loss": ["rssi"], "friis": ["csi"]}
+    | {name: ["spectrum"] for name in ("array_response", "rf_3dgs", "swift_wrf")}
+    | {"kriging": [], "ray_tracing": []},  # made of a trained model alone; of rooms that are known
     "pooling": {
         "array_response": ["spectrum"],
         "spectrum": ["spectrum"],
+        "clamped": ["spectrum"],
+        "mean_amplitude": ["rssi"],
         "mean_power": ["rssi"],
         "softmax_attention": ["rssi"],
         "element_sum": ["csi"],

@@ -114,6 +114,7 @@ def test_activations(scene):
         ({"spread": 0.0}, "spread must be positive, got 0.0"),
         ({"spread": math.nan}, "spread must be positive, got nan"),
         ({"signal": -1.0}, "signal must be at least 0, got -1.0"),
+        ({"degree": -1}, "degree must be at least 0, got -1"),
         ({"opacity": 1.0}, "between 0 and 1, got 1.0"),
         ({"opacity": 0.0}, "between 0 and 1"),
     ],
@@ -148,8 +149,11 @@ def test_resizing_keeps_what_is_frozen_frozen(scene):
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 5])
-def test_a_ply_brings_them_back_bit_by_bit(scene, tmp_path, channels):
-    saved, loaded = gaussians_of(scene, channels=channels), gaussians_of(scene, channels=channels, count=7)
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_ply_brings_them_back_bit_by_bit(scene, tmp_path, channels, degree):
+    options = {"channels": channels, "degree": degree}
+    saved, loaded = gaussians_of(scene, **options), gaussians_of(scene, **options, count=7)
+    torch.nn.init.normal_(saved.signal)
     saved.save_ply(tmp_path / "room.ply")
     loaded.load_ply(tmp_path / "room.ply")
     assert len(loaded) == 41
@@ -172,6 +176,15 @@ def test_a_ply_has_the_columns_that_splatting_viewers_read(scene, tmp_path):
     assert [fourth[f"scale_{i}"] for i in range(3)] == gaussians.log_scales[4].tolist()
     assert [fourth[f"rot_{i}"] for i in range(4)] == gaussians.quats[4].tolist()
     assert [fourth[f"f_dc_{i}"] for i in range(3)] == [*gaussians.signal[4, :, 0].tolist(), 0]
+
+
+def test_a_ply_has_one_channels_harmonics_behind_the_others(scene, tmp_path):
+    gaussians = gaussians_of(scene, channels=3, degree=3)
+    torch.nn.init.normal_(gaussians.signal)
+    gaussians.save_ply(tmp_path / "room.ply")
+    vertices = PlyData.read(tmp_path / "room.ply")["vertex"]
+    rest = [float(vertices[f"f_rest_{i}"][4]) for i in range(45)]
+    assert rest == gaussians.signal[4, :, 1:].flatten().tolist()
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from scipy.special import sph_harm_y
 
-from gaigs.geometry import Pose, covariances, from_spherical, quaternions_to_rotations, to_spherical
+from gaigs.geometry import (
+    Pose,
+    covariances,
+    from_spherical,
+    quaternions_to_rotations,
+    spherical_harmonics,
+    to_spherical,
+)
 
 
 @pytest.fixture
@@ -98,3 +106,25 @@ def test_gradients_are_finite_on_the_axis_and_beside_it(dtype, offset):
         (gradient,) = torch.autograd.grad(coordinate.sum(), points, retain_graph=True)
         assert gradient.isfinite().all()
     assert (to_spherical(points)[1].abs().rad2deg() > 89.999).all()
+
+
+def directions(count):
+    """Unit vectors, the poles among them."""
+    vectors = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    vectors[:2] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    return vectors / vectors.norm(dim=-1, keepdim=True)
+
+
+def test_spherical_harmonics_are_scipys():
+    vectors, degree = directions(40), 12
+    found = spherical_harmonics(vectors, degree).numpy()
+    azimuths, elevations, _ = (angle.numpy() for angle in to_spherical(vectors))
+    for n in range(degree + 1):
+        for m in range(-n, n + 1):
+            waves = sph_harm_y(n, abs(m), math.pi / 2 - elevations, azimuths)
+            expected = waves.real if m == 0 else math.sqrt(2) * (waves.real if m > 0 else waves.imag)
+            np.testing.assert_allclose(found[:, n**2 + n + m], expected, rtol=0, atol=1e-12)
+
+
+def test_spherical_harmonics_have_finite_gradients_at_the_poles():
+    assert torch.autograd.gradcheck(lambda vectors: spherical_harmonics(vectors, 4), directions(5).requires_grad_())

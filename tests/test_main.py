@@ -286,3 +286,36 @@ def test_a_multirun_goes_past_a_failure_and_reports(run, tmp_path):
         ended = {(row["tokenizer"], row["gaussians.count"]): row["status"] for row in csv.DictReader(file)}
     for tokenizer in ("euclidean", "ga"):
         assert (ended[tokenizer, "0"], ended[tokenizer, "30"]) == ("unfinished", "done")
+
+
+def test_systems_come_into_one_table_though_one_cannot_do_the_task(run, tmp_path):
+    command = ("-m", "+experiment=systems_spectrum", "data.transmitters=30", "hydra/launcher=basic", *SMALL[-1:])
+    code, err = run(*command, "model=knn,friis,mean")
+    assert code == 1
+    assert "gaigs: model 'friis'" in err
+    folder = tmp_path / "runs" / "systems_spectrum"
+    table = (folder / "systems.md").read_text()
+    assert [line.split(" | ")[0] for line in table.splitlines()[2:4]] == ["| knn", "| mean"]
+    assert "- without a result: friis: model 'friis'" in table
+    assert {path.name for path in folder.glob("systems*")} == {
+        *(f"systems.{ending}" for ending in ("md", "csv", "tex")),
+        *(f"systems_{name}.png" for name in ("cdf", "spectra")),
+    }
+    assert "Systems" in run.out
+    assert run(*command, "model=knn,mean")[0] == 0
+    assert run.out.count("finished already") == 2
+    assert (folder / "systems.md").read_text() == table
+
+
+def test_a_training_by_time_ends_and_tells_its_seconds(run, tmp_path):
+    """A second of the real clock, whatever it brings."""
+    by_time = ("trainer.max_steps=-1", "trainer.max_time=00:00:00:01", "trainer.val_check_interval=00:00:00:01")
+    assert run(*SMALL, *by_time, "hydra.run.dir=run")[0] == 0
+    steps = torch.load(tmp_path / "run" / "last.ckpt", weights_only=True)["global_step"]
+    curves = read_curves([tmp_path / "run" / "log" / "version_0" / "metrics.csv"])
+    seconds, scores = curves["seconds"], curves["validation/ssim"]
+    assert seconds[0].tolist() == scores[0].tolist()
+    assert seconds[0][-1] == steps - 1
+    assert seconds[1][-1] >= 1
+    assert run(*SMALL, *by_time, "hydra.run.dir=run")[0] == 0
+    assert run.out.splitlines()[0].startswith("finished already")

@@ -111,6 +111,15 @@ def test_two_processes_stop_together_and_go_on(tmp_path):
     assert_same_training(tmp_path / "whole", tmp_path / "stopped", 0)
 
 
+def test_two_processes_end_together_when_their_time_is_up(tmp_path):
+    """Validations and the last step are the same for both, or they would wait for each other."""
+    by_time = ("trainer.max_steps=-1", "trainer.max_time=00:00:00:03", "trainer.val_check_interval=00:00:00:01")
+    run(tmp_path / "timed", *SPECTRUM, *TWO, *by_time)
+    step = torch.load(tmp_path / "timed" / "last.ckpt", weights_only=True)["global_step"]
+    validated, _ = read_curves([tmp_path / "timed" / "log" / "version_0" / "metrics.csv"])["seconds"]
+    assert validated[-1] == step - 1
+
+
 def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path):
     process = start(tmp_path / "run", *SPECTRUM, *LONG, "save_every=0.2")
     wait_for(process, (tmp_path / "run" / "last.ckpt").is_file)
@@ -123,6 +132,22 @@ def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path):
     assert process.returncode == 143
     step = torch.load(tmp_path / "run" / "last.ckpt", weights_only=True)["global_step"]
     assert err == f"gaigs: stopped after step {step}; the same command with hydra.run.dir={tmp_path / 'run'} goes on\n"
+
+
+def test_a_launchers_process_that_waits_for_a_run_outlives_sigterm(monkeypatch):
+    """Its launcher would wait for it for ever; and no other run is to start there."""
+    monkeypatch.setattr(processes, "received", [])
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(processes.Stopped), processes.stopping(waits=True):
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert not processes.received
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert processes.received == [signal.SIGTERM]
+        with pytest.raises(processes.Stopped), processes.stopping(waits=True):
+            os.kill(os.getpid(), signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_sigterm_stops_all_jobs_of_a_launcher(tmp_path):

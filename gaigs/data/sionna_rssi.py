@@ -42,7 +42,7 @@ def traced_room_rssi(
     check_noise(noise)
     walls = find_room(room)
     places = place(walls, transmitters, seed)
-    offsets = frequency_offsets(walls, BANDWIDTH)
+    offsets = frequency_offsets(walls.meshes(), BANDWIDTH)
     receivers = tuple(gateway(name, position) for name, position in walls.gateways)
     strengths = []
     for receiver in receivers:

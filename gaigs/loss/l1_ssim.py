@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from gaigs.directions import Grid
+from gaigs.directions import Directions, Grid
 from gaigs.query import Batch
 from gaigs.registry import register
 from gaigs.task import Task
@@ -42,19 +42,34 @@ class L1Ssim:
         Raises:
             ValueError: The batch asks for a list of directions, which has no windows, or for fewer than 3 x 3.
         """
-        if not isinstance(batch.directions, Grid):
-            raise ValueError(
-                "loss 'l1_ssim' needs rows and columns, and training.thinning.rays draws single directions; take "
-                "loss=absolute or loss=squared"
-            )
-        smallest = min(batch.directions.shape)
-        if smallest < 3:
-            raise ValueError(f"loss 'l1_ssim' needs at least 3 x 3 directions, got {batch.directions.shape}")
-        step = max(1, round(batch.directions.pitch / self.pitch))
-        window = min(max(3, round((SSIM_WINDOW - 1) / step / 2) * 2 + 1), (smallest - 1) // 2 * 2 + 1)
+        window = find_window("l1_ssim", batch.directions, self.pitch, SSIM_WINDOW)
         similarity = structural_similarity(values, batch.labels, window)
         terms = {"l1": (values - batch.labels).abs().mean(), "ssim": 1 - similarity}
         return (1 - self.ssim) * terms["l1"] + self.ssim * terms["ssim"], terms
+
+
+def find_window(loss: str, directions: Directions | None, pitch: float, pixels: int) -> int:
+    """Edge of the window on a thinned grid that spans the angle of so many pixels of the label's own [pixels].
+
+    Args:
+        loss: Who needs it, as errors call it.
+        directions: Those looked at.
+        pitch: Between neighbouring rows of the label's own grid [rad].
+        pixels: An odd number.
+
+    Raises:
+        ValueError: The directions are no grid, or one of fewer than 3 x 3.
+    """
+    if not isinstance(directions, Grid):
+        raise ValueError(
+            f"loss {loss!r} needs rows and columns, and training.thinning.rays draws single directions; take "
+            "loss=absolute or loss=squared"
+        )
+    smallest = min(directions.shape)
+    if smallest < 3:
+        raise ValueError(f"loss {loss!r} needs at least 3 x 3 directions, got {directions.shape}")
+    step = max(1, round(directions.pitch / pitch))
+    return min(max(3, round((pixels - 1) / step / 2) * 2 + 1), (smallest - 1) // 2 * 2 + 1)
 
 
 def structural_similarity(

@@ -1,5 +1,6 @@
 """The splatting pipeline: GAI-GS, its ablations and its neighbours, put together from registered parts."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,10 +12,10 @@ from gaigs.data import Links
 from gaigs.deformation import Residuals
 from gaigs.directions import Directions
 from gaigs.gaussians import SH_DC, Gaussians
-from gaigs.geometry import covariances
+from gaigs.geometry import covariances, spherical_harmonics
 from gaigs.model import Model, Prediction
 from gaigs.placement import Placed
-from gaigs.projection import Splats
+from gaigs.projection import NEAR, Splats
 from gaigs.propagation import carriers
 from gaigs.query import Batch, Query
 from gaigs.registry import call, register, registry
@@ -112,6 +113,11 @@ class GaussianSplatting(Model):
         self.gaussians = None
         if gaussians is not None:
             self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels)
+            if self.placement.has_own and self.gaussians.degree:
+                raise ValueError(
+                    f"Gaussians beside those of placement {placement['name']!r} must have gaussians.degree=0, got "
+                    f"{self.gaussians.degree}"
+                )
         reads_tokens = registry("deformation").get(deformation["name"]).reads_tokens
         self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene) if reads_tokens else None
         context = {"scene": scene, "channels": channels}
@@ -220,7 +226,10 @@ class GaussianSplatting(Model):
         if placed.opacities is None:
             own = self.gaussians
             placed = placed._replace(
-                quats=own.unit_quats, scales=own.scales[None], opacities=own.opacities, signal=own.signal
+                quats=own.unit_quats,
+                scales=own.scales[None],
+                opacities=own.opacities,
+                signal=_towards(own.bands, query.transmitters[:, None] - placed.means),
             )
         # The network says how a place responds to a transmitter; where the Gaussians go is learnt from the image alone.
         seen = Placed(*(None if part is None else part.detach() for part in placed))
@@ -282,6 +291,8 @@ class GaussianSplatting(Model):
     def _strengths(self, placed: Placed, residuals: Residuals, which: Int[Tensor, "b"]) -> tuple:
         """Signal (b, n, c), opacities (b, n) and attenuations of some queries."""
         signal, opacities = placed.signal, placed.opacities
+        if signal.ndim == 4:  # another for each query
+            signal = signal[which]
         if residuals.delta_signal is not None:
             signal = signal + residuals.delta_signal[which]
         if residuals.delta_opacities is not None:
@@ -312,3 +323,17 @@ class GaussianSplatting(Model):
         return self.projection.project(
             means if not self.draws_map else means[0], covariances(quats, scales), self.scene.receivers[receiver].pose
         )
+
+
+def _towards(bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]) -> Float[Tensor, "*b n c 1"]:
+    """What Gaussians send for transmitters so far away from them [m], before the factor of the constant harmonic.
+
+    Without harmonics it is the same for all transmitters.
+    """
+    if bands.shape[-1] == 1:
+        return bands
+    lengths = offsets.norm(dim=-1, keepdim=True)
+    # A transmitter within a Gaussian's centre sees it in no direction: one is taken for it.
+    seen = torch.where(lengths < NEAR, offsets.new_tensor([1.0, 0.0, 0.0]), -offsets / lengths.clamp(min=NEAR))
+    harmonics = spherical_harmonics(seen, math.isqrt(bands.shape[-1]) - 1)
+    return (bands * harmonics[:, :, None]).sum(-1, keepdim=True) / SH_DC

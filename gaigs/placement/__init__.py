@@ -18,8 +18,8 @@ class Placed(NamedTuple):
         means: Centres, world frame (1, n, 3), or (b, n, 3) where they depend on the query [m].
         lengths: Of the path from the transmitter to the receiver that a Gaussian stands for, (b, n) [m]; None where a
             Gaussian says nothing of it.
-        quats, scales, opacities, signal: As those of ``Gaussians``, of all n; scales (1, n, 3), or (b, n, 3) [m]. None:
-            the free Gaussians' own.
+        quats, scales, opacities, signal: As those of ``Gaussians``, of all n; scales (1, n, 3), or (b, n, 3) [m];
+            signal (n, c, 1), or (b, n, c, 1). None: the free Gaussians' own.
         gains: Complex strength of each path's field (b, n), its phase included, by which the signal is multiplied.
             None: 1.
         coherences: Share of each path's field, in [0, 1] (n,), whose phase is known; the rest adds as power. None: 1.
@@ -31,7 +31,7 @@ class Placed(NamedTuple):
     quats: Float[Tensor, "n 4"] | None = None
     scales: Float[Tensor, "b n 3"] | None = None
     opacities: Float[Tensor, "n"] | None = None
-    signal: Float[Tensor, "n c k"] | None = None
+    signal: Float[Tensor, "*b n c 1"] | None = None
     gains: Complex[Tensor, "b n"] | None = None
     coherences: Float[Tensor, "n"] | None = None
     bandwidth: Float[Tensor, ""] | None = None

@@ -141,6 +141,30 @@ def speed_against_error(
     return figure
 
 
+def learning_curves(
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], score_label: str, baselines: Mapping[str, float]
+) -> Figure:
+    """Validation scores over the time of training, one line a system.
+
+    Args:
+        curves: Times [s] and scores by name.
+        score_label: What the score is.
+        baselines: Scores of the baselines, drawn as lines over all times.
+    """
+    with rc_context(STYLE):
+        key_rows = (len(curves) + len(baselines) + 3) // 4
+        figure = Figure(figsize=(PAGE, 3.0 + 0.15 * key_rows), layout="constrained")
+        ax = figure.subplots()
+        for (name, (times, scores)), (colour, dash) in zip(curves.items(), cycle(LINES), strict=False):
+            ax.plot(times, scores, marker=".", markersize=4, color=colour, linestyle=dash, label=name)
+        for (name, score), shade in zip(baselines.items(), cycle(("0.2", "0.45", "0.65", "0.8")), strict=False):
+            ax.axhline(score, color=shade, linewidth=0.9, zorder=0, label=name)
+        ax.set(xlabel="training [s]", ylabel=score_label)
+        ax.grid()
+        figure.legend(loc="outside lower center", ncols=4)
+    return figure
+
+
 def _draw_smoothed(ax: Axes, steps, values, **line) -> None:
     """A running mean over a fiftieth of the points, above the points themselves."""
     window = max(1, len(values) // 50)

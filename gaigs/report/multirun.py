@@ -1,25 +1,20 @@
 """The runs of a Hydra multirun, or of several: one table, their spread over seeds, their speed against their error."""
 
 import csv
-import json
-import re
-import statistics
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import yaml
 from matplotlib.figure import Figure
-from omegaconf import OmegaConf
 from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
-from gaigs.configuration import differences
 from gaigs.report.curves import speed_against_error
+from gaigs.report.runs import Run, Spread, read_runs
 from gaigs.report.style import DPI
+from gaigs.report.systems import write_systems
 from gaigs.report.table import metrics_of, stacked, written
 
 COSTS = {
@@ -35,71 +30,6 @@ WRITTEN_ONLY = "num_gaussians"
 
 SEEDS = "Runs that differ in the seed alone: mean ± standard deviation (n - 1), and the least"
 """What the second table shows."""
-
-
-class Run(NamedTuple):
-    """One job of a multirun.
-
-    Attributes:
-        name: Its sub-folder.
-        overrides: What was changed on the command line, by key.
-        metrics: Contents of ``metrics.json``; None where the job failed, was stopped or is still at work.
-    """
-
-    name: str
-    overrides: dict[str, str]
-    metrics: dict | None
-
-
-class Spread(NamedTuple):
-    """A metric of several runs: mean, standard deviation of a sample, least value."""
-
-    mean: float
-    deviation: float
-    least: float
-
-
-def read_runs(folder: Path) -> list[Run]:
-    """The runs at any depth of a folder, in the order of their names, the numbers in these by their size.
-
-    Raises:
-        FileNotFoundError: The folder holds no run.
-        ValueError: One was started anew with another configuration, or they are of several tasks.
-    """
-    runs = []
-    for path in folder.glob("**/.hydra/overrides.yaml"):
-        run_config, started = path.parents[1] / "config.yaml", path.parent / "config.yaml"
-        if run_config.is_file() and started.is_file() and differences(_resolved(run_config), _resolved(started)):
-            raise ValueError(
-                f"{run_config.parent} holds a run of another configuration than the one last started there, which was "
-                "refused, and Hydra has rewritten its overrides; start the multirun once more as it was at first"
-            )
-        overrides = (override.partition("=") for override in yaml.safe_load(path.read_text()))
-        metrics = path.parents[1] / "metrics.json"
-        runs.append(
-            Run(
-                path.parents[1].relative_to(folder).as_posix(),
-                {key.lstrip("+"): value for key, _, value in overrides},
-                json.loads(metrics.read_text()) if metrics.is_file() else None,
-            )
-        )
-    if not runs:
-        raise FileNotFoundError(
-            f"{folder} must hold runs, each with its .hydra/overrides.yaml, found none; "
-            "pass the folder that Hydra made for 'python -m gaigs --multirun ...'"
-        )
-    # Text and numbers take turns, so that like is compared with like.
-    parts = lambda name: [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
-    runs.sort(key=lambda run: parts(run.name))
-    tasks = {run.metrics.get("task"): run.name for run in runs if run.metrics is not None}
-    if len(tasks) > 1:
-        listed = ", ".join(f"{task} in {name}" for task, name in tasks.items())
-        raise ValueError(f"the runs of a table must be of one task, got {listed}; pass a folder with runs of one")
-    return runs
-
-
-def _resolved(path: Path) -> dict:
-    return OmegaConf.to_container(OmegaConf.load(path), resolve=True)
 
 
 def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
@@ -125,7 +55,7 @@ def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
             facts.append(key)
 
     rows, baselines = [], {}
-    for name, overrides, metrics in runs:
+    for name, overrides, metrics, *_ in runs:
         row = {"run": name, "status": "unfinished", "model": ""} | {key: overrides.get(key, "") for key in varied}
         if metrics is not None:
             (own, scores), *others = metrics["models"].items()
@@ -174,20 +104,22 @@ def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
         row["runs"] = len(group)
         for name in scores[0]:
             values = [score[name] for score in scores]
-            row[name] = Spread(statistics.mean(values), statistics.stdev(values), min(values))
+            row[name] = Spread.of(values)
         rows.append(row)
     return rows
 
 
 def report(folder: Path) -> Group:
-    """Writes ``ablation.csv``, ``ablation.md`` and, unless none has ended, ``speed_against_error.png`` there.
+    """Writes ``ablation.csv``, ``ablation.md`` and, unless none has ended, ``speed_against_error.png`` there. Runs of
+    several models are also set side by side, by ``gaigs.report.systems.write_systems``.
 
     Args:
         folder: Of a Hydra multirun, or one above several.
 
     Returns:
         The tables, for a terminal of 80 columns: the runs and, if there are any, the groups of runs that differ in the
-        seed alone. Metrics that are not brief are in the files only, and so is what tells no run from another.
+        seed alone; and the systems, where there are several. Metrics that are not brief are in the files only, and so
+        is what tells no run from another.
 
     Raises:
         FileNotFoundError: The folder holds no run.
@@ -222,6 +154,10 @@ def report(folder: Path) -> Group:
     tables = [_table(f"Runs of {folder}", rows, titles, hidden, caption)]
     if groups:
         tables.append(_table("Over seeds", groups, titles, hidden | {"status"}, f"{SEEDS}; all columns in ablation.md"))
+    baselines = [row for row in rows if row["status"] == "baseline"]
+    systems = write_systems(folder, runs, baselines, shared, known)
+    if systems is not None:
+        tables.append(systems)
     return Group(*tables)
 
 

@@ -1,6 +1,7 @@
 """Spatial spectra beside their predictions, over azimuth and elevation or as the sky above the array."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from math import ceil
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +12,9 @@ from matplotlib.ticker import MultipleLocator
 from numpy import ndarray
 
 from gaigs.report.style import PAGE, STYLE
+
+ACROSS = 4
+"""Most panels side by side of one spectrum and its predictions."""
 
 
 def spectra(
@@ -58,6 +62,44 @@ def spectra(
         if not polar:
             for ax in axes.flat:
                 ax.label_outer()
+    return figure
+
+
+def side_by_side(
+    label: Float[ndarray, "rows columns"],
+    predictions: Mapping[str, Float[ndarray, "rows columns"]],
+    ssim: Mapping[str, float],
+    elevations: Float[ndarray, "rows"],
+    azimuths: Float[ndarray, "columns"],
+) -> Figure:
+    """One measured spectrum and what systems predict in its place.
+
+    Args:
+        label: The measured spectrum, amplitudes in [0, 1].
+        predictions: By system; values outside [0, 1] take the colour of the nearer end.
+        ssim: Score of each.
+        elevations: Of the rows [deg].
+        azimuths: Of the columns [deg].
+    """
+    panels = {"label": label} | {f"{name} {ssim[name]:.3f}": values for name, values in predictions.items()}
+    columns = min(ACROSS, len(panels))
+    rows = ceil(len(panels) / columns)
+    colours = {"cmap": "viridis", "vmin": 0, "vmax": 1}
+    edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
+    with rc_context(STYLE):
+        figure = Figure(figsize=(PAGE, 0.8 * rows + 0.75), layout="constrained")
+        axes = [*figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat]
+        for ax in axes[len(panels) :]:
+            ax.remove()
+        axes = axes[: len(panels)]
+        for index, (ax, (title, values)) in enumerate(zip(axes, panels.items(), strict=True)):
+            image = _draw_plane(ax, *edges, values.astype(np.float32), colours)
+            ax.set_title(title)
+            ax.label_outer()
+            if index + columns >= len(panels):  # nothing below it
+                ax.set_xlabel("azimuth [deg]")
+                ax.tick_params(labelbottom=True)
+        figure.colorbar(image, ax=axes, label="normalised amplitude", location="bottom", shrink=0.5, aspect=45)
     return figure
 
 

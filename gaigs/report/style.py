@@ -28,8 +28,12 @@ STYLE = {
 
 BLUE, ORANGE, GREEN, PURPLE, SKY, GREY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#6E6E6E"
 
-LINES = ((BLUE, "-"), (GREY, "--"), (ORANGE, "-."), (GREEN, ":"), (PURPLE, (0, (7, 2))), (SKY, (0, (4, 1, 1, 1, 1, 1))))
-"""Colour and dash of the first, second, ... line; the run's own model comes first, and unbroken."""
+COLOURS = (BLUE, GREY, ORANGE, GREEN, PURPLE, SKY)
+
+DASHES = ("-", "--", "-.", ":", (0, (7, 2)), (0, (4, 1, 1, 1, 1, 1)))
+
+LINES = tuple((COLOURS[i], DASHES[(i + shift) % 6]) for shift in range(6) for i in range(6))
+"""Colour and dash of the first, second, ... line, no two of 36 alike; the run's own model comes first, and unbroken."""
 
 MARKERS = tuple(
     {"marker": marker, "color": colour, "markeredgecolor": "white", "markeredgewidth": 0.5}

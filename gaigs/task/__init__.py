@@ -1,7 +1,7 @@
 """Tasks say what a label is: its shape, unit and scores, how it is drawn, and what a run keeps of it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,6 +110,27 @@ class Task(ABC):
     def figures(self, folder: Path, links) -> dict:
         """Figures of a run by file name, from what is in its folder; by default none."""
         return {}
+
+    @classmethod
+    def compared(cls, files: Mapping[str, Path], split: str) -> dict:
+        """Figures of several systems by file name; by default none.
+
+        Args:
+            files: ``predictions.npz`` of each, by what to call it; all of the same test links.
+            split: Name of the split.
+        """
+        return {}
+
+
+def stored_scores(files: Mapping[str, Path], kind: str) -> dict[str, np.ndarray]:
+    """What ``predictions.npz`` of several systems hold of each, ``<kind>_<model>``; the first one's baselines last."""
+    own, baselines = {}, {}
+    for name, file in files.items():
+        with np.load(file) as run:
+            found = {key.removeprefix(f"{kind}_"): run[key] for key in run.files if key.startswith(f"{kind}_")}
+        (model, own[name]), *others = found.items()
+        baselines = baselines or {other: scores for other, scores in others if other != f"{model}_trend"}
+    return own | baselines
 
 
 def need_samples(scores: Tensor) -> None:

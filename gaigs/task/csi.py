@@ -1,5 +1,6 @@
 """Channel state information: a complex channel at each element of the receiver's array and each subcarrier."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from gaigs.registry import register
-from gaigs.task import Metric, Task, check_values, need_samples
+from gaigs.task import Metric, Task, check_values, need_samples, stored_scores
 
 HIGHEST = 140.0
 """No SNR is told beyond this [dB]: complex64 resolves nothing finer, and a perfect prediction has no finite one."""
@@ -114,3 +115,10 @@ class Csi(Task):
         if len(self.frequencies) > 1:
             figures["impulse_response"] = impulse_responses(*examples)
         return figures | {"snr_cdf": cdf(scores, "SNR [dB]", "channels", links.split.name, (None, None))}
+
+    @classmethod
+    def compared(cls, files: Mapping[str, Path], split: str) -> dict:
+        """How SNR is distributed."""
+        from gaigs.report.curves import cdf  # matplotlib is slow to import
+
+        return {"cdf": cdf(stored_scores(files, cls.watched), "SNR [dB]", "channels", split, (None, None))}

@@ -1,5 +1,6 @@
 """What tasks share whose label is one real number a link."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.task import Metric, Task, check_values, need_samples
+from gaigs.task import Metric, Task, check_values, need_samples, stored_scores
 
 
 class Scalar(Task):
@@ -90,3 +91,13 @@ class Scalar(Task):
         title = f"|error| [{self.error_unit}]"
         figures = {"error_cdf": cdf(errors, title, "readings", links.split.name, (0, furthest))}
         return figures | numbered(paged)
+
+    @classmethod
+    def compared(cls, files: Mapping[str, Path], split: str) -> dict:
+        """How the error is distributed."""
+        from gaigs.report.curves import cdf  # matplotlib is slow to import
+
+        errors = {name: abs(values) for name, values in stored_scores(files, "error").items()}
+        # Of all readings and systems: a single system that failed would squeeze all others.
+        furthest = np.quantile(np.concatenate([*errors.values()]), 0.98) or None
+        return {"cdf": cdf(errors, f"|error| [{cls.error_unit}]", "readings", split, (0, furthest))}

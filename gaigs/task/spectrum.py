@@ -1,5 +1,6 @@
 """Spatial spectra: an amplitude in each direction of a grid."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from torch import Tensor
 from gaigs.directions import Grid
 from gaigs.query import Batch
 from gaigs.registry import register
-from gaigs.task import Metric, Task, Thinning, check_values, need_samples
+from gaigs.task import Metric, Task, Thinning, check_values, need_samples, stored_scores
 
 SSIM_WINDOW = 7
 """Edge of scikit-image's default uniform window [pixels]."""
@@ -151,4 +152,23 @@ class Spectrum(Task):
             "spectra": spectra(*examples),
             "spectra_polar": spectra(*examples, polar=True),
             "ssim_cdf": cdf(scores, "SSIM", "spectra", links.split.name, (None, 1)),
+        }
+
+    @classmethod
+    def compared(cls, files: Mapping[str, Path], split: str) -> dict:
+        """How SSIM is distributed; and the test spectrum of median difficulty, as each system predicts it."""
+        from gaigs.report.curves import cdf  # matplotlib is slow to import
+        from gaigs.report.spectra import side_by_side
+
+        scores = stored_scores(files, "ssim")
+        order = np.argsort(np.mean([scores[name] for name in files], 0))
+        shown = order[round(0.5 * (len(order) - 1))]
+        predictions = {}
+        for name, file in files.items():
+            with np.load(file) as run:
+                predictions[name], label = run["prediction"][shown], run["labels"][shown]
+                grid = [np.rad2deg(run[key]) for key in ("elevations", "azimuths")]
+        return {
+            "cdf": cdf(scores, "SSIM", "spectra", split, (None, 1)),
+            "spectra": side_by_side(label, predictions, {name: scores[name][shown] for name in files}, *grid),
         }

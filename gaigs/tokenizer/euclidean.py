@@ -39,10 +39,10 @@ class EuclideanTokenizer(nn.Module):
         transmitter_octaves: The same for the transmitter; None takes those that the training transmitters can teach,
             see ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
-        width: Width of E(P_TX).
+        width: Width of E(P_TX). With None for both there is no network, and E(P_TX) are the features themselves.
 
     Raises:
-        ValueError: A range of octaves is empty, or a width out of range.
+        ValueError: A range of octaves is empty, a width is out of range, or one of the two is None alone.
 
     Source: GAI-GS, "Multi-view Tokenizer"; Tancik et al., Fourier Features, 2020.
     """
@@ -54,12 +54,17 @@ class EuclideanTokenizer(nn.Module):
         scene: Scene,
         gaussian_octaves: tuple[int, int],
         transmitter_octaves: tuple[int, int] | None,
-        hidden: int,
-        width: int,
+        hidden: int | None,
+        width: int | None,
     ):
         super().__init__()
+        if (hidden is None) != (width is None):
+            raise ValueError(
+                f"tokenizer options hidden and width must both be given, or both be null for no network, got {hidden} "
+                f"and {width}"
+            )
         for option, count in (("hidden", hidden), ("width", width)):
-            if count < 1:
+            if count is not None and count < 1:
                 raise ValueError(f"tokenizer option {option} must be at least 1, got {count}")
         self.scene = scene
         self.register_buffer("receivers_middle", scene.positions(scene.lower).mean(0))
@@ -68,11 +73,13 @@ class EuclideanTokenizer(nn.Module):
         transmitter_octaves = transmitter_octaves or learnable_octaves(scene)
         self.register_buffer("transmitter_frequencies", octaves("transmitter_octaves", *transmitter_octaves))
         self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
-        self.transmitter_width = width
         features = 3 * (1 + 2 * len(self.transmitter_frequencies))
         if scene.has_band:
             features += 1 + 2 * len(BAND_FREQUENCIES)
-        self.network = nn.Sequential(nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, width))
+        self.transmitter_width = features if width is None else width
+        self.network = nn.Identity()
+        if width is not None:
+            self.network = nn.Sequential(nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, width))
 
     def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
         """E(P_x) and E(P_TX); opacities are not looked at."""

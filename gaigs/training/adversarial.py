@@ -6,6 +6,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 
 from gaigs.query import Batch
 from gaigs.registry import call, register
+from gaigs.training.budget import share_done
 from gaigs.training.descent import Descent
 from gaigs.training.schedule import make_optimizer, make_schedule
 
@@ -45,7 +46,8 @@ class Adversarial(Descent):
         groups = self.model.parameter_groups()
         judged = {DISCRIMINATOR: groups.pop(DISCRIMINATOR)}
         optimizers = [make_optimizer(self.optimizer, part, self.learning_rates) for part in (groups, judged)]
-        return optimizers, [make_schedule(self.schedule, each, self.trainer.max_steps) for each in optimizers]
+        done = share_done(self.trainer)
+        return optimizers, [make_schedule(self.schedule, each, done) for each in optimizers]
 
     def on_fit_start(self) -> None:
         if self.trainer.world_size > 1:

@@ -14,11 +14,12 @@ from pathlib import Path
 import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TimeRemainingColumn
 
 from gaigs import density
 from gaigs.processes import STOPPING
 from gaigs.training import MeanScores, seeded
+from gaigs.training.budget import share_done
 
 
 class DensityControl(Callback):
@@ -26,7 +27,7 @@ class DensityControl(Callback):
 
     A Gaussian that the loss pulls at, though it is already where it should be, is too few: its mean positional gradient
     since the last time, times its distance to the receivers' middle (a pull per radian seen from there), is compared
-    with ``gradient``. Wide ones split, narrow ones are cloned.
+    with ``gradient``. Wide ones split, narrow ones are cloned. Where places are frozen, nothing happens any more.
 
     Args:
         every: Steps between two rounds.
@@ -74,16 +75,18 @@ class DensityControl(Callback):
 
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
         gaussians = module.model.primitives
+        if not gaussians.means.requires_grad:
+            return
         pull = gaussians.means.grad.norm(dim=-1) * self._distances(module)
         self.pull = pull if self.steps == 0 else self.pull.to(pull) + pull
         self.steps += 1
 
     @torch.no_grad()
     def on_train_batch_end(self, trainer, module, *_) -> None:
-        step = trainer.global_step
-        if step % self.every or not self.start <= step <= self.stop:
+        gaussians, optimizer, step = module.model.primitives, trainer.optimizers[0], trainer.global_step
+        is_due = step % self.every == 0 and self.start <= step <= self.stop
+        if not is_due or not gaussians.means.requires_grad:
             return
-        gaussians, optimizer = module.model.primitives, trainer.optimizers[0]
         pulled = self.pull / self.steps > self.gradient
         room = max(0, self.max_count - len(gaussians))
         if int(pulled.sum()) > room:  # only the hardest pulled
@@ -275,12 +278,12 @@ class ProgressLine(ProgressBar):
         """Lightning's call in all other processes, whose lines stay hidden from the start."""
 
     def on_train_start(self, trainer, module) -> None:
-        bar, count, left = BarColumn(None), MofNCompleteColumn(), TimeRemainingColumn()
-        rate, scores = "{task.fields[rate]:.1f} steps/s", "{task.fields[scores]}"
+        bar, left = BarColumn(None), TimeRemainingColumn()
+        count, rate, scores = "{task.fields[count]}", "{task.fields[rate]:.1f} steps/s", "{task.fields[scores]}"
         hidden = not trainer.is_global_zero
         self.line = Progress("training", bar, count, rate, left, scores, expand=True, disable=hidden)
-        self.start, self.first = time.monotonic(), trainer.global_step
-        self.task = self.line.add_task("", total=trainer.max_steps, completed=self.first, rate=0, scores="")
+        self.start, self.first, self.share_done = time.monotonic(), trainer.global_step, share_done(trainer)
+        self.task = self.line.add_task("", total=1, **self._done(trainer), rate=0, scores="")
         self.line.start()
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
@@ -288,7 +291,12 @@ class ProgressLine(ProgressBar):
         rate = (step - self.first) / (time.monotonic() - self.start)
         words = {"train/loss": "loss", f"validation/{module.task.watched}": module.task.watched}
         scores = " ".join(f"{word} {values[name]:.3f}" for name, word in words.items() if name in values)
-        self.line.update(self.task, completed=step, rate=rate, scores=scores)
+        self.line.update(self.task, **self._done(trainer), rate=rate, scores=scores)
+
+    def _done(self, trainer) -> dict:
+        step, last = trainer.global_step, trainer.max_steps
+        count = f"{step:{len(str(last))}d}/{last}" if last > 0 else f"{step} steps"
+        return {"completed": self.share_done(step), "count": count}
 
     def on_train_end(self, trainer, module) -> None:
         self.line.stop()

@@ -13,6 +13,7 @@ from gaigs.model import Model
 from gaigs.query import Batch
 from gaigs.registry import call, check_type, register
 from gaigs.training import MeanScores, seeded
+from gaigs.training.budget import share_done
 from gaigs.training.schedule import make_optimizer, make_schedule
 
 RATES = {*Gaussians.PARAMETERS, "network", "planes", "paths", "obstacles"}
@@ -86,7 +87,7 @@ class Descent(lightning.LightningModule):
 
     def configure_optimizers(self):
         optimizer = make_optimizer(self.optimizer, self.model.parameter_groups(), self.learning_rates)
-        schedule = make_schedule(self.schedule, optimizer, self.trainer.max_steps)
+        schedule = make_schedule(self.schedule, optimizer, share_done(self.trainer))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def training_step(self, batch: Batch, _: int) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.query import Batch
 from gaigs.training import seeded
+from gaigs.training.budget import time_share
 
 log = logging.getLogger(__name__)
 
@@ -18,7 +19,8 @@ LINKS = 48
 
 
 class Revision(Callback):
-    """Calls ``Model.revise`` after the shares of the training that the model asks for.
+    """Calls ``Model.revise`` after the shares of the training that the model asks for: of its steps or of its time,
+    whichever comes first.
 
     All processes look at the same links, so that they decide alike.
 
@@ -29,6 +31,13 @@ class Revision(Callback):
 
     def __init__(self, links: Links, seed: int):
         self.links, self.seed = links, seed
+        self.made: list[int] = []
+
+    def state_dict(self) -> dict:
+        return {"made": self.made}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.made = state["made"]
 
     def on_train_start(self, trainer, module) -> None:
         if trainer.global_step == 0:
@@ -40,8 +49,9 @@ class Revision(Callback):
     @torch.no_grad()
     def _revise(self, trainer, module) -> None:
         for number, share in enumerate(module.model.revisions):
-            if trainer.global_step != round(share * trainer.max_steps):
+            if number in self.made or not _is_due(trainer, share):
                 continue
+            self.made.append(number)
             split = self.links.split
             convert = trainer.precision_plugin.convert_input
             parts = (self._batch(module, part, number) for part in (split.train, split.validation))
@@ -58,6 +68,13 @@ class Revision(Callback):
         generator = seeded(self.seed, number, len(index))
         chosen = index[torch.randperm(len(index), generator=generator)[:LINKS].sort().values]
         return module.thin(self.links.batch(chosen).to(module.device), generator)
+
+
+def _is_due(trainer, share: float) -> bool:
+    """Whether so much of a training is done."""
+    time = time_share(trainer)
+    by_steps = trainer.max_steps > 0 and trainer.global_step == round(share * trainer.max_steps)
+    return by_steps or (time is not None and time >= share)
 
 
 def loss_of(module, batch: Batch) -> float:

@@ -1,6 +1,6 @@
-"""Learning rates over the steps, and the optimizers they belong to."""
+"""Learning rates over a training, and the optimizers they belong to."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import ModuleType
 
 import torch
@@ -37,32 +37,34 @@ def make_optimizer(
     return optimizer
 
 
-def make_schedule(config: Mapping, optimizer: Optimizer, steps: int) -> LRScheduler:
+def make_schedule(config: Mapping, optimizer: Optimizer, share_done: Callable[[int], float]) -> LRScheduler:
     """A schedule of all of an optimizer's rates, to be stepped once a step.
 
     Args:
         config: Options of ``warmup_and_decay``; or ``_target_``, a class of ``torch.optim.lr_scheduler``, with its own.
         optimizer: Whose rates.
-        steps: Of the whole training.
+        share_done: How much of the training is done after so many steps; a class of torch counts steps alone.
 
     Raises:
         TypeError: An option is not of its type.
         ValueError: The target is no class of ``torch.optim.lr_scheduler``; an option is unknown or out of range.
     """
     if "_target_" not in config:
-        return call("training.schedule", warmup_and_decay, config, optimizer=optimizer, steps=steps)
+        return call("training.schedule", warmup_and_decay, config, optimizer=optimizer, share_done=share_done)
     kind, options = _target("training.schedule", config, lr_scheduler, LRScheduler)
     return call("training.schedule", kind, options, optimizer=optimizer)
 
 
-def warmup_and_decay(optimizer: Optimizer, steps: int, warmup: int, final: float) -> LRScheduler:
+def warmup_and_decay(
+    optimizer: Optimizer, share_done: Callable[[int], float], warmup: int, final: float
+) -> LRScheduler:
     """Rates rise linearly at first and fall exponentially.
 
     Args:
         optimizer: Whose rates.
-        steps: Of the whole training.
+        share_done: How much of the training is done after so many steps.
         warmup: Steps over which the rates rise.
-        final: Every rate falls to this fraction of itself at the last step.
+        final: Every rate falls to this fraction of itself at the end.
 
     Raises:
         ValueError: An option is out of range.
@@ -71,7 +73,7 @@ def warmup_and_decay(optimizer: Optimizer, steps: int, warmup: int, final: float
         raise ValueError(f"training.schedule.final must be in (0, 1], got {final}")
     if warmup < 0:
         raise ValueError(f"training.schedule.warmup must be at least 0 steps, got {warmup}")
-    return LambdaLR(optimizer, lambda step: min(1.0, (step + 1) / max(warmup, 1)) * final ** (step / steps))
+    return LambdaLR(optimizer, lambda step: min(1.0, (step + 1) / max(warmup, 1)) * final ** share_done(step))
 
 
 def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tuple[type, dict]:

@@ -142,11 +142,11 @@ def test_responses_are_those_of_the_built_in_room_for_the_same_images():
 
 
 def test_a_band_is_sampled_finely_enough_for_its_longest_path():
-    offsets = tracing.frequency_offsets(ROOMS["l_shape"], 500e6)
+    offsets = tracing.frequency_offsets(ROOMS["l_shape"].meshes(), 500e6)
     assert offsets[[0, -1]].tolist() == [-250e6, 250e6]
     assert (offsets[1] - offsets[0]).item() < speed_of_light / ((tracing.DEPTH + 1) * math.hypot(8, 6.6, 2.8))
     with pytest.raises(ValueError, match="bandwidth must be positive"):
-        tracing.frequency_offsets(ROOMS["l_shape"], 0.0)
+        tracing.frequency_offsets(ROOMS["l_shape"].meshes(), 0.0)
 
 
 # --- what it needs ---

@@ -57,6 +57,36 @@ def test_it_keeps_the_contract_of_models(task, heads):
     check_model(build, example_links(task))
 
 
+def test_harmonics_are_of_the_direction_in_which_a_transmitter_sees_a_gaussian(build, batch):
+    model = build(gaussians=PARTS["gaussians"] | {"degree": 1}, deformation={"name": "none"})
+    gaussians, places = model.gaussians, batch.query.transmitters
+    nn.init.normal_(gaussians.signal)
+    with torch.no_grad():
+        gaussians.means[3] = places[0]  # which sees it in no direction
+    value = model(batch).value
+    value.sum().backward()
+    assert all(parameter.grad.isfinite().all() for parameter in gaussians.parameters())
+    seen = gaussians.means.detach() - places[:, None]
+    x, y, z = (seen / seen.norm(dim=-1, keepdim=True)).nan_to_num().movedim(-1, 0).clone()
+    x[0, 3] = 1
+    dc, *bands = gaussians.signal.detach().clone().unbind(-1)
+    # 3 ** 0.5 is the first degree's factor over that of the constant harmonic.
+    sent = dc + 3**0.5 * sum(part[..., None] * band for part, band in zip((-y, z, -x), bands, strict=True))
+    gaussians.degree = 0
+    for row, own in enumerate(sent):
+        with torch.no_grad():
+            gaussians.signal[..., 0] = own
+        one = replace(batch, query=batch.query[row : row + 1])
+        torch.testing.assert_close(value[row], model(one).value[0], rtol=0, atol=1e-4)
+
+
+def test_gaussians_beside_a_placements_own_send_alike(build):
+    placement = {"name": "mirrored", "planes": 6, "order": 1, "obstacles": 0}
+    parts = {"name": "mirrored", "placement": placement, "gaussians": PARTS["gaussians"] | {"degree": 2}}
+    with pytest.raises(ValueError, match=r"of placement 'mirrored' must have gaussians\.degree=0, got 2"):
+        registry("model").build(PARTS | NONE | parts, scene=example_links().scene)
+
+
 def test_gradients_reach_all_parameters(build, batch):
     model = build()
     value, penalties = model(batch)

@@ -90,6 +90,22 @@ def test_networks_without_width_are_refused(scene, option):
         EuclideanTokenizer(scene, **(OPTIONS | {option: 0}))
 
 
+def test_without_a_network_the_transmitters_token_is_its_features(scene):
+    tokenizer = EuclideanTokenizer(scene, **(OPTIONS | {"hidden": None, "width": None}))
+    places = torch.rand(2, 3)
+    tokens = tokenizer(Placed(torch.randn(1, 7, 3)), torch.rand(7), ask(places))
+    middle = (scene.lower + scene.upper) / 2
+    assert torch.equal(tokens.transmitters, fourier_features(places - middle, octaves("transmitter_octaves", -2, 4)))
+    assert tokenizer.transmitter_width == 45
+    assert not [*tokenizer.parameters()]
+
+
+@pytest.mark.parametrize("option", ["hidden", "width"])
+def test_a_network_has_both_widths_or_is_none(scene, option):
+    with pytest.raises(ValueError, match="hidden and width must both be given, or both be null"):
+        EuclideanTokenizer(scene, **(OPTIONS | {option: None}))
+
+
 @pytest.mark.parametrize("spacing", [0.001, 0.03, 0.2, 5.0])
 @pytest.mark.parametrize("edge", [0.5, 3.0, 40.0])
 def test_octaves_span_the_box_and_stop_well_above_the_spacing(scene, spacing, edge):

@@ -16,6 +16,7 @@ from gaigs.query import Query
 from gaigs.scene import Receiver
 from gaigs.task.spectrum import Spectrum
 from gaigs.training.batches import Batches, InOrder
+from gaigs.training.budget import ENDLESS
 from gaigs.training.descent import Descent
 
 PLACES = 12
@@ -87,7 +88,7 @@ def fit(module, links, folder, steps, *callbacks, resume=None, at_a_time=2, **op
         enable_checkpointing=any(isinstance(callback, Checkpoint) for callback in callbacks),
         logger=CSVLogger(folder, "log"), default_root_dir=folder, **options,
     )  # fmt: skip
-    batches = Batches(links, links.split.train, module.batch_size, 0, steps)
+    batches = Batches(links, links.split.train, module.batch_size, 0, ENDLESS if steps == -1 else steps)
     validation = InOrder(links, links.split.validation, at_a_time)
     trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     return trainer

@@ -336,6 +336,7 @@ def test_the_progress_line_fits_80_columns_and_counts_from_where_the_training_go
     monkeypatch.setenv("COLUMNS", "80")
     metrics = {"train/loss": 0.25, "v_num": 3}
     trainer = SimpleNamespace(global_step=1200, max_steps=1500, progress_bar_metrics=metrics, is_global_zero=True)
+    trainer.callbacks = []
     line, module = ProgressLine(), SimpleNamespace(task=SPECTRA)
     line.on_train_start(trainer, None)
     trainer.global_step = 1499
@@ -350,14 +351,14 @@ def test_the_progress_line_fits_80_columns_and_counts_from_where_the_training_go
 def test_the_progress_line_gives_the_terminal_back_after_an_error():
     line = ProgressLine()
     line.on_exception(None, None, ValueError())
-    line.on_train_start(SimpleNamespace(global_step=0, max_steps=3, is_global_zero=True), None)
+    line.on_train_start(SimpleNamespace(global_step=0, max_steps=3, is_global_zero=True, callbacks=[]), None)
     line.on_exception(None, None, ValueError())
     assert not line.line.live.is_started
 
 
 def test_of_several_processes_the_first_alone_shows_a_line(capsys):
     line, module = ProgressLine(), SimpleNamespace(task=SPECTRA)
-    trainer = SimpleNamespace(global_step=0, max_steps=3, progress_bar_metrics={}, is_global_zero=False)
+    trainer = SimpleNamespace(global_step=0, max_steps=3, progress_bar_metrics={}, is_global_zero=False, callbacks=[])
     line.setup(trainer, module, "fit")
     line.on_train_start(trainer, module)
     line.on_train_batch_end(trainer, module)

@@ -96,7 +96,7 @@ def test_options_of_the_optimizer_are_its_own(groups, options, error, message):
 @pytest.mark.parametrize(("warmup", "final"), [(4, 0.1), (0, 0.5), (1, 0.5), (50, 1.0)])
 def test_rates_rise_linearly_and_fall_exponentially(groups, warmup, final):
     optimizer = make_optimizer(ADAM, groups, RATES)
-    schedule = make_schedule({"warmup": warmup, "final": final}, optimizer, steps=20)
+    schedule = make_schedule({"warmup": warmup, "final": final}, optimizer, lambda step: step / 20)
     drawn = rates(schedule, optimizer, 21)
     rise = [min(1.0, (k + 1) / warmup) if warmup else 1.0 for k in range(21)]
     factors = torch.tensor([rise[k] * final ** (k / 20) for k in range(21)], dtype=torch.float64)
@@ -107,7 +107,7 @@ def test_rates_rise_linearly_and_fall_exponentially(groups, warmup, final):
 
 def test_a_schedule_of_torch_is_stepped_once_a_step(groups):
     optimizer = make_optimizer(ADAM, groups, RATES)
-    schedule = make_schedule(CONSTANT, optimizer, steps=20)
+    schedule = make_schedule(CONSTANT, optimizer, lambda step: step / 20)
     assert type(schedule) is ConstantLR
     drawn = rates(schedule, optimizer, 5)
     assert drawn[:, 0].tolist() == pytest.approx([0.125, 0.125, 0.125, 0.5, 0.5])
@@ -130,4 +130,4 @@ def test_a_schedule_of_torch_is_stepped_once_a_step(groups):
 )
 def test_a_schedule_refuses(groups, config, error, message):
     with pytest.raises(error, match=message):
-        make_schedule(config, make_optimizer(ADAM, groups, RATES), steps=20)
+        make_schedule(config, make_optimizer(ADAM, groups, RATES), lambda step: step / 20)

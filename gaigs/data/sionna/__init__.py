@@ -64,7 +64,7 @@ def traced_room(
     walls = find_room(room)
     places = place(walls, transmitters, seed)
     receiver = patch_array(walls, max(carriers))
-    offsets = frequency_offsets(walls, bandwidth) if spectrum == "band" else torch.zeros(1)
+    offsets = frequency_offsets(walls.meshes(), bandwidth) if spectrum == "band" else torch.zeros(1)
     grid = Grid.degrees()
     labels = []
     for carrier in carriers:

@@ -6,6 +6,7 @@ import logging
 import os
 import tempfile
 import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -43,8 +44,6 @@ def find_paths(room: Room, receiver: Float[Tensor, "3"], transmitters: Float[Ten
         ValueError: The frequency is out of range, or the file is damaged.
     """
     key = {
-        "version": VERSION,
-        "packages": tracing.find_packages(),
         "meshes": [(mesh.material, mesh.vertices, mesh.faces) for mesh in room.meshes()],
         "thickness": tracing.THICKNESS,
         "receiver": receiver.tolist(),
@@ -52,35 +51,52 @@ def find_paths(room: Room, receiver: Float[Tensor, "3"], transmitters: Float[Ten
         "frequency": float(frequency),
         "settings": [tracing.DEPTH, tracing.RAYS, tracing.CANDIDATES, tracing.CHUNK, tracing.WEAKEST],
     }
+
+    def trace() -> dict[str, np.ndarray]:
+        paths = tracing.trace(room.meshes(), receiver, transmitters, frequency)
+        return {"images": paths.images.numpy().astype(np.float32), "gains": paths.gains.numpy().astype(np.complex64)}
+
+    arrays = keep(key, trace, f"tracing the paths of {len(transmitters)} transmitters")
+    return Paths(torch.from_numpy(arrays["images"]).double(), torch.from_numpy(arrays["gains"]).to(torch.complex128))
+
+
+def keep(key: Mapping[str, object], make: Callable[[], dict[str, np.ndarray]], what: str) -> dict[str, np.ndarray]:
+    """Arrays by name, made the first time and read afterwards.
+
+    Args:
+        key: All that they depend on beside the packages that trace, as JSON takes it.
+        make: Makes them.
+        what: Is done the first time, for the log.
+
+    Raises:
+        ImportError: A package that traces is not installed.
+        ValueError: The file is damaged.
+    """
+    key = {"version": VERSION, "packages": tracing.find_packages(), **key}
     file = folder() / f"{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:32]}.npz"
-    if file.is_file():
-        return _read(file)
-    log.info("tracing the paths of %d transmitters; next time they are read from %s", len(transmitters), file)
-    paths = tracing.trace(room.meshes(), receiver, transmitters, frequency)
-    if not file.is_file():  # two tracings are not quite alike: that of a process which was faster stays
-        _write(file, paths)
+    if not file.is_file():
+        log.info("%s; next time they are read from %s", what, file)
+        arrays = make()
+        if not file.is_file():  # two tracings are not quite alike: that of a process which was faster stays
+            _write(file, arrays)
     return _read(file)  # in its precision, so that the first time gives what every other gives
 
 
-def _read(file: Path) -> Paths:
+def _read(file: Path) -> dict[str, np.ndarray]:
     try:
         with file.open("rb") as stream:  # numpy would not close a file that it cannot read
-            arrays = np.load(stream, allow_pickle=False)
-            images, gains = torch.from_numpy(arrays["images"]), torch.from_numpy(arrays["gains"])
+            return dict(np.load(stream, allow_pickle=False))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file} must be a whole file of paths, and is damaged ({error}); delete it") from error
-    return Paths(images.double(), gains.to(torch.complex128))
 
 
-def _write(file: Path, paths: Paths) -> None:
+def _write(file: Path, arrays: dict[str, np.ndarray]) -> None:
     """In one go: whoever reads meanwhile finds a whole file or none."""
     file.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
     try:
         with os.fdopen(handle, "wb") as stream:
-            np.savez_compressed(
-                stream, images=paths.images.numpy().astype(np.float32), gains=paths.gains.numpy().astype(np.complex64)
-            )
+            np.savez_compressed(stream, **arrays)
         os.replace(name, file)
     except BaseException:
         os.unlink(name)

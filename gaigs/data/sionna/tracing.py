@@ -14,7 +14,7 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.data.sionna.meshes import THICKNESS, Mesh, Room
+from gaigs.data.sionna.meshes import THICKNESS, Mesh
 from gaigs.data.synthetic.image_source import MATERIALS, Paths
 from gaigs.propagation import free_space
 from gaigs.scene import Receiver
@@ -115,20 +115,9 @@ def trace(
 
     Source: Sionna RT technical report, arXiv:2504.21719; materials as in ITU-R P.2040-3, table 3.
     """
-    low, high = FREQUENCIES
-    if not low <= frequency <= high:
-        raise ValueError(f"frequency must lie in {low:g}..{high:g} Hz, got {frequency:.6g}")
-    find_packages()
-    os.environ["DRJIT_LIBLLVM_PATH"] = find_llvm()  # read once, when the first kernel is compiled
-    import mitsuba
-
-    mitsuba.set_variant("llvm_ad_mono_polarized")  # on the processor, before the import chooses a graphics card
+    scene = make_scene(meshes, frequency)
     from sionna import rt
 
-    scene = rt.load_scene()
-    scene.frequency = frequency
-    _furnish(scene, meshes, frequency)
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
     scene.add(rt.Transmitter("receiver", receiver.tolist()))
     solver = rt.PathSolver()
     found = []
@@ -148,6 +137,46 @@ def trace(
         images[row, : len(gains)] = torch.from_numpy(places)
         padded[row, : len(gains)] = torch.from_numpy(gains)
     return Paths(images, padded)
+
+
+def find_sionna():
+    """The module ``sionna.rt``, which computes on the processor.
+
+    Raises:
+        ImportError: Sionna RT is not installed.
+        RuntimeError: There is no libLLVM that it can use.
+    """
+    find_packages()
+    os.environ["DRJIT_LIBLLVM_PATH"] = find_llvm()  # read once, when the first kernel is compiled
+    import mitsuba
+
+    mitsuba.set_variant("llvm_ad_mono_polarized")  # on the processor, before the import chooses a graphics card
+    from sionna import rt
+
+    return rt
+
+
+def make_scene(meshes: Sequence[Mesh], frequency: float):
+    """A scene of Sionna RT, on the processor, between antennas that are alike in all directions and vertically
+    polarised. The object of mesh k is called ``mesh <k>``.
+
+    Args:
+        meshes: What stands there.
+        frequency: Of the carrier [Hz].
+
+    Raises:
+        ImportError, RuntimeError: As for ``find_sionna``.
+        ValueError: The frequency is out of range.
+    """
+    low, high = FREQUENCIES
+    if not low <= frequency <= high:
+        raise ValueError(f"frequency must lie in {low:g}..{high:g} Hz, got {frequency:.6g}")
+    rt = find_sionna()
+    scene = rt.load_scene()
+    scene.frequency = frequency
+    _furnish(scene, meshes, frequency)
+    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    return scene
 
 
 def _furnish(scene, meshes: Sequence[Mesh], frequency: float) -> None:
@@ -223,15 +252,19 @@ def respond(
     return torch.cat(found)
 
 
-def frequency_offsets(room: Room, bandwidth: float) -> Float[Tensor, "f"]:
+def frequency_offsets(meshes: Sequence[Mesh], bandwidth: float) -> Float[Tensor, "f"]:
     """Frequencies that sample a band, relative to its middle [Hz]; so dense that no two paths' beat is aliased.
+
+    Args:
+        meshes: What stands there.
+        bandwidth: Of the band [Hz].
 
     Raises:
         ValueError: The bandwidth is not positive.
     """
     if not 0 < bandwidth < math.inf:
         raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
-    corners = torch.tensor([corner for mesh in room.meshes() for corner in mesh.vertices], dtype=torch.float64)
+    corners = torch.tensor([corner for mesh in meshes for corner in mesh.vertices], dtype=torch.float64)
     longest = (DEPTH + 1) * (corners.amax(0) - corners.amin(0)).norm().item()
     count = math.ceil(bandwidth * longest / speed_of_light) + 1
     return torch.linspace(-bandwidth / 2, bandwidth / 2, count, dtype=torch.float64)

@@ -1,0 +1,100 @@
+"""The runs of a Hydra multirun, or of several, as they lie in its folder."""
+
+import json
+import re
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+from omegaconf import OmegaConf
+
+from gaigs.configuration import differences
+
+FAILED = "gaigs: "
+"""How the line of a job's log begins that says why it failed."""
+
+
+class Run(NamedTuple):
+    """One job of a multirun.
+
+    Attributes:
+        name: Its sub-folder.
+        overrides: What was changed on the command line, by key.
+        metrics: Contents of ``metrics.json``; None where the job failed, was stopped or is still at work.
+        failure: What the job said when it failed; None where it did not.
+        folder: Where it lies.
+    """
+
+    name: str
+    overrides: dict[str, str]
+    metrics: dict | None
+    failure: str | None
+    folder: Path
+
+
+class Spread(NamedTuple):
+    """A metric of several runs: mean, standard deviation of a sample, least value."""
+
+    mean: float
+    deviation: float
+    least: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Spread":
+        """That of two values or more."""
+        return cls(statistics.mean(values), statistics.stdev(values), min(values))
+
+
+def read_runs(folder: Path) -> list[Run]:
+    """The runs at any depth of a folder, in the order of their names, the numbers in these by their size.
+
+    Raises:
+        FileNotFoundError: The folder holds no run.
+        ValueError: One was started anew with another configuration, or they are of several tasks.
+    """
+    runs = []
+    for path in folder.glob("**/.hydra/overrides.yaml"):
+        run_config, started = path.parents[1] / "config.yaml", path.parent / "config.yaml"
+        if run_config.is_file() and started.is_file() and differences(_resolved(run_config), _resolved(started)):
+            raise ValueError(
+                f"{run_config.parent} holds a run of another configuration than the one last started there, which was "
+                "refused, and Hydra has rewritten its overrides; start the multirun once more as it was at first"
+            )
+        overrides = (override.partition("=") for override in yaml.safe_load(path.read_text()))
+        own = path.parents[1]
+        metrics = own / "metrics.json"
+        runs.append(
+            Run(
+                own.relative_to(folder).as_posix(),
+                {key.lstrip("+"): re.sub(r"\\(.)", r"\1", value) for key, _, value in overrides},  # as it was typed
+                json.loads(metrics.read_text()) if metrics.is_file() else None,
+                None if metrics.is_file() else _failure(own),
+                own,
+            )
+        )
+    if not runs:
+        raise FileNotFoundError(
+            f"{folder} must hold runs, each with its .hydra/overrides.yaml, found none; "
+            "pass the folder that Hydra made for 'python -m gaigs --multirun ...'"
+        )
+    # Text and numbers take turns, so that like is compared with like.
+    parts = lambda name: [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
+    runs.sort(key=lambda run: parts(run.name))
+    tasks = {run.metrics.get("task"): run.name for run in runs if run.metrics is not None}
+    if len(tasks) > 1:
+        listed = ", ".join(f"{task} in {name}" for task, name in tasks.items())
+        raise ValueError(f"the runs of a table must be of one task, got {listed}; pass a folder with runs of one")
+    return runs
+
+
+def _failure(folder: Path) -> str | None:
+    """What a job said last, if that was why it failed."""
+    logs = [log for log in folder.glob("*.log") if not log.name.startswith("train_ddp")]
+    last = "".join(log.read_text() for log in logs).rstrip().rpartition("\n")[2]
+    return last.removeprefix(FAILED) if last.startswith(FAILED) else None
+
+
+def _resolved(path: Path) -> dict:
+    return OmegaConf.to_container(OmegaConf.load(path), resolve=True)

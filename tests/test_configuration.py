@@ -1,0 +1,114 @@
+"""What the configuration files choose together, and what they ask of the place they are used in."""
+
+import logging
+from importlib import metadata
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from gaigs import configuration
+from gaigs.configuration import conf_dir, installed, launcher
+from gaigs.registry import registry
+
+DATA = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
+MIRRORED = {"spectrum": "mirrored", "rssi": "mirrored_rssi", "csi": "mirrored_csi"}
+POOLINGS = {"spectrum": "array_response", "rssi": "mean_power", "csi": "element_sum"}
+TRENDS = {"spectrum": None, "rssi": {"name": "mean"}, "csi": None}
+
+
+@pytest.fixture(scope="module")
+def configure():
+    """Composes the configuration; with Hydra's own part, as it stands."""
+    configuration.install()
+
+    def configure(*overrides, whole=False):
+        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            config = compose("config", [*overrides], return_hydra_config=whole)
+        return config if whole else OmegaConf.to_container(config, resolve=True)
+
+    return configure
+
+
+# --- a model of several tasks ---
+
+
+@pytest.mark.parametrize("task", DATA)
+def test_a_model_chooses_what_suits_it_for_every_task(configure, task):
+    config = configure("model=mirrored", f"data={DATA[task]}")
+    assert config == configure(f"+experiment={MIRRORED[task]}")
+    assert config["task"]["name"] == task
+    model = config["model"]
+    parts = ("name", "placement", "deformation", "projection", "rasterizer", "pooling")
+    names = [model[part] if part == "name" else model[part]["name"] for part in parts]
+    assert names == ["mirrored", "mirrored", "none", "direction_cosine", "aperture", POOLINGS[task]]
+    assert (model["gaussians"], model["trend"]) == (None, TRENDS[task])
+    assert (config["kriging"], config["threads"], config["trainer"]["max_steps"]) == (True, 1, 900)
+
+
+def test_the_command_line_wins_over_a_model_and_a_model_over_the_task(configure):
+    chosen = ("pooling=softmax_attention", "gaussians=lattice", "gaussians.count=7", "kriging=false", "threads=2")
+    config = configure("model=mirrored", "data=synthetic_rssi", *chosen, "trainer.max_steps=5")
+    assert config["pooling"] == configure("data=synthetic_rssi")["pooling"]
+    assert config["model"]["gaussians"]["count"] == 7
+    assert (config["kriging"], config["threads"], config["trainer"]["max_steps"]) == (False, 2, 5)
+
+
+def test_an_experiment_wins_over_a_model(configure):
+    config = configure("+experiment=rssi", "model=mirrored")
+    assert config["trainer"]["max_steps"] == configure("+experiment=rssi")["trainer"]["max_steps"] == 600
+    assert config["model"]["gaussians"] is None
+    assert config["deformation"]["name"] == "none"
+
+
+# --- all systems ---
+
+
+@pytest.mark.parametrize("task", DATA)
+@pytest.mark.parametrize("model", ["gaigs", "mirrored", "knn"])
+def test_systems_have_one_budget_whatever_they_choose(configure, task, model):
+    config = configure(f"+experiment=systems_{task}", f"model={model}")
+    assert config["task"]["name"] == task
+    assert config["model"]["name"] == model
+    assert config["data"]["name"] == DATA[task]
+    trainer = configure("trainer.max_steps=-1")["trainer"]
+    assert config["trainer"] == trainer | {"max_time": "00:00:03:00", "val_check_interval": "00:00:00:15"}
+
+
+@pytest.mark.parametrize("task", DATA)
+def test_systems_are_swept_over_as_far_as_they_are_installed(configure, task, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # where no plug-in is
+    settings = configure(f"+experiment=systems_{task}", whole=True).hydra
+    listed = OmegaConf.to_container(settings.sweeper.params)["model"]
+    names = listed.removeprefix("${installed:").removesuffix("}").replace(" ", "").split(",")
+    assert {"nerf2", "gsrf", "ray_tracing", "gaigs", "mirrored"} <= {*names}
+    swept = settings.sweeper.params["model"].split(",")
+    assert {*swept} <= {*registry("model").names()}
+    assert swept[-2:] == ["gaigs", "mirrored"]
+    assert settings.sweep.dir == f"runs/systems_{task}"
+    assert settings.callbacks.report["_target_"] == "gaigs.report.at_end.AtEnd"
+
+
+def test_what_is_not_installed_is_left_out_and_told(caplog):
+    with caplog.at_level(logging.WARNING):
+        assert installed("knn", "yagi", "gaigs", "loop") == "knn,gaigs"
+    assert [record.getMessage() for record in caplog.records] == ["left out, as not installed: model=yagi,loop"]
+    caplog.clear()
+    assert installed("gaigs") == "gaigs"
+    assert not caplog.records
+
+
+def test_two_jobs_at_a_time_where_that_is_installed(configure, monkeypatch):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs gaigs[parallel]")
+    settings = lambda *more: configure("+experiment=systems_rssi", *more, whole=True).hydra.launcher
+    assert settings()["n_jobs"] == 2
+    assert settings()["_target_"].endswith("JoblibLauncher")
+    assert settings("hydra/launcher=basic")["_target_"].endswith("BasicLauncher")
+    assert settings("hydra.launcher.n_jobs=4")["n_jobs"] == 4
+
+    def lacks(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", lacks)
+    assert launcher("two") == "basic"
+    assert settings()["_target_"].endswith("BasicLauncher")

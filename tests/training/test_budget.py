@@ -1,0 +1,252 @@
+"""Trainings that end when their time is up, by a clock that the test sets."""
+
+import math
+import re
+from types import SimpleNamespace
+
+import pytest
+import torch
+from fitting import Plane, fit, make_links, make_module
+from lightning.pytorch.callbacks import Callback, Timer
+
+from gaigs.training.budget import ENDLESS, make_budget, share_done
+from gaigs.training.callbacks import Interrupted, KeepBest, KeepLast, ProgressLine
+from gaigs.training.revision import Revision
+
+
+class Clock(Callback):
+    """A second a step and, where it is told so, some a validation; notes what happens when; stops behind one step.
+
+    Args:
+        start: What it shows first [s]; another process's clock shows something else.
+        validation: Of each [s].
+        at: The step behind which the training is interrupted.
+    """
+
+    def __init__(self, start=0.0, validation=0.0, at=None):
+        self.now, self.validation, self.at = start, validation, at
+        self.losses, self.rates, self.validated = [], [], []
+
+    def monotonic(self):
+        return self.now
+
+    def on_train_batch_start(self, trainer, module, *_):
+        self.now += 1.0
+        self.rates.append(trainer.optimizers[0].param_groups[0]["lr"])
+
+    def on_train_batch_end(self, trainer, module, outputs, *_):
+        self.losses.append(outputs["loss"].item())
+        if trainer.global_step == self.at:
+            next(callback for callback in trainer.callbacks if isinstance(callback, KeepLast)).interrupt(15)
+
+    def on_validation_start(self, trainer, module):
+        self.now += self.validation
+        self.validated.append(trainer.global_step)
+
+
+class Turned(Plane):
+    """A plane that is turned now and then, and notes when."""
+
+    revisions = (0.0, 0.3, 0.35, 0.9)
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.turns = []
+
+    def revise(self, number, train, validation, loss):
+        self.turns.append(number)
+        self.slope += 0.1 * torch.randn(2)
+        return "turned"
+
+
+@pytest.fixture(scope="module")
+def links():
+    return make_links()
+
+
+@pytest.fixture
+def train(links, tmp_path, monkeypatch):
+    """Trains by a clock; gives the trainer."""
+
+    def train(clock, module=None, steps=-1, resume=None, **options):
+        monkeypatch.setattr("lightning.pytorch.callbacks.timer.time", clock)
+        timer = Timer()
+        given = {"max_steps": steps, "max_time": "00:00:00:10", "val_check_interval": "00:00:00:04"} | options
+        given, budget = make_budget(given, timer)
+        del given["max_steps"]
+        module = module or make_module(links)
+        keep = KeepBest(tmp_path / "best.ckpt", None), KeepLast(tmp_path / "last.ckpt", every=math.inf)
+        callbacks = [clock, timer, budget, Revision(links, 0), *keep]
+        return fit(module, links, tmp_path, steps, *callbacks, resume=resume, **given)
+
+    return train
+
+
+def test_it_ends_with_its_time_and_the_last_step_is_validated_once(train):
+    clock = Clock()
+    trainer = train(clock, val_check_interval=3)
+    assert trainer.global_step == 10
+    assert clock.validated == [3, 6, 9, 10]
+
+
+def test_time_that_validations_take_counts(train):
+    clock = Clock(validation=2.0)
+    trainer = train(clock, val_check_interval=3)
+    assert clock.validated == [3, 6]
+    assert trainer.global_step == 6, "3 s, 2 s to validate, 3 s, 2 s to validate"
+
+
+@pytest.mark.parametrize(("spent", "validated"), [(0.0, [4, 8, 10]), (1.0, [4, 8])])
+def test_validations_come_by_time_from_the_end_of_one_to_the_next(train, spent, validated):
+    clock = Clock(validation=spent)
+    train(clock)
+    assert clock.validated == validated
+
+
+def test_steps_may_end_what_validates_by_time(train, tmp_path):
+    clock = Clock()
+    trainer = train(clock, steps=6, max_time=None)
+    assert (trainer.global_step, clock.validated) == (6, [4])
+    assert torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] in (4, 6)
+
+
+def test_rates_fall_with_the_time(train, links):
+    clock = Clock()
+    module = make_module(links, learning_rates={"slope": 1.0, "network": 0.5}, schedule={"warmup": 0, "final": 0.01})
+    train(clock, module)
+    share = [0, *(k / 10 for k in range(9))]  # as told behind the step before
+    assert clock.rates == pytest.approx([0.01**done for done in share])
+
+
+def test_of_steps_and_time_the_larger_share_counts(train, links):
+    clock = Clock()
+    schedule = {"warmup": 0, "final": 0.01}
+    train(clock, make_module(links, learning_rates={"slope": 1.0, "network": 0.5}, schedule=schedule), steps=5)
+    assert clock.rates == pytest.approx([0.01 ** (k / 5) for k in range(5)])
+    trainer = SimpleNamespace(max_steps=50, callbacks=[SimpleNamespace()])
+    assert share_done(trainer)(20) == 20 / 50
+    _, budget = make_budget({"max_steps": 50, "max_time": "00:00:00:10"}, Timer())
+    trainer.callbacks.append(budget)
+    budget.share = 0.5
+    assert [share_done(trainer)(step) for step in (20, 30)] == [0.5, 0.6]
+
+
+def test_revisions_come_after_their_shares_of_the_time(train, links, caplog):
+    caplog.set_level("INFO")
+    module = make_module(links, Turned(links.scene))
+    train(Clock(), module)
+    told = [record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"]
+    assert told == ["step 0: turned", "step 3: turned", "step 4: turned", "step 9: turned"]
+    assert module.model.turns == [0, 1, 2, 3]
+
+
+def test_a_revision_that_steps_brought_is_not_made_again_by_time(train, links):
+    module = make_module(links, Turned(links.scene))
+    train(Clock(), module, steps=8)
+    assert module.model.turns == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("at", [1, 3, 4, 6, 8])
+def test_a_training_that_goes_on_has_the_time_that_was_spent(train, links, tmp_path, at):
+    """Stopped between validations and at one, it sees what an uninterrupted one sees, whatever the clock shows now."""
+    make = lambda: make_module(links, Turned(links.scene), learning_rates={"slope": 0.05, "network": 0.02})
+    whole, part, rest = Clock(), Clock(at=at), Clock(start=5000.0)
+    torch.manual_seed(0)
+    uninterrupted, stopped, resumed = make(), make(), make()
+    torch.manual_seed(0)
+    train(whole, uninterrupted)
+    (tmp_path / "best.ckpt").unlink()
+    torch.manual_seed(0)
+    with pytest.raises(Interrupted, match=f"stopped after step {at}$"):
+        train(part, stopped)
+    torch.manual_seed(7)
+    trainer = train(rest, resumed, resume=tmp_path / "last.ckpt")
+    assert trainer.global_step == 10
+    assert part.losses + rest.losses == whole.losses
+    assert part.rates + rest.rates == whole.rates
+    assert part.validated + rest.validated == whole.validated == [4, 8, 10]
+    assert stopped.model.turns + resumed.model.turns == uninterrupted.model.turns == [0, 1, 2, 3]
+    for name, value in uninterrupted.model.state_dict().items():
+        assert torch.equal(resumed.model.state_dict()[name], value), name
+
+
+def test_a_training_whose_time_is_up_takes_no_step_more(train, tmp_path):
+    train(Clock())
+    again = Clock(start=100.0)
+    trainer = train(again, resume=tmp_path / "last.ckpt")
+    assert (trainer.global_step, again.losses, again.validated) == (10, [], [])
+
+
+def test_the_clock_of_the_first_process_decides():
+    """This process's clock is ahead, the first one's is not."""
+    timer = SimpleNamespace(time_elapsed=lambda stage: 99.0)
+    _, budget = make_budget({"max_time": "00:00:00:10", "val_check_interval": "00:00:00:05"}, timer)
+    asked = []
+    strategy = SimpleNamespace(broadcast=lambda value: asked.append(value) or first)
+    trainer = SimpleNamespace(strategy=strategy, should_stop=False, global_step=7, val_check_batch=None)
+    trainer.sanity_checking, trainer.loggers = False, []
+    first = 4.0
+    budget.on_train_batch_end(trainer, None)
+    assert (budget.share, trainer.should_stop, trainer.val_check_batch) == (0.4, False, ENDLESS)
+    first = 6.0
+    budget.on_train_batch_end(trainer, None)
+    assert (budget.share, trainer.should_stop, trainer.val_check_batch) == (0.6, False, 7)
+    budget.on_validation_end(trainer, None)
+    assert budget.validated == 6.0
+    first = 10.0
+    budget.on_train_batch_end(trainer, None)
+    assert (trainer.should_stop, trainer.val_check_batch) == (True, 7)
+    assert asked == [99.0] * 4
+
+
+@pytest.mark.parametrize(
+    ("options", "max_time", "every"),
+    [
+        ({"max_steps": 5, "val_check_interval": 2}, None, None),
+        ({"max_steps": 5, "val_check_interval": 2, "max_time": None}, None, None),
+        ({"max_steps": -1, "val_check_interval": 2, "max_time": "00:01:03:20"}, 3800.0, None),
+        ({"max_steps": 5, "val_check_interval": {"minutes": 2}}, None, 120.0),
+        ({"max_steps": -1, "val_check_interval": "00:00:00:09", "max_time": {"minutes": 3}}, 180.0, 9.0),
+    ],
+)
+def test_options(options, max_time, every):
+    before = dict(options)
+    rest, budget = make_budget(options, Timer())
+    assert options == before
+    assert "max_time" not in rest
+    assert rest["max_steps"] == options["max_steps"]
+    assert rest["val_check_interval"] == (2 if every is None else ENDLESS)
+    assert (budget is None) == (max_time is every is None)
+    if budget is not None:
+        assert (budget.max_time, budget.every) == (max_time, every)
+
+
+@pytest.mark.parametrize("time", ["3 min", "00:03:00", 180, "00:00:00:00", {"minuets": 3}, {"seconds": 0.5}])
+@pytest.mark.parametrize("option", ["max_time", "val_check_interval"])
+def test_a_time_that_cannot_be_read_is_refused(option, time):
+    if option == "val_check_interval" and time == 180:
+        return  # steps
+    message = rf"trainer\.{option} must be a time of at least a second as 'DD:HH:MM:SS', got {re.escape(repr(time))}"
+    with pytest.raises(ValueError, match=message):
+        make_budget({"max_steps": 10, option: time}, Timer())
+
+
+@pytest.mark.parametrize("options", [{"max_steps": -1}, {}])
+def test_something_must_end_it(options):
+    with pytest.raises(ValueError, match=r"max_steps must be at least 1, got -1; time alone ends it with trainer\.max"):
+        make_budget(options, Timer())
+
+
+def test_the_progress_line_tells_the_share_of_the_time(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    _, budget = make_budget({"max_steps": -1, "max_time": "00:00:03:00"}, Timer())
+    trainer = SimpleNamespace(global_step=40, max_steps=-1, progress_bar_metrics={}, is_global_zero=True)
+    trainer.callbacks = [budget]
+    line, module = ProgressLine(), SimpleNamespace(task=SimpleNamespace(watched="ssim"))
+    line.on_train_start(trainer, None)
+    trainer.global_step, budget.share = 1499, 0.25
+    line.on_train_batch_end(trainer, module)
+    assert [task.percentage for task in line.line.tasks] == [25.0]
+    line.on_train_end(trainer, module)
+    (shown,) = capsys.readouterr().out.strip().splitlines()
+    assert re.fullmatch(r"training \S+ +1499 steps [\d.]+ steps/s \S+", shown), shown
