@@ -1,0 +1,94 @@
+"""NeRF²'s two-stage network, asked at the Gaussians' centres."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import relu
+
+from gaigs.deformation import Deformation, Residuals
+from gaigs.deformation.two_branch import CLEAR, DARKEST, TokenLinear
+from gaigs.placement import Placed
+from gaigs.projection import NEAR
+from gaigs.query import Query
+from gaigs.scene import Scene
+from gaigs.tokenizer import Tokens
+from gaigs.tokenizer.euclidean import fourier_features
+
+
+class TwoStage(Deformation):
+    """Attenuation and signal of every Gaussian, for a transmitter and a receiver.
+
+    Attenuation network: E(P_x) -> layers of one width with ReLU, into the middle one of which E(P_x) is fed again. From
+    its end h the attenuation delta and a feature, both linear; delta through a sigmoid, ``CLEAR`` at the start.
+    Signal network: [feature, E(P_TX), CLS, PE(view)] -> width -> half of it, with ReLU -> the signal of each channel.
+    The view is the unit vector from the receiver to the Gaussian. So matter is the same for all, and what it sends
+    depends on who sends and who hears.
+
+    Args:
+        scene: Where the receivers stand.
+        channels: Signal channels of a Gaussian.
+        tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens.
+        width: Of the attenuation network, and of the signal network's first layer.
+        layers: Of the attenuation network.
+        view_octaves: L of PE(view), which has the angular frequencies 2^k for k = 0..L-1.
+
+    Raises:
+        ValueError: A size is out of range.
+
+    Source: WRF-GS (INFOCOM 2025) after NeRF² (MobiCom 2023).
+    """
+
+    sees_receivers = True
+
+    def __init__(
+        self,
+        scene: Scene,
+        channels: int,
+        tokenizer_widths: tuple[int, int, int],
+        width: int,
+        layers: int,
+        view_octaves: int,
+    ):
+        super().__init__()
+        for option, count, least in (("width", width, 2), ("layers", layers, 2), ("view_octaves", view_octaves, 0)):
+            if count < least:
+                raise ValueError(f"deformation.{option} must be at least {least}, got {count}")
+        self.scene = scene
+        links, gaussians, transmitters = tokenizer_widths
+        matter = 0, gaussians, 0
+        self.first, self.again = TokenLinear(matter, width), TokenLinear(matter, width, hidden=width)
+        self.before = nn.ModuleList(nn.Linear(width, width) for _ in range(layers // 2 - 1))
+        self.behind = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - layers // 2 - 1))
+        self.attenuation, self.feature = nn.Linear(width, 1), nn.Linear(width, width)
+        self.register_buffer("view_frequencies", 2.0 ** torch.arange(view_octaves))
+        view = 3 * (1 + 2 * view_octaves)
+        self.signal_first = TokenLinear((links, width, transmitters), width, hidden=view)
+        self.signal_second, self.signal = nn.Linear(width, width // 2), nn.Linear(width // 2, channels)
+        nn.init.zeros_(self.attenuation.weight)
+        nn.init.constant_(self.attenuation.bias, math.log(CLEAR / (1 - CLEAR)))
+
+    def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
+        """Signal (b, n, channels, 1), attenuations (b, n)."""
+        b, n = len(query), placed.means.shape[1]
+        # One row, where Gaussians stand still: what is matter alone is computed once for all queries.
+        nobody = tokens.scene.new_zeros(1 if tokens.gaussians.ndim == 2 else b, 0)
+        matter = Tokens(nobody, tokens.gaussians, nobody)
+        hidden = relu(self.first(matter))
+        for layer in self.before:
+            hidden = relu(layer(hidden))
+        hidden = relu(self.again(matter, hidden))
+        for layer in self.behind:
+            hidden = relu(layer(hidden))
+        attenuations = DARKEST + (1 - DARKEST) * self.attenuation(hidden)[..., 0].sigmoid()
+        excited = tokens._replace(gaussians=self.feature(hidden))
+        signal = relu(self.signal_first(excited, self.view(placed, query)))
+        signal = self.signal(relu(self.signal_second(signal)))
+        return Residuals(delta_signal=signal[..., None], attenuations=attenuations.expand(b, n))
+
+    def view(self, placed: Placed, query: Query) -> Float[Tensor, "b n features"]:
+        """PE of the unit vectors from each query's receiver to the Gaussians, 0 where one sits on the receiver."""
+        offsets = placed.means - self.scene.positions(placed.means)[query.receivers][:, None]
+        directions = offsets / offsets.norm(dim=-1, keepdim=True).clamp(min=NEAR)
+        return fourier_features(directions, self.view_frequencies)

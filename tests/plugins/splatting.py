@@ -1,0 +1,68 @@
+"""What the tests of splatting systems share: configurations with this repository's plug-ins, and short runs."""
+
+import contextlib
+import functools
+import sys
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+import gaigs
+from gaigs import configuration, evaluation, experiment
+from gaigs.registry import registry
+from gaigs.testing import check_model, example_links
+
+ROOT = Path(__file__).parents[2]
+DATA = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
+"""The data set that brings a task."""
+
+RUN = (
+    "rasterizer=torch",
+    "training.batch_size=7",
+    "trainer.accelerator=cpu",
+    "trainer.max_steps=4",
+    "trainer.val_check_interval=2",
+    "trainer.log_every_n_steps=1",
+    "trainer.enable_progress_bar=false",
+    "baselines=[{name: mean}]",
+)
+
+
+@contextlib.contextmanager
+def repository():
+    """As from the root of the repository, where plug-ins are found by name."""
+    path = sys.path[:]  # the registry appends to it
+    with contextlib.chdir(ROOT):
+        yield
+    sys.path[:] = path
+
+
+@functools.cache
+def composed(*overrides):
+    """The whole configuration, as the command line would have it."""
+    configuration.install()
+    with repository(), initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
+        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+
+
+def build(kind, config, seed=0, **context):
+    """A component of a plug-in."""
+    torch.manual_seed(seed)
+    with repository():
+        return registry(kind).build(config, **context)
+
+
+def check_task(task, *overrides, carrier=None):
+    """A model, as it is configured for a task, keeps the contract."""
+    config = composed(f"data={DATA[task]}", *overrides)["model"]
+    check_model(lambda scene: build("model", config, scene=scene), example_links(task, carrier))
+
+
+def run(folder, monkeypatch, *overrides):
+    """A short training on the built-in room: its configuration, its metrics, and the model of its checkpoint."""
+    monkeypatch.setattr(evaluation, "write_figures", lambda *_: None)  # they take longer than all else
+    config = composed(*overrides, *RUN)
+    with repository():
+        return config, experiment.run(config, folder), gaigs.load(folder / "best.ckpt")
