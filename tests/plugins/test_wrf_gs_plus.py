@@ -1,0 +1,161 @@
+"""WRF-GS+: its network and its rendering against plain float64 transcriptions, and what it is made of."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+from splatting import build, check_task, composed, run
+from torch.nn.functional import normalize
+
+from gaigs.geometry import covariances
+from gaigs.placement import Placed
+from gaigs.testing import check_deformation, check_tokenizer, example_links
+from gaigs.testing.rasterizer import rasterize_densely
+
+LINKS = example_links()
+SMALL = ("model=wrf_gs_plus", "gaussians.count=40", "deformation.width=16", "rasterizer=torch")
+SOME = torch.tensor([0, 2, 4])
+"""Links to the first receiver."""
+
+
+@pytest.fixture
+def model():
+    """The model of spectra, its network as after some training."""
+    model = build("model", composed(*SMALL)["model"], scene=LINKS.scene)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in model.deformation.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+        model.gaussians.log_scales.add_(0.5 * torch.randn(40, 3, generator=generator))
+    return model
+
+
+def ask(model):
+    """What the deformation is called with."""
+    query = LINKS.query[SOME]
+    placed = Placed(model.gaussians.means.detach()[None])
+    return model.tokenizer(placed, model.gaussians.opacities.detach(), query), placed, query
+
+
+# --- the contracts ---
+
+
+@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
+def test_it_keeps_the_contract_of_models(task):
+    check_task(task, *SMALL)
+
+
+def test_its_parts_keep_theirs():
+    config = composed(*SMALL)
+    check_deformation(functools.partial(build, "deformation", config["deformation"]), LINKS.scene)
+    check_tokenizer(build("tokenizer", config["tokenizer"], scene=LINKS.scene), LINKS.scene)
+
+
+@pytest.mark.parametrize("option", ["width", "layers"])
+def test_sizes_out_of_range_are_refused(option):
+    config = composed(*SMALL)["deformation"] | {option: -1}
+    with pytest.raises(ValueError, match=rf"deformation\.{option} must be at least \d, got -1"):
+        build("deformation", config, channels=2, tokenizer_widths=(0, 3, 3))
+
+
+# --- the network ---
+
+
+def transcribed(network, tokens, channels):
+    """Rotation, scale and signal of each pair, in numpy."""
+    values = {name: parameter.detach().double().numpy() for name, parameter in network.named_parameters()}
+    linear = lambda name, x: values[f"{name}.weight"] @ x + values[f"{name}.bias"]
+    relu = lambda x: np.maximum(x, 0)
+    mixed = lambda name, transmitter, gaussian: (
+        values[f"{name}.links.weight"] @ transmitter
+        + values[f"{name}.gaussians.weight"] @ gaussian
+        + values[f"{name}.bias"]
+    )
+    rows = []
+    for transmitter in tokens.transmitters.detach().double().numpy():
+        for gaussian in tokens.gaussians.double().numpy():
+            h = relu(mixed("first", transmitter, gaussian))
+            for k in range(3):
+                h = relu(linear(f"before.{k}", h))
+            h = relu(mixed("again", transmitter, gaussian) + values["again.hidden.weight"] @ h)
+            for k in range(3):
+                h = relu(linear(f"behind.{k}", h))
+            waves = linear("amplitude", h) * np.exp(1j * linear("phase", h))
+            signal = np.concatenate((waves.real, waves.imag)) if channels % 2 == 0 else waves.real
+            rows.append(np.concatenate((linear("rotation", h), linear("scale", h), signal)))
+    shape = len(tokens.transmitters), len(tokens.gaussians), -1
+    return np.split(np.reshape(rows, shape), [4, 7], axis=-1)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 6])
+def test_the_network_has_eight_layers_and_heads_of_shape_and_wave(channels):
+    widths = 0, 5, 4
+    network = build("deformation", composed(*SMALL)["deformation"], channels=channels, tokenizer_widths=widths)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape))
+    tokens = build("tokenizer", composed(*SMALL)["tokenizer"], scene=LINKS.scene)(
+        Placed(torch.rand(1, 7, 3)), torch.rand(7), LINKS.query[:3]
+    )
+    tokens = tokens._replace(gaussians=tokens.gaussians[:, :5], transmitters=tokens.transmitters[:, :4])
+    residuals = network(tokens, Placed(torch.rand(1, 7, 3)), LINKS.query[:3])
+    quats, scales, signal = transcribed(network, tokens, channels)
+    np.testing.assert_allclose(residuals.delta_quats.detach(), quats, atol=1e-6)
+    np.testing.assert_allclose(residuals.delta_scales.detach(), scales, atol=1e-6)
+    np.testing.assert_allclose(residuals.delta_signal.detach()[..., 0], signal, atol=1e-6)
+    assert signal.shape == (3, 7, channels)
+    assert residuals.delta_opacities is residuals.attenuations is None
+
+
+def test_shapes_start_as_they_are_and_signals_differ_from_the_first_step_on():
+    model = build("model", composed(*SMALL)["model"], scene=LINKS.scene)
+    residuals = model.deformation(*ask(model))
+    assert not residuals.delta_quats.any()
+    assert not residuals.delta_scales.any()
+    assert (residuals.delta_signal[0] - residuals.delta_signal[1]).abs().max() > 1e-4
+
+
+# --- the rendering ---
+
+
+def test_its_rendering_is_the_dense_reference(model):
+    gaussians, tokens = model.gaussians, ask(model)[0]
+    quats, scales, signal = map(torch.from_numpy, transcribed(model.deformation, tokens, channels=2))
+    with torch.no_grad():
+        matrices = covariances(normalize(gaussians.quats) + quats, gaussians.log_scales.exp() + scales)
+        splats = model.projection.project(gaussians.means.double(), matrices, LINKS.receivers[0].pose)
+        opacities = gaussians.opacity_logits.sigmoid().expand(3, -1)
+        # Static signal and residual, times the constant spherical harmonic.
+        signal = 0.28209479 * (gaussians.signal[..., 0] + signal)
+        plane = model.projection.plane(LINKS.task.directions)
+        image, _ = rasterize_densely(splats, signal, opacities, None, plane)
+    value = model(LINKS.batch(SOME)).value
+    # A handful of pixels may stand where a splat is just cut off.
+    assert ((value - torch.complex(*image.unbind(1)).abs()).abs() < 1e-4).double().mean() > 0.998
+
+
+# --- how it is chosen ---
+
+
+@pytest.mark.parametrize(
+    ("chosen", "pooling"),
+    [
+        ((), "spectrum"),
+        (("data=synthetic_rssi",), "softmax_attention"),
+        (("+experiment=rssi",), "softmax_attention"),
+        (("+experiment=csi",), "element_sum"),
+    ],
+)
+def test_it_is_itself_with_every_task(chosen, pooling):
+    config = composed("model=wrf_gs_plus", *chosen)["model"]
+    named = config["name"], config["deformation"]["name"], config["pooling"]["name"]
+    assert named == ("wrf_gs_plus", "amplitude_phase", pooling)
+
+
+def test_a_run_trains_tests_and_keeps_it(tmp_path, monkeypatch):
+    config, metrics, loaded = run(tmp_path, monkeypatch, *SMALL, "data.transmitters=30", "training.thinning.stride=8")
+    assert metrics["models"].keys() == {"wrf_gs_plus", "mean"}
+    start = build("model", config["model"], scene=loaded.scene, seed=config["seed"])
+    for trained, untrained in zip(loaded.parameters(), start.parameters(), strict=True):
+        assert not torch.equal(trained, untrained)
