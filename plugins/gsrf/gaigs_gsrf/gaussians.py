@@ -1,0 +1,151 @@
+"""Complex-valued Gaussians: where they start, and what they send in each direction."""
+
+import math
+
+import torch
+from jaxtyping import Complex, Float
+from scipy.constants import speed_of_light
+from torch import Tensor, nn
+
+from gaigs.gaussians import Gaussians
+from gaigs.geometry import spherical_harmonics, to_spherical
+from gaigs.projection import NEAR
+from gaigs.scene import Scene
+
+
+class ComplexGaussians(Gaussians):
+    """Gaussians with complex coefficients of a Fourier-Legendre series, and a phase.
+
+    They start on a cubic grid over the box that holds transmitters and receivers, and a margin around it. Points in
+    whose directions no receiver listens are left out. Their standard deviation at the start is the mean distance
+    between them on the sphere of footprints.
+
+    Args:
+        scene: Its receivers and transmitters say where to put the Gaussians, its carrier how densely.
+        zone: Lowest and highest elevation that anything is heard from, in the receivers' frames [rad].
+        channels: Real channels, half of which are real parts of complex ones and half imaginary.
+        degree: L of the series.
+        radius: Of the sphere of footprints [m].
+        count: Points of the grid at most; where there would be more, its pitch is wider.
+        pitch: Of the grid [wavelengths]; where the carrier is unknown, ``count`` decides.
+        margin: As a share of the box's longest edge.
+        opacity: At the start, in (0, 1).
+        signal: Standard deviation of the coefficients' random start.
+
+    Attributes:
+        signal: Coefficients c_lm at number l² + l + m, (n, channels, (L + 1)²).
+        phases: By which a wave turns that passes through a Gaussian's middle (n,) [rad].
+
+    Raises:
+        ValueError: An option is out of range, or nothing of the grid is heard.
+
+    Source: GSRF (NeurIPS 2025), "Fourier-Legendre radiance field".
+    """
+
+    PARAMETERS = (*Gaussians.PARAMETERS, "phases")
+
+    def __init__(
+        self,
+        scene: Scene,
+        zone: tuple[float, float],
+        channels: int,
+        degree: int,
+        radius: float,
+        count: int,
+        pitch: float,
+        margin: float,
+        opacity: float,
+        signal: float,
+    ):
+        for option, value in (("pitch", pitch), ("margin", margin)):
+            if not 0 < value < math.inf:
+                raise ValueError(f"model.{option} must be positive, got {value}")
+        if degree < 0:
+            raise ValueError(f"model.degree must be at least 0, got {degree}")
+        if count < 1:
+            raise ValueError(f"model.count must be at least 1, got {count}")
+        means = heard(cubic_grid(scene, count, pitch, margin), scene, zone)
+        if len(means) < len(scene.receivers):
+            raise ValueError(
+                f"the grid of Gaussians must have a point for each of the {len(scene.receivers)} receivers, got "
+                f"{len(means)} that are heard; raise model.count"
+            )
+        options = {"near": 1.0, "far": 1.0, "spread": 1.0, "opacity": opacity, "signal": signal, "degree": degree}
+        super().__init__(scene, zone, channels, len(means), **options)
+        solid_angle = 2 * math.pi * (math.sin(zone[1]) - math.sin(zone[0]))
+        with torch.no_grad():
+            self.means.copy_(means)
+            self.log_scales.fill_(math.log(radius * math.sqrt(solid_angle / len(means))))
+            self.signal.normal_(std=signal)
+        self.phases = nn.Parameter(torch.zeros(len(means)))
+
+    def radiance(self, transmitters: Float[Tensor, "b 3"]) -> Complex[Tensor, "b n s"]:
+        """What each sends towards the transmitters, on s complex channels.
+
+        psi_i = sum_{l <= L, |m| <= l} c_ilm Y_lm at the direction from the Gaussian to the transmitter.
+        """
+        offsets = transmitters[:, None] - self.means
+        lengths = offsets.norm(dim=-1, keepdim=True)
+        # A transmitter within a Gaussian's centre lies in no direction: one is taken for it.
+        upwards = offsets.new_tensor([0.0, 0.0, 1.0])
+        directions = torch.where(lengths < NEAR, upwards, offsets / lengths.clamp(min=NEAR))
+        coefficients = torch.complex(*self.signal.unflatten(1, (2, -1)).unbind(1))
+        return torch.einsum("bnk,nsk->bns", fourier_legendre(directions, self.degree), coefficients)
+
+
+def fourier_legendre(vectors: Float[Tensor, "*batch 3"], degree: int) -> Complex[Tensor, "*batch k"]:
+    """Y_lm = N_lm P_l^|m|(cos theta) exp(j m az), times (-1)^|m| for m < 0, in the order of l and m.
+
+    N_lm = sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!). Made of the real harmonics, whose recurrence has no factorials
+    and no pole; sqrt(2) N P cos(m az) and sqrt(2) N P sin(m az) are two of them.
+
+    Args:
+        vectors: Unit vectors.
+        degree: The highest l.
+
+    Source: GSRF (NeurIPS 2025).
+    """
+    harmonics = spherical_harmonics(vectors, degree)
+    middles = torch.tensor([n**2 + n for n in range(degree + 1) for _ in range(2 * n + 1)], device=vectors.device)
+    orders = torch.arange(len(middles), device=vectors.device) - middles
+    real, imaginary = (harmonics[..., middles + sign * orders.abs()] for sign in (1, -1))
+    size = vectors.new_tensor([1.0, math.sqrt(0.5), -math.sqrt(0.5)])
+    size = size[torch.where((orders < 0) & (orders % 2 == 1), 2, orders.sign().abs())]
+    return torch.complex(size * real, size * orders.sign() * imaginary)
+
+
+def cubic_grid(scene: Scene, count: int, pitch: float, margin: float) -> Float[Tensor, "n 3"]:
+    """Points of a cubic grid over the box of training transmitters and receivers, and a margin around it.
+
+    Args:
+        scene: Box, receivers and carrier.
+        count: Most points.
+        pitch: In wavelengths, where these are known.
+        margin: As a share of the box's longest edge.
+    """
+    corners = torch.cat((scene.lower[None], scene.upper[None], scene.positions(scene.lower)))
+    lower, upper = corners.amin(0).double(), corners.amax(0).double()
+    edges = (upper - lower) + 2 * margin * (upper - lower).max()
+    task = scene.task
+    frequencies = task.frequencies if task.dtype.is_complex else scene.frequencies
+    step = (edges.prod() / count) ** (1 / 3)
+    if len(frequencies):
+        step = torch.maximum(step, pitch * speed_of_light / frequencies.double().mean())
+    steps = (edges / step).floor()
+    while (steps + 1).prod() > count:
+        step = 1.02 * step
+        steps = (edges / step).floor()
+    axes = (
+        middle + step * (torch.arange(size + 1) - size / 2)
+        for middle, size in zip((lower + upper) / 2, steps.tolist(), strict=True)
+    )
+    return torch.cartesian_prod(*axes).float()
+
+
+def heard(points: Float[Tensor, "n 3"], scene: Scene, zone: tuple[float, float]) -> Float[Tensor, "k 3"]:
+    """Those of some points that a receiver sees between two elevations."""
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for receiver in scene.receivers:
+        _, elevations, _ = to_spherical(receiver.pose.local(points))
+        seen |= (elevations >= zone[0]) & (elevations <= zone[1])
+    return points[seen]

@@ -1,0 +1,51 @@
+"""GSRF's loss: three terms of spectra, one of levels and of channels."""
+
+from torch import Tensor
+
+from gaigs.loss.l1_ssim import find_window, structural_similarity
+from gaigs.loss.nmse import Nmse
+from gaigs.query import Batch
+from gaigs.task import Task
+from gaigs_gsrf.mean_amplitude import RANGE
+
+WINDOW = 11
+"""Edge of the SSIM window [pixels]."""
+
+L1, SSIM, FOURIER = 0.44, 0.37, 0.19
+"""Weights of the terms of spectra."""
+
+
+class GsrfLoss:
+    """Of spectra 0.44 L1 + 0.37 (1 - SSIM) + 0.19 Fourier; of levels the squared error of amplitudes; of channels the
+    normalised squared error.
+
+    The SSIM window spans 11 pixels of the label's own grid; its weights are uniform, as those of ``l1_ssim``. The
+    Fourier term is the mean squared difference of the two-dimensional discrete Fourier transforms, in the form that
+    keeps energies. By Parseval's theorem that is the mean squared error, and so it is computed.
+
+    Args:
+        task: Whose labels are compared.
+
+    Source: GSRF (NeurIPS 2025), but for channels, whose loss is not published.
+    """
+
+    def __init__(self, task: Task):
+        self.directions, self.is_complex = task.directions, task.dtype.is_complex
+        self.nmse = Nmse(task) if self.is_complex else None
+
+    def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss, and its terms; see ``gaigs.loss.Loss``.
+
+        Raises:
+            ValueError: The batch asks for a list of directions, which has no windows, or for fewer than 3 x 3.
+        """
+        if self.is_complex:
+            return self.nmse(values, batch)
+        errors = values - batch.labels
+        if self.directions is None:
+            squared = (errors / RANGE).square().mean()
+            return squared, {"amplitude": squared}
+        window = find_window("gsrf", batch.directions, self.directions.pitch, WINDOW)
+        similarity = structural_similarity(values, batch.labels, window)
+        terms = {"l1": errors.abs().mean(), "ssim": 1 - similarity, "fourier": errors.square().mean()}
+        return L1 * terms["l1"] + SSIM * terms["ssim"] + FOURIER * terms["fourier"], terms

@@ -1,0 +1,35 @@
+"""RSSI as GSRF reads it: the mean amplitude over all directions."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.directions import Directions
+from gaigs.pooling import Pooling, sphere
+from gaigs.query import Query
+
+RANGE = 100.0
+"""An amplitude of 0 is -100 dBm, one of 1 is 0 dBm, as NeRF² scales its readings [dB]."""
+
+
+class MeanAmplitude(Pooling):
+    """100 (mean |C_0 + j C_1| - 1) [dBm], the mean over the grid.
+
+    Args:
+        grid: Rows and columns of the map over the full sphere, ``Grid.sphere``, whose pixels have equal solid angles.
+
+    Source: GSRF (NeurIPS 2025); the scale of NeRF² (MobiCom 2023).
+    """
+
+    channels = 2
+
+    def __init__(self, grid: list[int]):
+        super().__init__()
+        self.grid = sphere("pooling.grid", grid)
+
+    def forward(
+        self, image: Float[Tensor, "b 2 rows columns"], query: Query, directions: Directions | None = None
+    ) -> Float[Tensor, "b"]:
+        """Level [dBm], float32 where the map is of half precision; where the map is 0, so is its gradient."""
+        image = image.to(torch.promote_types(image.dtype, torch.float32))
+        return RANGE * (torch.complex(*image.unbind(1)).abs().mean((1, 2)) - 1)
