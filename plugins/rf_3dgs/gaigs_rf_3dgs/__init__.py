@@ -1,0 +1,102 @@
+"""RF-3DGS: first where the Gaussians are, then what they send by radio."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from gaigs.data import Links
+from gaigs.gaussians import SH_DC
+from gaigs.model.gaigs import GaussianSplatting
+from gaigs.query import Batch
+from gaigs.registry import call
+from gaigs.scene import Scene
+from gaigs_rf_3dgs.geometry import read_geometry
+
+GREY = 0.5
+"""What each Gaussian sends when its harmonics are reset, as colours of 3-D Gaussian splatting are then."""
+
+GEOMETRY = ("means", "quats", "log_scales")
+"""Parameters that the second stage leaves as they are."""
+
+
+class Rf3dgs(GaussianSplatting):
+    """The splatting pipeline, trained in two stages.
+
+    1. Geometry. Without a file everything is trained, and each Gaussian sends alike for all transmitters, as a
+       photograph shows the room whoever sends: what is learnt is what the training spectra have in common. With a
+       file there is no training: Gaussians stand at its points.
+    2. Radio. Centres, orientations and scales are frozen and the signal is reset. Trained are opacities and spherical
+       harmonics over the direction in which a transmitter sees a Gaussian.
+
+    Args:
+        scene: Receivers and task.
+        geometry: File with the room's points, mesh or splats, see ``gaigs_rf_3dgs.geometry``; None for none.
+        first_stage: Share of the training that the first stage takes without a file.
+        **options: As ``GaussianSplatting`` has them.
+
+    Raises:
+        ValueError: The labels are no spectra, or an option is out of range.
+
+    Source: RF-3DGS (arXiv 2411.19420), where the receiver moves and the transmitter stands still.
+    """
+
+    name = "rf_3dgs"
+
+    def __init__(self, scene: Scene, geometry: str | None, first_stage: float, **options):
+        if scene.task.directions is None:
+            raise ValueError(
+                f"model 'rf_3dgs' learns from spectra, and labels of task {scene.task.name!r} are none; use another "
+                "model"
+            )
+        if not 0 < first_stage < 1:
+            raise ValueError(f"model.first_stage must lie between 0 and 1, got {first_stage}")
+        call(f"model {self.name!r}", super().__init__, options, scene=scene)
+        self.geometry, self.first_stage, self.degree = geometry, first_stage, self.gaussians.degree
+        self.register_buffer("stage", torch.tensor(1))
+        self.register_load_state_dict_post_hook(lambda module, _: module._enter())
+        self._enter()
+
+    @torch.no_grad()
+    def fit(self, links: Links) -> None:
+        """As the pipeline's; and puts the Gaussians where the file has them."""
+        super().fit(links)
+        if self.geometry is None:
+            return
+        gaussians, logit = self.gaussians, self.gaussians.opacity_logits[0].clone()
+        found = read_geometry(Path(self.geometry), len(gaussians))
+        gaussians.resize(len(found.means))
+        gaussians.opacity_logits.fill_(logit)
+        self._reset()
+        for name, values in found._asdict().items():
+            if values is not None:
+                getattr(gaussians, name).copy_(values)
+
+    @property
+    def revisions(self) -> tuple[float, ...]:
+        return (self.first_stage if self.geometry is None else 0.0,)
+
+    def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
+        """Begins the second stage."""
+        self.stage.fill_(2)
+        self._enter()
+        self._reset()
+        return f"geometry of {len(self.gaussians)} Gaussians frozen; harmonics of degree {self.degree} from here on"
+
+    def facts(self) -> dict[str, object]:
+        """Beside the rasterizer: the stage that the model is of, and where its geometry is from."""
+        source = "training spectra" if self.geometry is None else Path(self.geometry).name
+        return super().facts() | {"stage": int(self.stage), "geometry": source}
+
+    def _enter(self) -> None:
+        """Has count, and be trained, what the stage says."""
+        is_radio = int(self.stage) == 2
+        self.gaussians.degree = self.degree if is_radio else 0
+        for name in GEOMETRY:
+            getattr(self.gaussians, name).requires_grad_(not is_radio)
+
+    @torch.no_grad()
+    def _reset(self) -> None:
+        nn.init.zeros_(self.gaussians.signal)
+        self.gaussians.signal[..., 0] = GREY / SH_DC
