@@ -1,0 +1,81 @@
+"""NeRF²: a radiance field of radio waves, two networks along rays from the receivers."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import leaky_relu, linear, relu
+
+from gaigs.query import Query
+from gaigs.scene import Scene
+from gaigs.tokenizer.euclidean import fourier_features
+from gaigs_nerf2.marching import RayMarching, Samples, render
+
+__all__ = ["Nerf2", "RayMarching", "Samples", "amplitudes_and_phases", "render"]
+
+
+class Nerf2(RayMarching):
+    """Place -> attenuation and a feature; feature, direction and transmitter -> what is sent along the ray.
+
+    The first network's input joins its layers again halfway. The second has a layer of ``width`` and one of half of it.
+
+    Args:
+        scene: Receivers, task, carrier.
+        samples, far, rays, frequency: See ``RayMarching``.
+        octaves: Of the features sin 2^k x and cos 2^k x of positions [m] and directions, k from 0.
+        width, layers: Of the first network.
+
+    Raises:
+        ValueError: See ``RayMarching``.
+
+    Source: NeRF², 2023.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        samples: int,
+        far: float | None,
+        rays: list[int],
+        frequency: float,
+        octaves: int,
+        width: int,
+        layers: int,
+    ):
+        super().__init__(scene, samples, far, rays, frequency)
+        for option, value, least in (("octaves", octaves, 0), ("width", width, 2), ("layers", layers, 2)):
+            if value < least:
+                raise ValueError(f"model.{option} must be at least {least}, got {value}")
+        self.register_buffer("frequencies", 2.0 ** torch.arange(octaves), persistent=False)
+        features = 3 * (1 + 2 * octaves)
+        self.joint = layers // 2
+        inputs = [features, *[width] * (layers - 1)]
+        inputs[self.joint] += features
+        self.layers = nn.ModuleList(nn.Linear(size, width) for size in inputs)
+        self.attenuate, self.feature = nn.Linear(width, 2), nn.Linear(width, width)
+        self.parts = width, features, features  # of what the second network's first layer takes
+        self.join = nn.Linear(sum(self.parts), width)
+        self.send = nn.Sequential(
+            nn.Linear(width, width // 2), nn.ReLU(), nn.Linear(width // 2, 2 * self.reading.channels)
+        )
+
+    def sample(self, query: Query, points: Float[Tensor, "r i 3"], views: Float[Tensor, "r 3"]) -> Samples:
+        places = fourier_features(points, self.frequencies)
+        hidden = places
+        for number, layer in enumerate(self.layers):
+            hidden = relu(layer(torch.cat((places, hidden), -1) if number == self.joint else hidden))
+        attenuations, turns = amplitudes_and_phases(self.attenuate(hidden))
+        # All links have in common what the layer makes of the ray: it is summed up part by part.
+        ray, view, transmitter = self.join.weight.split(self.parts, 1)
+        ray = linear(self.feature(hidden), ray, self.join.bias)
+        ray = ray + linear(fourier_features(views, self.frequencies), view)[:, None]
+        transmitter = linear(fourier_features(query.transmitters - self.middle, self.frequencies), transmitter)
+        amplitudes, phases = amplitudes_and_phases(self.send((ray + transmitter[:, None, None]).relu_()))
+        return Samples(attenuations[..., 0], turns[..., 0], amplitudes, phases)
+
+
+def amplitudes_and_phases(values: Float[Tensor, "*batch 2c"]) -> tuple[Tensor, Tensor]:
+    """|leaky ReLU| of the first half of what a network gives, 2 pi sigmoid of the second [rad]."""
+    amplitudes, phases = values.chunk(2, -1)
+    return leaky_relu(amplitudes).abs(), 2 * math.pi * phases.sigmoid()

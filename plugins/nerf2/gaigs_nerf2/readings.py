@@ -1,0 +1,168 @@
+"""What a receiver makes of the rays that reach it: a spectrum, a level or a channel."""
+
+import math
+
+import torch
+from jaxtyping import Complex, Float
+from scipy.constants import speed_of_light
+from torch import Tensor, nn
+
+from gaigs.data import Links
+from gaigs.directions import Directions, Grid
+from gaigs.propagation import array_sign, check_elements, direct_waves, phase_sign
+from gaigs.query import Query
+from gaigs.scene import Scene
+
+REACH = 0.025
+"""What a sample adds to a spectrum falls with the distance as 0.025 m / t, as published: lambda / (4 pi) at about
+920 MHz."""
+
+
+class Reading(nn.Module):
+    """What S, the sums along rays, are to the label.
+
+    Attributes:
+        channels: Numbers that a sample has an amplitude and a phase of.
+        grid: The rays, where labels have no directions; None where they have.
+        carriers: Whose phase turns along the rays (channels,) [Hz]; None where it is part of what is learnt.
+    """
+
+    channels = 1
+    grid: Grid | None = None
+    carriers: Tensor | None = None
+
+    def fit(self, links: Links) -> None:
+        """Takes what the training links say of themselves; by default nothing."""
+
+    def gains(self, distances: Float[Tensor, "i"]) -> Float[Tensor, "i"]:
+        """By which factor what a sample sends arrives from so far [m]."""
+        return torch.ones_like(distances)
+
+    def shifts(self, distances: Float[Tensor, "i"]) -> Float[Tensor, "i c"]:
+        """How far the phase turns on the way 2 pi t / lambda [rad]."""
+        if self.carriers is None:
+            return torch.zeros_like(distances[:, None])
+        return 2 * math.pi / speed_of_light * distances[:, None] * self.carriers.to(distances)
+
+    def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
+        """Magnitudes of S, or of what the rays add up to, that would give these labels."""
+        raise NotImplementedError
+
+    def forward(self, sums: Complex[Tensor, "b r c"], query: Query, directions: Directions) -> Tensor:
+        """Values of links to one receiver (b, ...)."""
+        raise NotImplementedError
+
+
+class Spectrum(Reading):
+    """|S(u)| in each direction u."""
+
+    def gains(self, distances: Float[Tensor, "i"]) -> Float[Tensor, "i"]:
+        return REACH / distances
+
+    def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
+        return labels
+
+    def forward(self, sums: Complex[Tensor, "b r 1"], query: Query, directions: Directions) -> Tensor:
+        return sums[..., 0].abs().unflatten(1, directions.shape)
+
+
+class Level(Reading):
+    """100 (|sum_u S(u)| - 1) [dBm]: the sum's magnitude is 0 for -100 dBm and 1 for 0 dBm.
+
+    Args:
+        grid: Of the rays.
+        frequency: Of the carrier [Hz].
+    """
+
+    def __init__(self, grid: Grid, frequency: float):
+        super().__init__()
+        self.grid, self.carriers = grid, torch.tensor([frequency], dtype=torch.float64)
+
+    def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
+        return 1 + labels / 100
+
+    def forward(self, sums: Complex[Tensor, "b r 1"], query: Query, directions: Directions) -> Tensor:
+        return 100 * (sums.sum((1, 2)).abs() - 1)
+
+
+class Channel(Reading):
+    """F(f) sum_u a(u) exp(-j 2 pi f x_e . u / c) S(u, f) at the element e and the subcarrier f.
+
+    a is the elements' pattern and x_e an element's place. F is the wave of free space over the direct distance. Where
+    the training channels' phases fall with the distance, as for the time dependence exp(+j omega t), the sum is the
+    complex conjugate. Where they follow it with neither sign, F is its amplitude alone.
+
+    Args:
+        grid: Of the rays.
+        scene: Its task has the subcarriers, its receivers the elements.
+
+    Raises:
+        ValueError: An array has another number of elements than the labels.
+    """
+
+    def __init__(self, grid: Grid, scene: Scene):
+        super().__init__()
+        check_elements("marching along rays", scene)
+        self.scene, self.grid, self.carriers = scene, grid, scene.task.frequencies
+        self.channels = len(self.carriers)
+        self.register_buffer("sign", torch.tensor(-1))  # of F; 0: its amplitude alone
+        self.register_buffer("array_sign", torch.tensor(-1))
+
+    def fit(self, links: Links) -> None:
+        """Takes the signs of phases from the training channels."""
+        train = links.split.train
+        labels, query = links.labels[train].to(torch.complex128), links.query[train]
+        waves = direct_waves(self.scene, query, self.carriers)
+        self.sign.fill_(phase_sign(labels, waves, query.receivers))
+        self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))
+
+    def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
+        return (labels / self._direct(query)).abs()
+
+    def forward(self, sums: Complex[Tensor, "b r c"], query: Query, directions: Directions) -> Tensor:
+        receiver = int(query.receivers[0]) if len(query) else 0
+        array, directions = self.scene.receivers[receiver].array, directions.flatten().vectors().double()
+        # A wave from the direction u reaches an element at x earlier by x . u / c than the middle.
+        delays = directions @ array.elements.to(directions).T / speed_of_light
+        phases = -2 * math.pi * self.carriers.to(directions)[:, None, None] * delays
+        steering = torch.polar(array.gain(directions)[:, None].expand_as(phases), phases).to(sums)  # (c, r, e)
+        heard = (sums.permute(2, 0, 1) @ steering).permute(1, 2, 0)
+        if self.array_sign < 0:
+            heard = heard.conj()
+        return heard * self._direct(query).to(sums)
+
+    def _direct(self, query: Query) -> Complex[Tensor, "b 1 c"]:
+        return direct_waves(self.scene, query, self.carriers, int(self.sign), at_elements=False)
+
+
+def make_reading(scene: Scene, rays: list[int], frequency: float) -> Reading:
+    """The reading of a scene's labels.
+
+    Args:
+        scene: Receivers and task.
+        rays: Rows and columns of the rays over the sphere, where labels have no directions.
+        frequency: Carrier of levels whose data say none [Hz].
+
+    Raises:
+        ValueError: The labels are no spectra, levels or channels, or of several carriers; an option is out of range.
+    """
+    task = scene.task
+    if scene.has_band:
+        raise ValueError(
+            f"a radiance field is of one carrier, and these links have {len(scene.frequencies)}; take another model"
+        )
+    if len(rays) != 2:
+        raise ValueError(f"model.rays must be [rows, columns], got {rays}")
+    if not 0 < frequency < math.inf:
+        raise ValueError(f"model.frequency must be positive [Hz], got {frequency}")
+    match task.name:
+        case "spectrum":
+            return Spectrum()
+        case "rssi":
+            return Level(Grid.sphere(*rays), scene.frequencies[0].item() if len(scene.frequencies) else frequency)
+        case "csi":
+            return Channel(Grid.sphere(*rays), scene)
+    raise ValueError(
+        f"a radiance field is marched for spectrum, rssi and csi, and these labels are of task {task.name!r}; take "
+        "another model"
+    )
