@@ -1,0 +1,198 @@
+"""NeWRF: its sum against a float64 transcription of the published equation, the arrivals it finds, and its refusals."""
+
+import cmath
+import functools
+import itertools
+import math
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from splatting import build, composed, run
+
+from gaigs.data.synthetic.image_source import Room, respond
+from gaigs.geometry import Pose
+from gaigs.query import Batch, Query
+from gaigs.scene import Array, Receiver
+from gaigs.task.csi import Csi
+from gaigs.testing import check_model, example_links
+
+SMALL = ("model=newrf", "model.arrivals=3", "model.samples=4", "model.octaves=2", "model.width=8", "model.layers=5")
+LIGHT = 299792458.0
+LINKS = example_links("csi")
+
+
+@functools.cache
+def options():
+    return composed("data=synthetic_csi", *SMALL)["model"]
+
+
+def make(scene=LINKS.scene, **changes):
+    return build("model", options() | changes, scene=scene)
+
+
+@pytest.fixture
+def package():
+    """The module that has the model."""
+    return sys.modules[type(make()).__module__]
+
+
+def test_it_keeps_the_contract_of_models():
+    check_model(make, LINKS)
+
+
+# --- the sum ---
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_channels_are_the_published_sum(package, sign):
+    generator = torch.Generator().manual_seed(sign + 1)
+    random = lambda *shape: torch.rand(*shape, generator=generator)
+    fields = torch.complex(2 * random(2, 3, 6, 4) - 1, 2 * random(2, 3, 6, 4) - 1)
+    depths, frequencies = 3 * random(2, 3, 6) ** 3, torch.tensor([2.4e9, 2.41e9, 2.45e9], dtype=torch.float64)
+    depths[0, :, -1] = torch.inf
+    distances = random(2, 3, 6).double().add(0.1).cumsum(-1)
+    expected = torch.zeros(2, 4, 3, dtype=torch.complex128)
+    for b, e, (s, f) in itertools.product(range(2), range(4), enumerate(frequencies.tolist())):
+        for k in range(3):
+            passed = 1.0
+            for i in range(6):
+                z, alpha = distances[b, k, i].item(), 1 - math.exp(-depths[b, k, i].item())
+                loss = LIGHT / (4 * math.pi * f * z)
+                way = cmath.exp(sign * 2j * math.pi * f * z / LIGHT)
+                expected[b, e, s] += fields[b, k, i, e].item() * loss * alpha * passed * way
+                passed *= 1 - alpha
+    found = package.render(fields, depths, distances, frequencies, sign)
+    torch.testing.assert_close(found, expected.to(torch.complex64), rtol=0, atol=1e-4 * expected.abs().max().item())
+
+
+def test_opaque_and_empty_samples_have_finite_gradients(package):
+    depths = torch.tensor([[[0.0, 1e-9, 200.0, 0.0, 50.0, torch.inf]]], requires_grad=True)
+    fields = torch.ones(1, 1, 6, 1, dtype=torch.complex64, requires_grad=True)
+    distances = torch.tensor([[[0.0, 0.1, 0.2, 0.3, 0.4, 0.5]]], dtype=torch.float64)
+    channels = package.render(fields, depths, distances, torch.tensor([1e9]).double())
+    channels.abs().square().sum().backward()
+    assert channels.isfinite().all()
+    assert depths.grad.isfinite().all()
+    assert fields.grad.isfinite().all()
+
+
+def test_samples_lie_evenly_from_the_antenna_to_where_waves_arrive_from(package):
+    model, seen = make(), []
+    model.origins.add_(torch.arange(6).reshape(2, 3, 1))
+    field = model.fields[1]
+    field.register_forward_pre_hook(lambda module, inputs: seen.append(inputs))
+    query = LINKS.query[torch.tensor([1, 3])]
+    model(Batch(query))
+    ((places, views),) = seen
+    for b, k, i in itertools.product(range(2), range(3), range(4)):
+        way = model.origins[1, k] - query.transmitters[b]
+        place = query.transmitters[b] + way * (i + 1) / 4 - (LINKS.scene.lower + LINKS.scene.upper) / 2
+        torch.testing.assert_close(places[b, k, i, :3], place, rtol=0, atol=1e-5)
+        torch.testing.assert_close(views[b, k, i, :3], way / way.norm(), rtol=0, atol=1e-5)
+
+
+# --- arrivals ---
+
+ROOM = Room(size=(6.0, 5.0, 3.0), walls=("metal",) * 6)
+POSE = Pose.from_xyzw((1.5, 1.0, 1.2), (0, 0, 0, 1))
+
+
+def room_links(count, sign=-1, strength=1.0):
+    """Channels at two elements in a box of metal, single reflections alone; the receiver is well within the room."""
+    generator = torch.Generator().manual_seed(0)
+    places = torch.tensor([1.0, 1.0, 0.5]) + torch.rand(count, 3, generator=generator) * torch.tensor([4.0, 3.0, 2.0])
+    array, carrier = Array.planar(1, 2, 0.03), 5e9
+    offsets = torch.linspace(-5e8, 5e8, 41, dtype=torch.float64)
+    receiver = Receiver("middle", POSE, array)
+    channels = strength * respond(ROOM, places, receiver, carrier, offsets, 1)
+    channels = channels.conj() if sign > 0 else channels
+    links = replace(
+        LINKS,
+        query=Query(places, torch.zeros(count, dtype=torch.long)),
+        receivers=(receiver,),
+        labels=channels.to(torch.complex64),
+        task=Csi(2, carrier + offsets),
+        rows=None,
+    )
+    parts = torch.arange(count).split((count - 8, 4, 4))
+    return replace(links, split=replace(links.split, train=parts[0], validation=parts[1], test=parts[2]))
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_arrivals_are_the_receiver_and_its_images_in_the_walls(sign):
+    links = room_links(60, sign, strength=7.0)
+    model = make(links.scene, arrivals=7)
+    model.fit(links)
+    (x, y, z), (a, b, c) = POSE.position.tolist(), ROOM.size
+    images = [[x, y, z], [-x, y, z], [2 * a - x, y, z], [x, -y, z], [x, 2 * b - y, z], [x, y, -z], [x, y, 2 * c - z]]
+    found = model.origins[0]
+    torch.testing.assert_close(found[0], POSE.position)
+    apart = torch.cdist(torch.tensor(images), found).amin(1)
+    assert apart.max() < 0.1, f"images {apart.tolist()} m from what is found"
+    assert model.sign == sign
+    assert 5 < model.unit < 15
+
+
+def test_more_links_than_it_looks_at_and_receivers_that_nobody_trains():
+    links = room_links(300)
+    links = replace(links, receivers=(*links.receivers, replace(links.receivers[0], name="deaf")))
+    model = make(links.scene, arrivals=2)
+    model.fit(links)
+    assert (model.origins[0, 1] - POSE.position).norm() > 1
+    torch.testing.assert_close(model.origins[1], POSE.position.expand(2, 3))
+
+
+def test_it_learns_channels_of_free_space():
+    links = room_links(60)
+    direct = replace(ROOM, walls=("ceiling_board",) * 6)
+    labels = respond(direct, links.query.transmitters, links.receivers[0], 5e9, links.task.frequencies - 5e9, 0)
+    links = replace(links, labels=labels.to(torch.complex64))
+    model = make(links.scene, arrivals=1, width=32)
+    model.fit(links)
+    optimizer = torch.optim.Adam(model.parameters(), 1e-2)
+    batch = links.batch(links.split.train)
+    for _ in range(60):
+        errors = (model(batch).value - batch.labels).abs().square().sum((1, 2))
+        loss = (errors / batch.labels.abs().square().sum((1, 2))).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert loss < 0.2
+
+
+# --- runs and refusals ---
+
+
+def test_a_run_from_start_to_end(tmp_path, monkeypatch):
+    config, metrics, model = run(tmp_path, monkeypatch, "data=synthetic_csi", *SMALL)
+    assert config["loss"]["name"] == "nmse"
+    assert metrics["models"].keys() == {"newrf", "mean"}
+    assert type(model).__name__ == "NeWrf"
+    assert (model.origins[0].diff(dim=0).norm(dim=1) > 0.1).all()
+
+
+@pytest.mark.parametrize("task", ["spectrum", "rssi"])
+def test_labels_without_delays_are_refused(task):
+    with pytest.raises(ValueError, match=f"model 'newrf' gives complex channels, and labels of task '{task}' are none"):
+        make(example_links(task).scene)
+
+
+def test_a_single_subcarrier_is_refused():
+    scene = replace(LINKS.scene, task=Csi(4, torch.tensor([2.4e9])))
+    with pytest.raises(ValueError, match="delays, which a single subcarrier does not tell; take another model"):
+        make(scene)
+
+
+def test_several_carriers_are_refused():
+    scene = replace(LINKS.scene, frequencies=torch.tensor([1e9, 2e9]))
+    with pytest.raises(ValueError, match="of one carrier, and these links have 2; take another model"):
+        make(scene)
+
+
+@pytest.mark.parametrize("option", ["arrivals", "samples", "octaves", "view_octaves", "width", "layers"])
+def test_options_out_of_range(option):
+    least = {"samples": 2, "octaves": 0, "view_octaves": 0}.get(option, 1)
+    with pytest.raises(ValueError, match=f"model.{option} must be at least {least}, got {least - 1}"):
+        make(**{option: least - 1})
