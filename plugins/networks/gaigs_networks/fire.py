@@ -1,0 +1,71 @@
+"""FIRE: a variational auto-encoder of labels, told where the transmitter stands."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.model import Prediction
+from gaigs.query import Batch
+from gaigs.scene import Scene
+from gaigs_networks.network import Network, check_widths, linear_layers
+
+
+class Fire(Network):
+    """While it is trained an encoder sees the label, and a decoder draws it anew from what the encoder lets through.
+
+    With y the label's image and c the link's numbers, a step draws z ~ N(mu(y, c), exp(lambda(y, c))), predicts the
+    decoder's image of (z, c), and is charged for what z tells,
+
+        KL = sum_i (mu_i² + exp(lambda_i) - lambda_i - 1) / 2   [nat]
+
+    A prediction has no label to look at, and takes the mean of the prior, z = 0.
+
+    The penalty ``kl`` is KL over the count of numbers in an image, in the unit of a mean squared error: times the
+    variance of the labels; of complex ones times 1, as their error is relative to their power. With the weight 2 s, it
+    is the bound on the likelihood of labels with independent noise of s times their variance.
+
+    Args:
+        scene: Receivers, task, box of the training transmitters.
+        widths: Of the encoder's layers; those of the decoder are the same in reverse, before its last one.
+        latent: Length of z.
+        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a metre; None: those that
+            the training transmitters can teach.
+        pixel: Of the images that spectra are drawn in [deg].
+
+    Raises:
+        ValueError: An option is out of range.
+
+    Source: Liu et al., FIRE, 2021; conditioned as in Sohn et al., Learning Structured Output Representation using Deep
+        Conditional Generative Models, 2015.
+    """
+
+    def __init__(self, scene: Scene, widths: list[int], latent: int, octaves: tuple[int, int] | None, pixel: float):
+        super().__init__(scene, octaves, pixel)
+        check_widths(widths=widths, latent=latent)
+        numbers, told = math.prod(self.label.shape), self.question.width
+        self.latent = latent
+        self.encoder = linear_layers([numbers + told, *widths], nn.LeakyReLU())
+        self.posterior = nn.Linear(widths[-1], 2 * latent)
+        decoder = linear_layers([latent + told, *reversed(widths)], nn.LeakyReLU())
+        self.decoder = nn.Sequential(decoder, nn.Linear(widths[0], numbers), nn.Unflatten(1, self.label.shape))
+
+    def forward(self, batch: Batch) -> Prediction:
+        told = self.question(batch.query)
+        z, penalties = told.new_zeros(len(told), self.latent), {}
+        if self.training and batch.labels is not None:
+            z, kl = self.encode(self.label.own_images(batch.labels, batch.directions), told)
+            unit = 1.0 if batch.labels.is_complex() else self.label.scale.square()
+            penalties["kl"] = unit * kl.mean() / math.prod(self.label.shape)
+        images = self.decoder(torch.cat((z, told), 1))
+        return Prediction(self.label.values(images, batch.directions), penalties)
+
+    def encode(
+        self, images: Float[Tensor, "b channels rows columns"], told: Float[Tensor, "b width"]
+    ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b"]]:
+        """A random z of each label, and how much it tells [nat]."""
+        seen = self.encoder(torch.cat((images.flatten(1), told), 1))
+        mean, log_variance = self.posterior(seen).chunk(2, 1)
+        kl = (mean.square() + log_variance.exp() - log_variance - 1).sum(1) / 2
+        return mean + (log_variance / 2).exp() * torch.randn_like(mean), kl

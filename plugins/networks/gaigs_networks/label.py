@@ -1,0 +1,134 @@
+"""Labels as the images that networks draw: a spectrum in fewer pixels, a level in one, a channel in two colours."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.data import Links
+from gaigs.directions import Directions, Grid
+from gaigs.scene import Scene
+
+PART = 256
+"""Labels held in memory at a time: a spectrum takes 130 KB."""
+
+
+class LabelImage(nn.Module):
+    """A label as an image, of mean 0 and variance 1 over the training links.
+
+    | label | rows | columns | channels |
+    |---|---|---|---|
+    | spectrum | elevations | azimuths | 1 |
+    | one number a link | 1 | 1 | 1 |
+    | complex channel | elements | subcarriers | 2: real and imaginary part |
+
+    A spectrum's image has every so-manieth row and column of the label, and between them it is interpolated linearly.
+    Complex labels are scaled to a mean power of 1 and not shifted: 0 means the same at every phase.
+
+    Args:
+        scene: Whose labels.
+        pixel: Of a spectrum's image: from one row or column to the next, at most [deg]; never less than the label's.
+
+    Attributes:
+        shape: Channels, rows, columns.
+        grid: Directions of the pixels; None where a label has none.
+
+    Raises:
+        ValueError: ``pixel`` is not positive.
+    """
+
+    def __init__(self, scene: Scene, pixel: float):
+        super().__init__()
+        if not 0 < pixel < math.inf:
+            raise ValueError(f"model.pixel must be positive and finite [deg], got {pixel}")
+        self.task, self.grid = scene.task, None
+        shape = scene.task.shape
+        rows, columns = (shape[0], math.prod(shape[1:])) if len(shape) > 1 else (1, math.prod(shape))
+        if scene.task.directions is not None:
+            own = scene.task.directions
+            self.grid = own.thin(every(own.elevations, pixel), every(own.azimuths, pixel))
+            rows, columns = self.grid.shape
+        self.shape = (2 if scene.task.dtype.is_complex else 1, rows, columns)
+        self.register_buffer("mean", torch.tensor(0.0))
+        self.register_buffer("scale", torch.tensor(1.0))
+
+    def fit(self, links: Links) -> None:
+        """Takes mean and scale from the training links."""
+        total, power, count = 0.0, 0.0, 0
+        for index in links.split.train.split(PART):
+            labels = links.labels[index]
+            labels = labels.to(torch.promote_types(labels.dtype, torch.float64))
+            total += 0.0 if labels.is_complex() else labels.sum().item()
+            power += labels.abs().square().sum().item()
+            count += labels.numel()
+        mean = total / count
+        variance = power / count - mean**2
+        self.mean.fill_(mean)
+        self.scale.fill_(math.sqrt(variance) if variance > 0 else 1.0)  # labels may all be the same
+
+    def values(self, images: Float[Tensor, "b channels rows columns"], directions: Directions | None) -> Tensor:
+        """The labels that images stand for (b, *shape), of spectra in the directions asked for; None: the label's."""
+        images = images * self.scale + self.mean
+        if self.grid is not None:
+            return interpolate(images[:, 0], self.grid, directions or self.task.directions)
+        numbers = torch.complex(*images.unbind(1)) if self.task.dtype.is_complex else images
+        return numbers.reshape(len(images), *self.task.shape)
+
+    def images(self, labels: Tensor, directions: Directions | None) -> Float[Tensor, "b channels rows columns"]:
+        """The images of labels, those of spectra with a pixel for each of the directions that the labels have.
+
+        Raises:
+            ValueError: The labels are of single directions, which make no image.
+        """
+        if self.grid is not None and not isinstance(directions, Grid):
+            raise ValueError(
+                "a network that looks at labels needs rows and columns, and training.thinning.rays draws single "
+                "directions; set training.thinning.rays=null"
+            )
+        channels, rows, columns = self.shape if self.grid is None else (1, *directions.shape)
+        numbers = torch.view_as_real(labels).movedim(-1, 1) if labels.is_complex() else labels
+        return ((numbers - self.mean) / self.scale).reshape(len(labels), channels, rows, columns)
+
+    def own_images(self, labels: Tensor, directions: Directions | None) -> Float[Tensor, "b channels rows columns"]:
+        """The same in the pixels that images have here, whichever directions the labels have."""
+        images = self.images(labels, directions)
+        return images if self.grid is None else interpolate(images[:, 0], directions, self.grid)[:, None]
+
+
+def every(angles: Float[Tensor, "n"], pixel: float) -> slice:
+    """Those of a label's rows or columns that are not more than a pixel apart [rad, deg]."""
+    pitch = (angles.max() - angles.min()).item() / max(len(angles) - 1, 1)
+    # A hundredth more: four rows of a degree in float32 may be more than 4 degrees apart.
+    return slice(None, None, max(1, int(1.01 * math.radians(pixel) / pitch)) if pitch else 1)
+
+
+def interpolate(values: Float[Tensor, "b rows columns"], grid: Grid, directions: Directions) -> Float[Tensor, "b ..."]:
+    """Values between a grid's pixels, linearly; beyond its first and last row they are those of that row.
+
+    Azimuths go round: between the last column and the first one lie pixels like any others.
+    """
+    rows = shares(grid.elevations, directions.elevations).to(values)
+    columns = shares(grid.azimuths, directions.azimuths, period=2 * math.pi).to(values)
+    if isinstance(directions, Grid):
+        return rows @ values @ columns.mT
+    return (rows @ values * columns).sum(-1)
+
+
+def shares(known: Float[Tensor, "n"], asked: Float[Tensor, "k"], period: float | None = None) -> Float[Tensor, "k n"]:
+    """Which share each of some known angles has in the value at an angle asked for [rad], float64."""
+    count = len(known)
+    known, order = known.double().sort()
+    asked = asked.to(known)
+    if period is None:
+        asked = asked.clamp(known[0], known[-1])
+    else:
+        asked = known[0] + (asked - known[0]).remainder(period)
+        known, order = torch.cat((known, known[:1] + period)), torch.cat((order, order[:1]))
+    if len(known) == 1:
+        return torch.ones_like(asked)[:, None]
+    above = torch.searchsorted(known, asked, right=True).clamp(max=len(known) - 1)
+    share = (asked - known[above - 1]) / (known[above] - known[above - 1])
+    found = asked.new_zeros(len(asked), count)
+    found.scatter_add_(1, order[above - 1][:, None], 1 - share[:, None])
+    return found.scatter_add_(1, order[above][:, None], share[:, None])

@@ -1,0 +1,514 @@
+"""The networks: formulas against plain loops in float64, contracts, refusals, and a short run of each on each task."""
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from scipy.interpolate import BSpline
+
+import gaigs
+from gaigs import configuration, evaluation, experiment
+from gaigs.query import Batch, Query
+from gaigs.registry import registry
+from gaigs.task.scalar import Scalar
+from gaigs.testing import check_model, example_links
+
+ROOT = Path(__file__).parents[2]
+TASKS = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
+"""The data set that brings a task."""
+
+SHARED = {"octaves": [-2, 0], "pixel": 20.0}
+SMALL = {
+    "mlp": {"widths": [6, 5], "dropout": 0.25},
+    "fire": {"widths": [8, 7, 6], "latent": 3},
+    "dcgan": {"width": 2, "noise": 3},
+    "wrf_kan": {"widths": [5, 4], "intervals": 4},
+}
+LINKS = {task: example_links(task) for task in TASKS}
+every_system = pytest.mark.parametrize("name", SMALL)
+
+
+@pytest.fixture(autouse=True)
+def place(monkeypatch):
+    """The root of the repository, where the package is found by name."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "path", sys.path[:])  # the registry appends to it
+
+
+def build(name, scene, **options):
+    torch.manual_seed(0)
+    return registry("model").build({"name": name} | SHARED | SMALL[name] | options, scene=scene)
+
+
+def fitted(name, task, **options):
+    model = build(name, LINKS[task].scene, **options)
+    model.fit(LINKS[task])
+    return model
+
+
+def doubled(model):
+    """In float64, with statistics as a training leaves them."""
+    generator = torch.Generator().manual_seed(1)
+    for part in model.modules():
+        if isinstance(part, torch.nn.BatchNorm1d):
+            part.running_mean.normal_(generator=generator)
+            part.running_var.uniform_(0.5, 2, generator=generator)
+            part.weight.data.uniform_(0.5, 2, generator=generator)
+            part.bias.data.normal_(generator=generator)
+    return model.double().eval()
+
+
+def numbers(module):
+    """Parameters and buffers in numpy."""
+    return {name: value.detach().numpy() for name, value in module.state_dict().items()}
+
+
+def told(model, count=3):
+    width = model.question.width
+    return torch.randn(count, width, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+
+
+# --- contracts ---
+
+
+@every_system
+@pytest.mark.parametrize("task", TASKS)
+def test_they_keep_the_contract_of_models(name, task):
+    check_model(lambda scene: build(name, scene), LINKS[task])
+
+
+@every_system
+def test_several_carriers(name):
+    links = LINKS["rssi"]
+    frequencies = torch.tensor([2.4e9, 5.0e9, 5.8e9])[torch.arange(24) % 3]
+    check_model(lambda scene: build(name, scene), replace(links, query=replace(links.query, frequencies=frequencies)))
+
+
+@every_system
+def test_a_label_of_several_numbers(name):
+    class Triple(Scalar):
+        name, quantity, unit, error_unit = "triple", "level", "dBm", "dB"
+        shape = (3,)
+
+    links = replace(LINKS["rssi"], task=Triple(), labels=torch.randn(24, 3))
+    model = build(name, links.scene)
+    model.fit(links)
+    assert model.label.shape == (1, 1, 3)
+    assert model.train()(links.batch(torch.arange(5))).value.shape == (5, 3)
+
+
+@every_system
+@pytest.mark.parametrize("task", TASKS)
+def test_a_batch_of_one_link_trains(name, task):
+    model = fitted(name, task).train()
+    batch = LINKS[task].batch(torch.tensor([3]))
+    value, penalties = model(batch)
+    total = (value - batch.labels).abs().sum() + sum(penalties.values())
+    if name == "dcgan":
+        total = total + model.discriminate(batch, value).sum()
+    total.backward()
+    gradients = [parameter.grad for parameter in model.parameters()]
+    assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)
+    assert any((gradient != 0).any() for gradient in gradients)
+
+
+@every_system
+@pytest.mark.parametrize("task", TASKS)
+def test_they_learn(name, task):
+    """Labels that bend over the room are fitted to half of their mean's error."""
+    links = LINKS[task]
+    bend = (links.query.transmitters[:, 0] - 3) / 3
+    shape = [-1, *[1] * len(links.task.shape)]
+    labels = (0.5 + 0.3 * bend).reshape(shape).expand(-1, *links.task.shape).to(links.task.dtype)
+    links = replace(links, labels=labels if task != "rssi" else 20 * labels - 70)
+    model = build(name, links.scene, **({"dropout": 0.0} if name == "mlp" else {}))
+    model.fit(links)
+    model.train()
+    optimizer = torch.optim.Adam(model.parameter_groups()["network"], lr=2e-2)
+    batch = links.batch(links.split.train)
+    for _ in range(60):
+        value, penalties = model(batch)
+        loss = (value - batch.labels).abs().square().mean() + sum(penalties.values())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    error = (model.predict(batch.query) - batch.labels).abs().square().mean()
+    mean = (batch.labels - batch.labels.mean(0)).abs().square().mean()
+    assert error < mean / 2
+
+
+# --- what a network is told ---
+
+
+def moved(scene, by=0.0, factor=1.0):
+    return replace(scene, lower=factor * scene.lower + by, upper=factor * scene.upper + by)
+
+
+def test_places_are_told_relative_to_the_box():
+    scene, places = LINKS["rssi"].scene, LINKS["rssi"].query.transmitters
+    ask = lambda scene, places: build("mlp", scene).question(Query(places, torch.zeros(len(places), dtype=torch.long)))
+    answer = ask(scene, places)
+    torch.testing.assert_close(ask(moved(scene, by=7.0), places + 7), answer, rtol=0, atol=1e-4)
+    # The coordinates themselves keep their meaning in a larger box, their waves stay those of the same octaves.
+    torch.testing.assert_close(ask(moved(scene, factor=3.0), 3 * places)[:, :3], answer[:, :3], rtol=0, atol=1e-5)
+    middle, half = ((scene.lower + s * scene.upper).double().numpy() / 2 for s in (1, -1))
+    x = places.double().numpy() - middle
+    phases = (x[:, :, None] * 2 * math.pi * 2.0 ** np.arange(-2, 1)).reshape(len(x), -1)
+    expected = np.concatenate((x / np.abs(half).max(), np.sin(phases), np.cos(phases)), 1)
+    np.testing.assert_allclose(answer[:, :-2], expected, atol=1e-5)
+    assert answer[:, -2:].tolist() == [[1.0, 0.0]] * len(places)
+
+
+def test_a_flat_box():
+    scene = LINKS["rssi"].scene
+    flat = replace(scene, upper=torch.cat((scene.upper[:2], scene.lower[2:])))
+    assert build("mlp", flat).predict(LINKS["rssi"].query.transmitters).isfinite().all()
+
+
+def test_receivers_and_carriers_are_told():
+    scene = replace(LINKS["rssi"].scene, frequencies=torch.tensor([2.4e9, 5.0e9, 5.8e9]))
+    question = build("mlp", scene).question
+    place = torch.ones(3, 3)
+    answers = question(Query(place, torch.tensor([0, 1, 1]), torch.tensor([2.4e9, 2.4e9, 5.0e9])))
+    assert answers.shape == (3, question.width)
+    own, band = answers[:, 21:23], answers[:, 23:]
+    assert own.tolist() == [[1, 0], [0, 1], [0, 1]]
+    assert torch.equal(band[0], band[1])
+    assert (band[0] - band[2]).abs().max() > 0.1
+    with pytest.raises(ValueError, match="so a frequency must be given"):
+        question(Query(place, torch.tensor([0, 1, 1])))
+
+
+def test_one_receiver_needs_no_telling():
+    scene = LINKS["rssi"].scene
+    assert build("mlp", replace(scene, receivers=scene.receivers[:1])).question.width == 21
+
+
+def test_octaves_are_by_default_those_that_can_be_learnt():
+    scene = LINKS["spectrum"].scene
+    from gaigs.tokenizer.euclidean import learnable_octaves
+
+    found = build("mlp", scene, octaves=None).question.frequencies
+    assert torch.equal(found, build("mlp", scene, octaves=[*learnable_octaves(scene)]).question.frequencies)
+
+
+# --- labels as images ---
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_mean_and_scale_are_those_of_the_training_links(task):
+    links = LINKS[task]
+    label = fitted("mlp", task).label
+    labels = links.labels[links.split.train].numpy()
+    if task == "csi":
+        mean, scale = 0.0, np.sqrt((np.abs(labels) ** 2).mean())
+    else:
+        mean, scale = labels.mean(), labels.std()
+    assert label.mean.item() == pytest.approx(mean, rel=1e-5)
+    assert label.scale.item() == pytest.approx(scale, rel=1e-4)
+
+
+def test_labels_that_are_all_the_same():
+    links = replace(LINKS["rssi"], labels=torch.full((24,), -70.0))
+    model = build("mlp", links.scene)
+    model.fit(links)
+    assert (model.label.mean.item(), model.label.scale.item()) == (-70, 1)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_image_with_all_pixels_is_the_label(task):
+    links, label = LINKS[task], fitted("mlp", task, pixel=1.0).label
+    batch = links.batch(torch.arange(5))
+    images = label.own_images(batch.labels, batch.directions)
+    shapes = {"spectrum": (1, 18, 36), "rssi": (1, 1, 1), "csi": (2, 4, 5)}
+    assert images.shape == (5, *shapes[task]) == (5, *label.shape)
+    torch.testing.assert_close(label.images(batch.labels, batch.directions), images, rtol=0, atol=1e-5)
+    torch.testing.assert_close(label.values(images, batch.directions), batch.labels, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("pixel", "shape"), [(5.0, (18, 36)), (10.0, (9, 36)), (19.0, (6, 36)), (20.0, (5, 18))])
+def test_pixels_are_at_most_as_large_as_told(pixel, shape):
+    assert build("mlp", LINKS["spectrum"].scene, pixel=pixel).label.shape == (1, *shape)
+
+
+def test_between_pixels_spectra_are_linear_and_azimuths_go_round():
+    label = build("mlp", LINKS["spectrum"].scene).label.double()
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randn(1, *label.shape, dtype=torch.float64, generator=generator)
+    elevations, azimuths = (angles.double().numpy() for angles in (label.grid.elevations, label.grid.azimuths))
+    asked = LINKS["spectrum"].task.directions.flatten().to(torch.float64)
+    asked.azimuths += 0.1
+    found = label.values(image, asked)[0].numpy()
+    for value, elevation, azimuth in zip(found, asked.elevations.numpy(), asked.azimuths.numpy(), strict=True):
+        row = [np.interp(azimuth, azimuths, pixels, period=2 * np.pi) for pixels in image[0, 0].numpy()]
+        assert value == pytest.approx(np.interp(elevation, elevations, row), abs=1e-9)
+
+
+def test_labels_of_single_directions_make_no_image():
+    batch = LINKS["spectrum"].batch(torch.arange(4))
+    rays = Batch(batch.query, batch.directions.flatten()[:9], batch.labels.flatten(1)[:, :9])
+    for name in ("fire", "dcgan"):
+        model = build(name, LINKS["spectrum"].scene).train()
+        looks = {
+            "fire": lambda model=model: model(rays),
+            "dcgan": lambda model=model: model.discriminate(rays, rays.labels),
+        }
+        with pytest.raises(ValueError, match=r"needs rows and columns, .* set training\.thinning\.rays=null"):
+            looks[name]()
+
+
+# --- the formulas ---
+
+
+def leaky(x, slope=0.01):
+    return np.where(x > 0, x, slope * x)
+
+
+def normalised(x, part):
+    """By running statistics."""
+    return (x - part["running_mean"]) / np.sqrt(part["running_var"] + 1e-5) * part["weight"] + part["bias"]
+
+
+def test_the_mlp_is_the_formula():
+    model = doubled(build("mlp", LINKS["spectrum"].scene))
+    given = told(model)
+    x = given.numpy()
+    for layer in (0, 4):  # linear, normalised, rectified; a prediction leaves nothing out
+        linear, norm = (numbers(model.network[layer + i]) for i in (0, 1))
+        x = leaky(normalised(x @ linear["weight"].T + linear["bias"], norm))
+    head = numbers(model.network[8])
+    expected = (x @ head["weight"].T + head["bias"]).reshape(3, 1, 5, 18)
+    np.testing.assert_allclose(model.draw(given).detach(), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_dropout_is_for_the_training_alone():
+    batch = LINKS["rssi"].batch(torch.arange(8))
+    for dropout in (0.0, 0.5):
+        model = fitted("mlp", "rssi", dropout=dropout)
+        one, other = (model.train()(batch).value for _ in range(2))
+        assert torch.equal(one, other) == (dropout == 0)
+
+
+def test_a_kolmogorov_arnold_layer_is_the_formula():
+    model = doubled(build("wrf_kan", LINKS["rssi"].scene))
+    layer = model.network[1]
+    x = 0.7 * torch.randn(6, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    x[0] = torch.tensor([-1.0, 1.0, 0.0, 3.0, -3.0])
+    with torch.no_grad():
+        layer.splines.normal_()
+    base, coefficients = numbers(layer.base), layer.splines.detach().numpy().reshape(4, 5, 7)
+    knots = -1 + 0.5 * np.arange(-3, 8)
+    expected = np.zeros((6, 4))
+    for b in range(6):
+        for o in range(4):
+            expected[b, o] = base["bias"][o]
+            for i, value in enumerate(x[b].numpy()):
+                expected[b, o] += base["weight"][o, i] * value / (1 + np.exp(-value))
+                for k in range(7):
+                    spline = BSpline.basis_element(knots[k : k + 5], extrapolate=False)
+                    expected[b, o] += coefficients[o, i, k] * np.nan_to_num(spline(value))
+    np.testing.assert_allclose(layer(x).detach(), expected, rtol=1e-9, atol=1e-9)
+    inside = torch.linspace(-1, 1, 50, dtype=torch.float64)[None]
+    torch.testing.assert_close(layer.basis(inside).sum(-1), torch.ones_like(inside))
+
+
+def test_fire_draws_from_the_middle_of_the_prior():
+    model = doubled(build("fire", LINKS["csi"].scene))
+    given = LINKS["csi"].query[torch.arange(4)]
+    given = replace(given, transmitters=given.transmitters.double())
+    x = np.concatenate((np.zeros((4, 3)), model.question(given).numpy()), 1)
+    for layer in (0, 2, 4):
+        part = numbers(model.decoder[0][layer])
+        x = leaky(x @ part["weight"].T + part["bias"])
+    head = numbers(model.decoder[1])
+    drawn = (x @ head["weight"].T + head["bias"]).reshape(4, 2, 4, 5)
+    value = model(Batch(given)).value.detach()
+    np.testing.assert_allclose(value, drawn[:, 0] + 1j * drawn[:, 1], rtol=1e-9, atol=1e-9)
+    assert model(Batch(given)).penalties == {}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_what_the_encoder_lets_through_is_charged_for(task):
+    links = LINKS[task]
+    model = fitted("fire", task).train()
+    batch = links.batch(torch.arange(6))
+    torch.manual_seed(5)
+    value, penalties = model(batch)
+    given = model.question(batch.query)
+    seen = torch.cat((model.label.own_images(batch.labels, batch.directions).flatten(1), given), 1)
+    mean, log_variance = model.posterior(model.encoder(seen)).chunk(2, 1)
+    posterior = torch.distributions.Normal(mean, (log_variance / 2).exp())
+    kl = torch.distributions.kl_divergence(posterior, torch.distributions.Normal(0.0, 1.0)).sum(1).mean()
+    unit = 1.0 if task == "csi" else links.labels[links.split.train].var(correction=0)
+    expected = unit * kl / math.prod(model.label.shape)
+    torch.testing.assert_close(penalties["kl"], expected, rtol=1e-4, atol=1e-7)
+    torch.manual_seed(5)
+    images = model.decoder(torch.cat((posterior.rsample(), given), 1))
+    torch.testing.assert_close(value, model.label.values(images, batch.directions), rtol=1e-4, atol=1e-4)
+
+
+def test_fire_sees_thinned_labels_as_whole_ones():
+    """A label that is linear in elevation is the same seen in every so many rows."""
+    links = LINKS["spectrum"]
+    label = fitted("fire", "spectrum").label
+    grid = links.task.directions
+    labels = grid.elevations[:, None].expand(grid.shape)[None]
+    rows, columns = slice(0, None, 17), slice(2, None, 5)
+    thin = label.own_images(labels[:, rows, columns], grid.thin(rows, columns))
+    torch.testing.assert_close(thin, label.own_images(labels, grid), rtol=0, atol=1e-5)
+
+
+def transposed_by_loops(x, weight, bias, stride, padding):
+    (outs, rows, columns), (height, width) = (weight.shape[1], *x.shape[2:]), weight.shape[2:]
+    sizes = ((rows - 1) * stride[0] + height, (columns - 1) * stride[1] + width)
+    whole = np.zeros((len(x), outs, *sizes))
+    for r in range(rows):
+        for c in range(columns):
+            at = (slice(r * stride[0], r * stride[0] + height), slice(c * stride[1], c * stride[1] + width))
+            whole[:, :, at[0], at[1]] += np.einsum("bi,iohw->bohw", x[:, :, r, c], weight)
+    cut = (slice(padding[0], sizes[0] - padding[0]), slice(padding[1], sizes[1] - padding[1]))
+    return whole[:, :, cut[0], cut[1]] + bias[None, :, None, None]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_generator_is_four_transposed_convolutions(task):
+    model = doubled(build("dcgan", LINKS[task].scene))
+    given = told(model)
+    linear, *blocks = [part for part in model.generator if numbers(part)]
+    first = numbers(linear)
+    x = np.concatenate((np.zeros((3, 3)), given.numpy()), 1) @ first["weight"].T + first["bias"]
+    channels, rows, columns = model.label.shape
+    x = x.reshape(3, *{"spectrum": (16, 1, 2), "rssi": (16, 1, 1), "csi": (16, 1, 1)}[task])
+    assert len(blocks) == 8
+    for norm, layer in zip(blocks[::2], blocks[1::2], strict=True):
+        part = {name: value.reshape(-1, 1, 1) for name, value in numbers(norm).items()}
+        x = np.maximum(normalised(x, part), 0)
+        x = transposed_by_loops(x, **numbers(layer), stride=layer.stride, padding=layer.padding)
+    widths = [16, 8, 4, 2, channels]
+    assert [layer.in_channels for layer in blocks[1::2]] == widths[:-1]
+    assert x.shape[1:] == {"spectrum": (1, 8, 32), "rssi": (1, 1, 1), "csi": (2, 4, 8)}[task]
+    np.testing.assert_allclose(model.draw(given).detach(), x[..., :rows, :columns], rtol=1e-9, atol=1e-9)
+
+
+def test_the_generator_gets_noise_in_the_training_alone():
+    batch = LINKS["rssi"].batch(torch.arange(8))
+    model = fitted("dcgan", "rssi")
+    one, other = (model.train()(batch).value for _ in range(2))
+    assert not torch.equal(one, other)
+    one, other = (model.eval()(batch).value for _ in range(2))
+    assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_discriminator_looks_at_label_and_link(task):
+    model = fitted("dcgan", task).eval()
+    batch = LINKS[task].batch(torch.arange(6))
+    judge = lambda labels, query=batch.query: model.discriminate(replace(batch, query=query), labels)
+    own = judge(batch.labels)
+    assert own.shape == (6,)
+    assert (own - judge(batch.labels.flip(0))).abs().max() > 1e-6
+    other = Query(batch.query.transmitters + 1, batch.query.receivers)
+    assert (own - judge(batch.labels, other)).abs().max() > 1e-6
+    torch.testing.assert_close(own[2:3], model.discriminate(LINKS[task].batch(torch.tensor([2])), batch.labels[2:3]))
+    groups = model.parameter_groups()
+    gradients = torch.autograd.grad(own.square().sum(), groups["discriminator"])
+    assert all(gradient.isfinite().all() for gradient in gradients)
+    assert {*map(id, groups["discriminator"])}.isdisjoint(map(id, groups["network"]))
+
+
+@pytest.mark.parametrize("stride", range(1, 7))
+def test_the_discriminator_takes_labels_however_thin(stride):
+    links = LINKS["spectrum"]
+    model = fitted("dcgan", "spectrum", pixel=1.0)
+    thin = links.task.thinning(stride=stride)(links.batch(torch.arange(4)), torch.Generator().manual_seed(0))
+    assert model.discriminate(thin, thin.labels).isfinite().all()
+
+
+# --- options ---
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("mlp", {"octaves": [2, 1]}, r"model\.octaves must be \[lowest, highest\], got \[2, 1\]"),
+        ("mlp", {"pixel": 0.0}, r"model\.pixel must be positive and finite \[deg\], got 0\.0"),
+        ("mlp", {"pixel": math.inf}, r"model\.pixel must be positive"),
+        ("mlp", {"widths": []}, r"model\.widths must be of at least 1, got \[\]"),
+        ("mlp", {"widths": [4, 2.5]}, r"model\.widths must be of at least 1, got \[4, 2\.5\]"),
+        ("mlp", {"dropout": 1.0}, r"model\.dropout must be in \[0, 1\), got 1\.0"),
+        ("mlp", {"dropout": math.nan}, r"model\.dropout must be in"),
+        ("fire", {"widths": [4, 0, 4]}, r"model\.widths must be of at least 1"),
+        ("fire", {"latent": 0}, r"model\.latent must be of at least 1, got 0"),
+        ("dcgan", {"width": 0}, r"model\.width must be of at least 1"),
+        ("dcgan", {"noise": 0}, r"model\.noise must be of at least 1"),
+        ("wrf_kan", {"intervals": 0}, r"model\.intervals must be of at least 1"),
+        ("wrf_kan", {"widths": [-1]}, r"model\.widths must be of at least 1"),
+    ],
+)
+def test_options_out_of_range(name, options, message):
+    with pytest.raises(ValueError, match=message):
+        build(name, LINKS["spectrum"].scene, **options)
+
+
+# --- whole runs ---
+
+
+def composed(name, task):
+    configuration.install()
+    few = ["data.transmitters=20", "data.order=1", "split.validation=0.2", "trainer.max_steps=3"]
+    if task == "csi":
+        few.append("data.subcarriers=5")
+    if task == "spectrum":
+        few.append("training.thinning.stride=8")
+    quiet = [
+        "trainer.accelerator=cpu",
+        "trainer.val_check_interval=2",
+        "trainer.log_every_n_steps=1",
+        "trainer.enable_progress_bar=false",
+    ]
+    own = [f"model.{option}={value}" for option, value in SMALL[name].items()]
+    words = [
+        f"data={TASKS[task]}",
+        f"model={name}",
+        *few,
+        *quiet,
+        *own,
+        "training.batch_size=5",
+        "baselines=[{name: mean}]",
+    ]
+    with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
+        return OmegaConf.to_container(compose("config", words), resolve=True)
+
+
+LOSSES = {
+    "mlp": {"spectrum": "l1_ssim", "rssi": "squared", "csi": "nmse"},
+    "fire": {"spectrum": "squared", "rssi": "squared", "csi": "nmse"},
+    "dcgan": {"spectrum": "absolute", "rssi": "absolute", "csi": "nmse"},
+    "wrf_kan": {"spectrum": "l1_ssim", "rssi": "squared", "csi": "nmse"},
+}
+
+
+@every_system
+@pytest.mark.parametrize("task", TASKS)
+def test_a_run(name, task, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "write_figures", lambda *_: None)
+    config = composed(name, task)
+    assert config["loss"]["name"] == LOSSES[name][task]
+    assert config["training"]["name"] == ("adversarial" if name == "dcgan" else "descent")
+    metrics = experiment.run(config, tmp_path)
+    assert [*metrics["models"]] == [name, "mean"]
+    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
+    model = gaigs.load(tmp_path / "best.ckpt")
+    assert model.label.scale.item() != 1
+    with np.load(tmp_path / "predictions.npz") as run:
+        query = Query(torch.tensor(run["transmitters"]), torch.tensor(run["receiver"]))
+        frequency = model.scene.frequencies[:1].expand(len(query)) if len(model.scene.frequencies) else None
+        again = model.predict(replace(query, frequencies=frequency)).numpy()
+        np.testing.assert_allclose(run["prediction"], again, rtol=1e-3, atol=1e-3)
