@@ -1,0 +1,264 @@
+"""Ray tracing in a room whose geometry is known, with materials learnt from the training links or as tabulated."""
+
+import math
+
+import torch
+from jaxtyping import Complex, Float
+from scipy.constants import epsilon_0
+from torch import Tensor, nn
+
+from gaigs.data import Links
+from gaigs.data.sionna.meshes import THICKNESS, wavefront_obj
+from gaigs.data.sionna.tracing import frequency_offsets, respond
+from gaigs.data.synthetic.image_source import MATERIALS, Paths
+from gaigs.model import Model, Prediction
+from gaigs.pooling.array_response import ArrayResponse
+from gaigs.propagation import carriers, check_elements, direct_waves, free_space, phase_sign
+from gaigs.query import Batch, Query
+from gaigs.scene import Array, Scene
+
+from .fields import Slabs, gains, padded
+from .rooms import check_room, find_meshes, known_materials, read_obj
+from .tracer import Tracer, find_tracer
+
+NEPER = 20 / math.log(10)
+"""Of a field [dB]."""
+
+SILENT = 1e-15
+"""Share of the power sent that a receiver reports where no path leads: -150 dB, below the noise of any."""
+
+BATCH = 64
+"""Links that are fitted to at a time."""
+
+
+class RayTracing(Model):
+    """Paths by Sionna RT, waves summed up along them at each element of the receiver's array.
+
+    A path's points do not depend on what the surfaces are made of, so each link is traced once. Its gain follows from
+    Fresnel's formulas for slabs: each material's permittivity is 1 + (e - 1) a and its conductivity s b, with e and s
+    as tabulated and a, b learnt, 1 at the start. Diffracted paths keep the gain that they have at the start.
+
+        channels    h = g sum_p h_p at each element and subcarrier, one complex gain g for each receiver
+        RSSI        10 log10 of the mean of |h|^2 over the data's band; where that is unknown, the paths' powers add
+        spectra     the conventional beamformer's amplitude over the band, scaled as the labels are
+
+    ``fit`` takes each receiver's gain from the training links, their median: transmit power, cables and the clock's
+    phase. It is trained with the materials. All this is computed on the processor.
+
+    Args:
+        scene: Receivers and task.
+        room: ``built_in``, or a room of the data set ``sionna``.
+        mesh: File of one's own room instead (.obj, .ply, .xml) [m]; None for the room of that name. It is read in
+            ``fit``, and is in the state dict.
+        materials: Which tabulated material a material of the mesh is like, by its name there.
+        calibrate: Whether materials and gains are trained. Else materials are as tabulated, and nothing is trained.
+        frequency: Carrier of links whose data say none [Hz]; None where they do.
+        depth: Largest number of reflections, passages through surfaces and diffractions of a path.
+        rays: That leave each transmitter.
+
+    Raises:
+        ValueError: The room is unknown, an option is out of range, or the labels are neither spectra, nor RSSI, nor
+            channels of the receivers' arrays.
+
+    Source: Sionna RT technical report, arXiv:2504.21719; slabs and materials as in ITU-R P.2040-3.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        room: str,
+        mesh: str | None,
+        materials: dict,
+        calibrate: bool,
+        frequency: float | None,
+        depth: int,
+        rays: int,
+    ):
+        super().__init__(scene)
+        if mesh is None:
+            check_room(room)
+        if frequency is not None and not 0 < frequency < math.inf:
+            raise ValueError(f"model.frequency must be positive [Hz], or null, got {frequency}")
+        if not 1 <= depth <= 8:
+            raise ValueError(f"model.depth must be in 1..8, got {depth}")
+        if rays < 1:
+            raise ValueError(f"model.rays must be at least 1, got {rays}")
+        self.room, self.mesh, self.materials = room, mesh, materials
+        self.frequency, self.depth, self.rays = frequency, depth, rays
+        self.beamformer = None
+        if scene.task.dtype.is_complex:
+            check_elements("model 'ray_tracing'", scene)
+        elif scene.task.directions is not None:
+            self.beamformer = ArrayResponse(scene, grid=[2, 3])  # of maps, which there are none of
+        elif scene.task.unit != "dBm":
+            raise ValueError(
+                f"model 'ray_tracing' predicts spectra, RSSI and channels, and labels of task {scene.task.name!r} are "
+                "none of them; use another model"
+            )
+        learnt = {"log_permittivities": torch.zeros(0), "log_conductivities": torch.zeros(0)}
+        if self.beamformer is None:
+            learnt["log_gains"] = torch.zeros(len(scene.receivers), 2)  # ln of amplitude, phase [rad]
+        for name, start in learnt.items():
+            if calibrate:
+                self.register_parameter(name, nn.Parameter(start))
+            else:
+                self.register_buffer(name, start)
+        self.register_buffer("sign", torch.tensor(-1))  # of phases: -1 for exp(+j omega t)
+        self.register_buffer("surfaces", torch.zeros(0, dtype=torch.uint8))  # an OBJ file
+
+    # --- the room ---
+
+    def _furnish(self, text: str) -> None:
+        """Takes the room's surfaces from the text of an OBJ file."""
+        self.text, meshes = text, read_obj(text, "the room")
+        self.known = known_materials(meshes, self.materials)
+        self.offsets = torch.zeros(1)
+        band = self.scene.bandwidth
+        if band and not self.scene.task.dtype.is_complex:
+            self.offsets = frequency_offsets(meshes, band)
+        for parameter in (self.log_permittivities, self.log_conductivities):
+            parameter.data = parameter.data.new_zeros(len(self.known))
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        stored = state_dict.get(f"{prefix}surfaces")
+        if stored is not None:
+            self.surfaces = self.surfaces.new_empty(stored.shape)
+            self._furnish(stored.cpu().numpy().tobytes().decode())
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+    # --- training ---
+
+    def fit(self, links: Links) -> None:
+        """Reads the room, traces the links' paths, and fits each receiver's gain.
+
+        Raises:
+            FileNotFoundError, ImportError, RuntimeError: As ``gaigs_ray_tracing.rooms.find_meshes`` and
+                ``gaigs.data.sionna.tracing.make_scene``.
+            ValueError: The mesh is damaged or of unknown materials.
+        """
+        text = wavefront_obj(find_meshes(self.room, self.mesh))
+        self.surfaces = torch.tensor(list(text.encode()), dtype=torch.uint8, device=self.surfaces.device)
+        self._furnish(text)  # as written, so that a checkpoint has the same
+        frequencies = self._carriers(links.query)
+        for carrier in frequencies.unique().tolist():
+            self._tracer(carrier).remember(links.query.transmitters[frequencies == carrier])
+        if self.beamformer is None:
+            self._fit_gains(links)
+
+    @torch.no_grad()
+    def _fit_gains(self, links: Links) -> None:
+        train = links.split.train
+        labels, query = links.labels[train], links.query[train]
+        is_complex = labels.is_complex()
+        if is_complex:
+            waves = direct_waves(self.scene, query, self.scene.task.frequencies)
+            self.sign.fill_(phase_sign(labels.to(torch.complex128), waves, query.receivers) or -1)
+        self.log_gains.zero_()
+        values = torch.cat([self(Batch(part)).value for part in query.parts(BATCH)])
+        for receiver in query.receivers.unique().tolist():
+            own = query.receivers == receiver
+            if is_complex:
+                # Not by least squares: links that are dimmed more than is known would pull it down by decibels.
+                h, guess = labels[own].to(torch.complex128).flatten(1), values[own].to(torch.complex128).flatten(1)
+                sizes, found = h.norm(dim=1), guess.norm(dim=1)
+                heard = (sizes > 0) & (found > 0)
+                if heard.any():
+                    amplitude = (sizes / found)[heard].median().log()
+                    alike = (guess.conj() * h).sum(1)[heard] / (sizes * found)[heard]
+                    self.log_gains[receiver] = torch.stack((amplitude, -int(self.sign) * alike.sum().angle()))
+            else:
+                self.log_gains[receiver, 0] = (labels[own] - values[own]).median() / NEPER
+
+    @property
+    def predicts_untrained(self) -> bool:
+        return True
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Those of the materials, and the receivers' gains; without calibration there are none."""
+        groups = {"materials": ["log_permittivities", "log_conductivities"], "gains": ["log_gains"]}
+        parameters = dict(self.named_parameters())
+        return {key: [parameters[name] for name in names if name in parameters] for key, names in groups.items()}
+
+    def facts(self) -> dict[str, object]:
+        """What the surfaces are made of, at the lowest carrier, and how long it takes to trace a place."""
+        carrier = self._carriers(Query(self.scene.lower[None], torch.tensor([0]), self._lowest())).item()
+        slabs = self.slabs(carrier)
+        tracer = self._tracer(carrier)
+        return {
+            "materials": {
+                name: {
+                    "permittivity": value.real.item(),
+                    "conductivity": -value.imag.item() * 2 * math.pi * carrier * epsilon_0,
+                }
+                for name, value in zip(self.known, slabs.permittivities.detach(), strict=True)
+            },
+            "tracing_ms": 1e3 * tracer.seconds / tracer.places if tracer.places else None,
+        }
+
+    # --- prediction ---
+
+    def forward(self, batch: Batch) -> Prediction:
+        query = batch.query.to("cpu")
+        frequencies = self._carriers(query)
+        task, dtype = self.scene.task, query.transmitters.dtype
+        shape = task.shape if self.beamformer is None else (batch.directions or task.directions).shape
+        value = torch.zeros(len(query), *shape, dtype=dtype.to_complex() if task.dtype.is_complex else dtype)
+        for carrier in frequencies.unique().tolist():
+            for receiver in query.receivers.unique().tolist():
+                own = ((frequencies == carrier) & (query.receivers == receiver)).nonzero()[:, 0]
+                if len(own):
+                    part = self._report(query[own], receiver, carrier, batch)
+                    value = value.index_add(0, own, part.to(value.dtype))
+        return Prediction(value.to(batch.query.transmitters.device), {})
+
+    def _report(self, query: Query, receiver: int, carrier: float, batch: Batch) -> Tensor:
+        """What links to one receiver give."""
+        antenna, task = self.scene.receivers[receiver], self.scene.task
+        traced = padded(self._tracer(carrier).find(query.transmitters, receiver), antenna.pose.position)
+        paths = Paths(traced.images, gains(traced, self.slabs(carrier)))
+        if task.dtype.is_complex:
+            amplitude, phase = self.log_gains[receiver].cpu().double()
+            channels = respond(paths, antenna, carrier, task.frequencies - carrier)
+            channels = channels * torch.polar(amplitude.exp(), phase)
+            return channels.conj() if self.sign > 0 else channels
+        if self.beamformer is not None:
+            lags = _lags(respond(paths, antenna, carrier, self.offsets), antenna.array)
+            return self.beamformer.hear(lags.to(torch.complex64), query, batch.directions)
+        if self.scene.bandwidth is None:
+            distances = (paths.images - antenna.pose.position.double()).norm(dim=-1)
+            powers = (paths.gains.abs() * free_space(distances, torch.tensor(carrier), 0).real).square().sum(1)
+        else:
+            powers = respond(paths, antenna, carrier, self.offsets).abs().square().mean((1, 2))
+        return 10 * (powers + SILENT).log10() + NEPER * self.log_gains[receiver, 0].cpu().double()
+
+    def slabs(self, carrier: float) -> Slabs:
+        """What the surfaces are made of at a carrier [Hz]."""
+        real, c, d = torch.tensor([MATERIALS[kind] for kind in self.known.values()], dtype=torch.float64).T
+        conductivities = c * (carrier / 1e9) ** d * self.log_conductivities.cpu().double().exp()
+        permittivities = torch.complex(
+            1 + (real - 1) * self.log_permittivities.cpu().double().exp(),
+            -conductivities / (2 * math.pi * epsilon_0 * carrier),
+        )
+        thicknesses = torch.tensor([THICKNESS[kind] for kind in self.known.values()], dtype=torch.float64)
+        return Slabs(permittivities, thicknesses, carrier)
+
+    def _tracer(self, carrier: float) -> Tracer:
+        receivers = tuple(tuple(receiver.pose.position.double().tolist()) for receiver in self.scene.receivers)
+        return find_tracer(self.text, tuple(self.known.items()), receivers, carrier, self.depth, self.rays)
+
+    def _lowest(self) -> Float[Tensor, "1"] | None:
+        return self.scene.frequencies[:1] if len(self.scene.frequencies) else None
+
+    def _carriers(self, query: Query) -> Float[Tensor, "b"]:
+        """The frequency of each link [Hz]."""
+        if self.frequency is not None and query.frequencies is None and not self.scene.task.dtype.is_complex:
+            return torch.full((len(query),), float(self.frequency))
+        return carriers(self.scene, query)
+
+
+def _lags(responses: Complex[Tensor, "b e f"], array: Array) -> Complex[Tensor, "b l"]:
+    """Mean covariance of an array's pairs of elements that are equally far apart, over the frequencies."""
+    _, pairs, counts = array.lags
+    covariances = responses @ responses.mH / responses.shape[-1]
+    lags = covariances.new_zeros(len(responses), len(counts))
+    return lags.index_add(1, pairs, covariances.flatten(1)) / counts

@@ -1,0 +1,178 @@
+"""Rooms as meshes: those that are known by name, and files of one's own."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyParseError
+
+from gaigs.data import synthetic
+from gaigs.data.sionna import ROOMS, tracing
+from gaigs.data.sionna.meshes import THICKNESS, Mesh
+
+BUILT_IN = ("built_in", "synthetic", "synthetic_rssi", "synthetic_csi")
+"""Names of the built-in room: its own, and those of the data that come from it."""
+
+FURNITURE = {
+    "partition": "plasterboard",
+    "wardrobe": "wood",
+    "bookshelf": "wood",
+    "desk": "wood",
+    "sofa": "wood",
+    "refrigerator": "metal",
+    "column": "concrete",
+}
+"""What the built-in room's furniture is taken for. The simulation knows how much each piece dims, and no material."""
+
+UNNAMED = "unnamed"
+"""Name of a material that the file has none for."""
+
+SUFFIXES = (".obj", ".ply", ".xml")
+
+
+def check_room(room: str) -> None:
+    """Raises a ``ValueError`` unless a room of that name is known."""
+    if room not in BUILT_IN and room not in ROOMS:
+        raise ValueError(
+            f"model 'ray_tracing' must know the room: one of built_in, {', '.join(ROOMS)}, got {room!r}; set "
+            "model.room, or model.mesh to a file of its surfaces"
+        )
+
+
+def find_meshes(room: str, mesh: str | None) -> list[Mesh]:
+    """The surfaces of a room, each with a material's name.
+
+    Args:
+        room: Its name.
+        mesh: File of its surfaces [m]; None for the room of that name.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ImportError, RuntimeError: A scene file takes Sionna RT, and it cannot be used.
+        ValueError: The file is of another kind, damaged, or without surfaces; or there is no such room.
+    """
+    if mesh is not None:
+        return _read(Path(mesh))
+    check_room(room)
+    if room in ROOMS:
+        return ROOMS[room].meshes()
+    shell = read_obj(synthetic.wavefront_obj(synthetic.ROOM), "the built-in room")
+    return [replace(part, material=part.name) if part.name in FURNITURE else part for part in shell]
+
+
+def known_materials(meshes: Sequence[Mesh], chosen: Mapping[str, str]) -> dict[str, str]:
+    """Which tabulated material each material of a mesh starts as, by names in ascending order.
+
+    Args:
+        meshes: Surfaces.
+        chosen: What the user says of some.
+
+    Raises:
+        ValueError: A name is unknown, or is said of a material that there is not.
+    """
+    there = sorted({mesh.material for mesh in meshes})
+    if unused := sorted(set(chosen) - set(there)):
+        raise ValueError(f"model.materials has {', '.join(unused)}, and the materials are {', '.join(there)}")
+    found = {}
+    for name in there:
+        plain = name.removeprefix("mat-").removeprefix("itu_").removeprefix("itu-")
+        found[name] = chosen.get(name, FURNITURE.get(name, plain))
+        if found[name] not in THICKNESS:
+            raise ValueError(
+                f"material {name!r} must be one of {', '.join(THICKNESS)}, got {found[name]!r}; say which it is like: "
+                f"+model.materials.{name}=concrete"
+            )
+    return found
+
+
+def _read(file: Path) -> list[Mesh]:
+    if file.suffix not in SUFFIXES:
+        raise ValueError(f"model.mesh must be a file {', '.join(SUFFIXES)}, got {file.name}")
+    if not file.is_file():
+        raise FileNotFoundError(f"no mesh at {file}; set model.mesh to a file of surfaces, or to null")
+    match file.suffix:
+        case ".obj":
+            meshes = read_obj(file.read_text(), str(file))
+        case ".ply":
+            meshes = _read_ply(file)
+        case _:
+            meshes = _read_scene(file)
+    if not meshes:
+        raise ValueError(f"{file} must hold surfaces, and holds none")
+    return meshes
+
+
+def read_obj(text: str, source: str) -> list[Mesh]:
+    """The surfaces of a Wavefront OBJ file, one mesh for each material of an object.
+
+    Args:
+        text: Content of the file.
+        source: What errors call it.
+
+    Raises:
+        ValueError: A line holds no numbers where it must, or a face takes vertices that there are not.
+    """
+    vertices: list[tuple[float, float, float]] = []
+    groups: dict[tuple[str, str], list[tuple[int, ...]]] = {}
+    name, material = "mesh", UNNAMED
+    for number, line in enumerate(text.splitlines(), 1):
+        word, *rest = line.split("#")[0].split() or [""]
+        try:
+            match word:
+                case "o" | "g":
+                    name = " ".join(rest) or "mesh"
+                case "usemtl":
+                    material = " ".join(rest) or UNNAMED
+                case "v":
+                    x, y, z = map(float, rest[:3])
+                    vertices.append((x, y, z))
+                case "f":
+                    corners = [int(part.split("/")[0]) for part in rest]
+                    # Negative ones count from the end.
+                    face = tuple(k - 1 if k > 0 else len(vertices) + k for k in corners)
+                    if len(face) < 3 or not all(0 <= k < len(vertices) for k in face):
+                        raise ValueError("a face takes three vertices or more, of those before it")
+                    groups.setdefault((name, material), []).append(face)
+        except ValueError as error:
+            raise ValueError(f"{source}, line {number}, must hold numbers, got {line.strip()!r}: {error}") from error
+    return [_mesh(name, material, vertices, faces) for (name, material), faces in groups.items()]
+
+
+def _read_ply(file: Path) -> list[Mesh]:
+    try:
+        content = PlyData.read(file)
+        corners, faces = content["vertex"], content["face"]
+        vertices = np.column_stack([corners[axis] for axis in "xyz"]).astype(float).tolist()
+        names = {part.name for part in faces.properties} & {"vertex_indices", "vertex_index"}
+        indices = [tuple(map(int, face)) for face in faces[names.pop()]]
+    except (PlyParseError, KeyError, ValueError) as error:
+        raise ValueError(f"{file} must be a .ply of vertices x, y, z and faces, and is not ({error})") from error
+    return [_mesh(file.stem, UNNAMED, vertices, indices)] if indices else []
+
+
+def _read_scene(file: Path) -> list[Mesh]:
+    rt = tracing.find_sionna()
+    import mitsuba
+
+    try:
+        scene = rt.load_scene(str(file))
+    except Exception as error:  # whatever Mitsuba's parser raises
+        raise ValueError(f"{file} must be a scene that Sionna RT reads, and is not ({error})") from error
+    meshes = []
+    for name, shape in scene.objects.items():
+        parameters = mitsuba.traverse(shape.mi_mesh)
+        vertices = parameters["vertex_positions"].numpy().reshape(-1, 3).astype(float).tolist()
+        faces = [tuple(face) for face in parameters["faces"].numpy().reshape(-1, 3).tolist()]
+        meshes.append(_mesh(name, shape.radio_material.name, vertices, faces))
+    return meshes
+
+
+def _mesh(name: str, material: str, vertices: Sequence, faces: Sequence[tuple[int, ...]]) -> Mesh:
+    """A mesh of those vertices alone that its faces have."""
+    numbers = {corner: k for k, corner in enumerate(dict.fromkeys(itertools.chain(*faces)))}
+    corners = tuple(tuple(vertices[corner]) for corner in numbers)
+    if not np.isfinite(corners).all():
+        raise ValueError(f"the vertices of {name!r} must be finite")
+    return Mesh(name, material, corners, tuple(tuple(numbers[corner] for corner in face) for face in faces))
