@@ -1,8 +1,12 @@
-"""Every registered name of every kind keeps its contract, with the options of its configuration file."""
+"""Every built-in name of every kind keeps its contract, with the options of its configuration file.
+
+Packages in ``plugins`` have tests of their own, in ``tests/plugins``.
+"""
 
 import functools
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +15,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import nn
 
+import gaigs
 from gaigs import configuration
 from gaigs.data import load, nerf2_spectrum
 from gaigs.model.gaigs import GaussianSplatting
@@ -57,14 +62,10 @@ SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "syntheti
 MADE_FOR = {
     "loss": {"l1_ssim": ["spectrum"], "absolute": ["spectrum", "rssi"], "squared": ["spectrum", "rssi"]}
     | {"huber": ["spectrum", "rssi"], "nmse": ["csi"]},
-    "model": {"path_loss": ["rssi"], "friis": ["csi"]}
-    | {name: ["spectrum"] for name in ("array_response", "rf_3dgs", "swift_wrf")}
-    | {"kriging": [], "ray_tracing": []},  # made of a trained model alone; of rooms that are known
+    "model": {"path_loss": ["rssi"], "friis": ["csi"], "kriging": []},  # kriging is made of a trained model alone
     "pooling": {
         "array_response": ["spectrum"],
         "spectrum": ["spectrum"],
-        "clamped": ["spectrum"],
-        "mean_amplitude": ["rssi"],
         "mean_power": ["rssi"],
         "softmax_attention": ["rssi"],
         "element_sum": ["csi"],
@@ -79,7 +80,14 @@ HEARD = {"spectrum": "array_response", "rssi": "mean_power", "csi": "element_sum
 CARRIER = 5e9
 """Of the links to arrays that are known [Hz]."""
 
-every = lambda kind: pytest.mark.parametrize("name", registry(kind).names())
+
+def built_in(kind):
+    """The names of a kind that do not come from plug-ins."""
+    folder = Path(gaigs.__file__).parent / kind
+    return [name for name in registry(kind).names() if (folder / f"{name}.py").exists() or (folder / name).is_dir()]
+
+
+every = lambda kind: pytest.mark.parametrize("name", built_in(kind))
 on_every_device = pytest.mark.parametrize("device", DEVICES)
 
 
@@ -110,7 +118,7 @@ def scenes():
 
 def on_its_tasks(kind):
     """Parametrises over the names of a kind, each with the tasks that it is made for."""
-    pairs = [(name, task) for name in registry(kind).names() for task in MADE_FOR[kind].get(name, TASKS)]
+    pairs = [(name, task) for name in built_in(kind) for task in MADE_FOR[kind].get(name, TASKS)]
     return pytest.mark.parametrize(("name", "task"), pairs)
 
 
