@@ -38,7 +38,13 @@ def run(config: DictConfig) -> float | None:
     """
     match config.get("command"):  # None where it is missing
         case "train":
-            return train(config)
+            try:
+                return train(config)
+            except Exception as error:
+                if HydraConfig.get().mode is RunMode.MULTIRUN:
+                    # Hydra prints that of the first job that failed alone: so each says it in its log, in one line.
+                    log.error("gaigs: %s", " ".join(str(error).removeprefix("gaigs: ").split()) or repr(error))
+                raise
         case "devices":
             return list_devices()
         case unknown:
@@ -74,7 +80,7 @@ def train(config: DictConfig) -> float | None:
     except OmegaConfBaseException as error:  # whose message Hydra adds
         raise CompactHydraException("gaigs: the configuration is not complete") from error
     except (TypeError, ValueError) as error:
-        raise failed(error) from error
+        raise CompactHydraException(f"gaigs: {error}") from error
     # Slow to import: here, once the configuration has proved good.
     from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
@@ -101,16 +107,8 @@ def train(config: DictConfig) -> float | None:
         if settings.verbose:
             os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra leaves most of the traceback out
             raise
-        raise failed(error) from error
+        raise CompactHydraException(f"gaigs: {error}") from error
     return None if metrics is None else metrics["validation_score"]
-
-
-def failed(error: Exception) -> CompactHydraException:
-    """What Hydra prints of a failure. Of a multirun's jobs it does so for the first alone, once all have ended: so each
-    says it in its log, too."""
-    if HydraConfig.get().mode is RunMode.MULTIRUN:
-        log.error("gaigs: %s", error)
-    return CompactHydraException(f"gaigs: {error}")
 
 
 def list_devices() -> None:

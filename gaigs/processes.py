@@ -109,6 +109,8 @@ def stopping(waits: bool = False) -> Iterator[None]:
 
     signal.signal(signal.SIGTERM, stop)
     try:
+        if received:  # between two runs of a process that waits
+            raise Stopped("stopped", received[0])
         yield
     finally:
         for number, handler in handlers.items():

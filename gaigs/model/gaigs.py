@@ -15,11 +15,14 @@ from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.geometry import covariances, spherical_harmonics
 from gaigs.model import Model, Prediction
 from gaigs.placement import Placed
-from gaigs.projection import NEAR, Splats
+from gaigs.projection import Splats
 from gaigs.propagation import carriers
 from gaigs.query import Batch, Query
 from gaigs.registry import call, register, registry
 from gaigs.scene import Scene
+
+BESIDE = 0.05
+"""Nearer to a Gaussian's centre than this a transmitter sees it in less and less of a direction [m]."""
 
 
 @register("model", "gaigs")
@@ -332,8 +335,7 @@ def _towards(bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]) -> 
     """
     if bands.shape[-1] == 1:
         return bands
-    lengths = offsets.norm(dim=-1, keepdim=True)
-    # A transmitter within a Gaussian's centre sees it in no direction: one is taken for it.
-    seen = torch.where(lengths < NEAR, offsets.new_tensor([1.0, 0.0, 0.0]), -offsets / lengths.clamp(min=NEAR))
+    # On a centre there is no direction: towards it the harmonics fade, and gradients stay moderate.
+    seen = -offsets / offsets.norm(dim=-1, keepdim=True).clamp(min=BESIDE)
     harmonics = spherical_harmonics(seen, math.isqrt(bands.shape[-1]) - 1)
     return (bands * harmonics[:, :, None]).sum(-1, keepdim=True) / SH_DC

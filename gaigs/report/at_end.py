@@ -28,7 +28,7 @@ def write() -> None:
 
         try:
             Console().print(report(folder))
-        except (FileNotFoundError, ValueError) as error:
-            print(f"gaigs: no report: {error}", file=sys.stderr)
+        except Exception as error:  # the jobs have ended well: nothing may make that look as if they had not
+            print(f"gaigs: no report: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr)
         else:
             print(f"report: {folder}; python -m gaigs.report {folder} writes it anew")

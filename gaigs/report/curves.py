@@ -1,6 +1,7 @@
 """Curves: how a score is distributed over the test set, how the losses fell, and what an error costs in time."""
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from math import ceil
@@ -54,7 +55,7 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
     """Steps and values of every quantity in files of Lightning's CSVLogger, whose rows leave out what they lack.
 
     Args:
-        paths: One file for each time the run was started; where they overlap, the later file counts.
+        paths: One file for each time the run was started; a later file counts from its first step on.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -66,11 +67,16 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
             reader = csv.DictReader(file)
             if "step" not in (reader.fieldnames or ()):
                 raise ValueError(f"{path} must have a column 'step', got {reader.fieldnames}; is it of a CSVLogger?")
-            for row in reader:
+            rows = list(reader)
+            begin = min((float(row["step"]) for row in rows), default=math.inf)
+            for points in curves.values():
+                for step in [step for step in points if step >= begin]:
+                    del points[step]
+            for row in rows:
                 for name in reader.fieldnames:
                     if row[name] and name not in ("step", "epoch"):
                         curves.setdefault(name, {})[float(row["step"])] = float(row[name])
-    return {name: tuple(np.array(sorted(points.items())).T) for name, points in curves.items()}
+    return {name: tuple(np.array(sorted(points.items())).T) for name, points in curves.items() if points}
 
 
 def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gaigs.report.curves import speed_against_error
-from gaigs.report.runs import Run, Spread, read_runs
+from gaigs.report.runs import Run, Spread, read_runs, train_seconds
 from gaigs.report.style import DPI
 from gaigs.report.systems import write_systems
 from gaigs.report.table import metrics_of, stacked, written
@@ -60,7 +60,7 @@ def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
         if metrics is not None:
             (own, scores), *others = metrics["models"].items()
             row |= {"status": "done", "model": row["model"] or own} | {key: metrics[key] for key in facts}
-            row |= scores | {key: metrics.get(key) for key in COSTS}
+            row |= scores | {key: metrics.get(key) for key in COSTS} | {"train_seconds": train_seconds(metrics)}
             for model, scores in others:
                 if model == f"{own}_trend":  # the run's own model without its kriging
                     continue

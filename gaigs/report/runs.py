@@ -3,7 +3,7 @@
 import json
 import re
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +32,17 @@ class Run(NamedTuple):
     metrics: dict | None
     failure: str | None
     folder: Path
+
+
+def as_baseline(name: str) -> str:
+    """What a reader calls a baseline where a system has the same name."""
+    return f"{name} (baseline)"
+
+
+def train_seconds(metrics: Mapping) -> float | None:
+    """How long a run trained, and what its kriging took on top [s]; None of a look-up."""
+    seconds = metrics.get("train_seconds")
+    return None if seconds is None else seconds + metrics.get("kriging", {}).get("seconds", 0.0)
 
 
 class Spread(NamedTuple):

@@ -1,10 +1,12 @@
 """Runs of several models as one table in the form of the paper's: published figures beside ours, times and sizes."""
 
 import csv
-from collections.abc import Mapping, Sequence
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import yaml
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
@@ -13,7 +15,7 @@ from rich.table import Table
 from gaigs.configuration import conf_dir, plugin_conf_dirs
 from gaigs.registry import registry
 from gaigs.report.curves import learning_curves, read_curves
-from gaigs.report.runs import Run, Spread
+from gaigs.report.runs import Run, Spread, as_baseline, train_seconds
 from gaigs.report.style import DPI
 from gaigs.report.table import stacked, written
 
@@ -30,7 +32,11 @@ COSTS = {
 BRIEF = ("train_seconds", "inference_ms", "num_parameters")
 """The costs for which a terminal has room."""
 
-TEX = str.maketrans({**{sign: f"\\{sign}" for sign in "&%_#$"}, "±": r"$\pm$", "–": "--", "²": r"\textsuperscript{2}"})
+TEX = str.maketrans(
+    {sign: f"\\{sign}" for sign in "&%_#${}"}
+    | {"±": r"$\pm$", "–": "--", "²": r"\textsuperscript{2}"}
+    | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
+)
 
 
 class Published(NamedTuple):
@@ -52,16 +58,18 @@ class System(NamedTuple):
     Attributes:
         model: Registered name.
         name: What a reader calls it.
-        runs: Those that ended, by seed; none of a baseline.
+        runs: Those that ended, one a seed; none of a baseline.
         values: Of each metric and cost, one a run; a baseline has one of each metric.
-        failure: Why none has ended; None where one has.
+        failures: Of each run that has not ended, its seed where several vary, and why.
+        varied: Whether more than model and seed tell its runs from others.
     """
 
     model: str
     name: str
     runs: list[Run]
     values: dict[str, list[float]]
-    failure: str | None = None
+    failures: Sequence[str] = ()
+    varied: bool = False
 
 
 class Column(NamedTuple):
@@ -110,7 +118,9 @@ def find_systems(runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapp
     rows = []
     for group in groups.values():
         overrides = group[0].overrides
-        done = sorted((run for run in group if run.metrics is not None), key=lambda run: run.metrics["seed"])
+        # A seed that was run twice, in two multiruns, counts once.
+        ended = {run.metrics["seed"]: run for run in reversed(group) if run.metrics is not None}
+        done = [ended[seed] for seed in sorted(ended)]
         model = overrides.get("model") or (next(iter(done[0].metrics["models"])) if done else group[0].name)
         varied = [f"{key}={overrides[key]}" for key in overrides if key not in ("model", "seed", *shared)]
         values: dict[str, list[float]] = {}
@@ -118,23 +128,31 @@ def find_systems(runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapp
             for key, value in (next(iter(run.metrics["models"].values())) | _costs(run.metrics)).items():
                 if value is not None:
                     values.setdefault(key, []).append(value)
-        failure = None if done else next((run.failure for run in group if run.failure), "unfinished")
-        rows.append(System(model, " ".join([names.get(model, model), *varied]), done, values, failure))
+        failures = [
+            f"{f'seed {seed}: ' if (seed := run.overrides.get('seed')) and len(group) > 1 else ''}"
+            f"{run.failure or 'unfinished'}"
+            for run in group
+            if run.metrics is None
+        ]
+        name = " ".join([names.get(model, model), *varied])
+        rows.append(System(model, name, done, values, failures, bool(varied)))
     order = [*names]
     rows.sort(key=lambda row: (order.index(row.model) if row.model in order else len(order), row.name))
-    own = {row.model for row in rows}
-    for row in (row for row in baselines if row["model"] not in own):
+    own = {row.model: row.values for row in rows}
+    for row in baselines:
         scores = {key: [value] for key, value in row.items() if isinstance(value, float)}
-        rows.append(System(row["model"], " ".join(filter(None, (row["model"], row.get("split")))), [], scores))
+        same = own.get(row["model"], {})
+        if same and all(written(same[key][0]) == written(values[0]) for key, values in scores.items() if key in same):
+            continue
+        name = as_baseline(row["model"]) if row["model"] in own else row["model"]
+        rows.append(System(row["model"], " ".join(filter(None, (name, row.get("split")))), [], scores))
     return rows
 
 
 def _costs(metrics: Mapping) -> dict[str, float | None]:
-    """Those of one run; the seconds of its kriging are part of its training, and no Gaussians are none."""
-    costs = {key: metrics.get(key) for key in COSTS}
+    """Those of one run; no Gaussians are none."""
+    costs = {key: metrics.get(key) for key in COSTS} | {"train_seconds": train_seconds(metrics)}
     costs["num_gaussians"] = costs["num_gaussians"] or None
-    if costs["train_seconds"] is not None:
-        costs["train_seconds"] += metrics.get("kriging", {}).get("seconds", 0.0)
     if costs["checkpoint_bytes"] is not None:
         costs["checkpoint_bytes"] /= 1e6
     return costs
@@ -155,10 +173,13 @@ def _value(values: list[float]) -> float | Spread:
 
 
 def _published(rows: Sequence[System], columns: Sequence[Mapping]) -> list[Column]:
-    """Those of publications; a title stands for what it is of."""
-    return [
-        Column(f"published {column['title']}", [column["figures"].get(row.model) for row in rows]) for column in columns
-    ]
+    """Those of publications, of systems as they are, not of ones that were varied; a title stands for what it is of."""
+    found = []
+    for column in columns:
+        figures = [column["figures"].get(row.model) if row.runs and not row.varied else None for row in rows]
+        if any(figure is not None for figure in figures):
+            found.append(Column(f"published {column['title']}", figures))
+    return found
 
 
 def _texts(column: Column) -> list[tuple[str, bool]]:
@@ -230,8 +251,8 @@ def write_systems(
     if len({row.model for row in done}) < 2:
         return None
     task = done[0].runs[0].metrics["task"]
-    failed = {row.name: row.failure for row in rows if row.failure is not None}
-    rows = [row for row in rows if row.failure is None]
+    failed = [f"{row.name}: {failure}" for row in rows for failure in row.failures]
+    rows = [row for row in rows if row.values]
     better = {name: metric.larger_is_better for name, metric in known.items()}
     scores = _columns(rows, {name: metric.title for name, metric in known.items()}, better)
     costs = _columns(rows, COSTS, {})
@@ -245,7 +266,7 @@ def write_systems(
         for part in (published.scores, published.costs)
         for column in part.get(task, ())
     ]
-    notes += [f"- without a result: {name}: {failure}" for name, failure in failed.items()]
+    notes += [f"- without a result: {failure}" for failure in failed]
     markdown = [*(_markdown(rows, table) for table in tables), "\n".join(notes) + "\n"]
     (folder / "systems.md").write_text("\n".join(markdown))
     (folder / "systems.tex").write_text("\n".join(_tex(rows, table) for table in tables))
@@ -257,8 +278,8 @@ def write_systems(
     return _terminal(rows, told[-1:] + brief, failed)
 
 
-def _terminal(rows: Sequence[System], columns: Sequence[Column], failed: Mapping[str, str]) -> Table:
-    missing = "".join(f"{name}: {failure}\n" for name, failure in failed.items())
+def _terminal(rows: Sequence[System], columns: Sequence[Column], failed: Sequence[str]) -> Table:
+    missing = "".join(f"{failure}\n" for failure in failed)
     caption = f"{missing}all columns in systems.md"
     table = Table(title="Systems", caption=escape(caption), box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("system", overflow="fold")
@@ -270,14 +291,33 @@ def _terminal(rows: Sequence[System], columns: Sequence[Column], failed: Mapping
     return table
 
 
+def _are_of_the_same_links(files: Iterable[Path]) -> bool:
+    """Whether predictions are of the same test links, told by their labels; not where a file cannot be read."""
+    first = None
+    for file in files:
+        try:
+            with file.open("rb") as stream, np.load(stream) as run:  # numpy would not close what it cannot read
+                labels = run["labels"]
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return False
+        first = labels if first is None else first
+        if not np.array_equal(first, labels):
+            return False
+    return first is not None
+
+
 def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict:
     """What the task draws of all systems' predictions, where these are of the same split; and how they were learnt."""
     figures, kind = {}, registry("task").get(task)
-    firsts = {row.name: row.runs[0] for row in rows}
+    shared = set.intersection(*({run.metrics["seed"] for run in row.runs} for row in rows))
+    firsts = {
+        row.name: next((run for run in row.runs if run.metrics["seed"] == min(shared, default=None)), row.runs[0])
+        for row in rows
+    }
     splits = {run.metrics["split"] for run in firsts.values()}
     files = {name: run.folder / "predictions.npz" for name, run in firsts.items()}
     files = {name: file for name, file in files.items() if file.is_file()}
-    if files and len(splits) == 1:
+    if len(splits) == 1 and _are_of_the_same_links(files.values()):
         figures |= kind.compared(files, *splits)
     watched = kind.watched if isinstance(kind.watched, str) else next(iter(known))
     curves = {}
@@ -289,7 +329,7 @@ def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict:
             points = [(time, steps[step]) for step, time in zip(*seconds, strict=True) if step in steps]
             curves[name] = tuple(zip(*points, strict=True))
     mean = next((name for name in (f"{watched}_mean", watched) if name in known), None)
-    if curves and mean is not None:
+    if curves and mean is not None and len(splits) == 1:
         own = {next(iter(firsts[name].metrics["models"])) for name in curves}
         own |= {f"{name}_trend" for name in own}  # a run's own model without its kriging
         validation = next((run.metrics["validation"] for run in firsts.values() if run.metrics.get("validation")), {})

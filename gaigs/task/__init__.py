@@ -123,14 +123,20 @@ class Task(ABC):
 
 
 def stored_scores(files: Mapping[str, Path], kind: str) -> dict[str, np.ndarray]:
-    """What ``predictions.npz`` of several systems hold of each, ``<kind>_<model>``; the first one's baselines last."""
+    """What ``predictions.npz`` of several systems hold of each, ``<kind>_<model>``; the first one's baselines last.
+
+    A baseline that is called as a system is, and scores otherwise, is told apart from it.
+    """
+    from gaigs.report.runs import as_baseline
+
     own, baselines = {}, {}
     for name, file in files.items():
         with np.load(file) as run:
             found = {key.removeprefix(f"{kind}_"): run[key] for key in run.files if key.startswith(f"{kind}_")}
         (model, own[name]), *others = found.items()
         baselines = baselines or {other: scores for other, scores in others if other != f"{model}_trend"}
-    return own | baselines
+    others = {name: scores for name, scores in baselines.items() if not np.array_equal(own.get(name), scores)}
+    return own | {as_baseline(name) if name in own else name: scores for name, scores in others.items()}
 
 
 def need_samples(scores: Tensor) -> None:

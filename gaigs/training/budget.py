@@ -109,7 +109,9 @@ def seconds(option: str, time: object) -> float:
     except (MisconfigurationException, TypeError):
         found = 0
     if found < 1:
-        raise ValueError(f"{option} must be a time of at least a second as 'DD:HH:MM:SS', got {time!r}")
+        raise ValueError(
+            f"{option} must be a time of at least a second as 'DD:HH:MM:SS', in quotes in a file, got {time!r}"
+        )
     return found
 
 

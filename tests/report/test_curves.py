@@ -95,6 +95,14 @@ def test_a_diverged_loss_still_makes_a_figure():
     figure.draw_without_rendering()
 
 
+def test_a_part_that_was_lost_with_a_killed_run_is_left_out(tmp_path):
+    (tmp_path / "0.csv").write_text("step,seconds\n99,60\n149,90\n199,120\n")
+    (tmp_path / "1.csv").write_text("step,seconds\n139,130\n189,160\n")
+    steps, seconds = read_curves([tmp_path / "0.csv", tmp_path / "1.csv"])["seconds"]
+    assert steps.tolist() == [99, 139, 189]
+    assert seconds.tolist() == [60, 130, 160]
+
+
 def test_curves_of_other_files_are_refused(tmp_path):
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match="must have a column 'step'"):

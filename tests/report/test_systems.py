@@ -15,6 +15,7 @@ from gaigs.report.multirun import report
 from gaigs.report.runs import read_runs
 from gaigs.report.spectra import side_by_side
 from gaigs.report.systems import read_published
+from gaigs.task import stored_scores
 
 SCORES = ("ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae")
 GRID = np.deg2rad(np.arange(1, 12)), np.deg2rad(np.arange(14))
@@ -202,6 +203,76 @@ def test_a_baseline_that_is_a_system_of_its_own_comes_once(tmp_path):
     write_run(tmp_path, "knn", 0.8)
     report(tmp_path)
     assert [row["system"] for row in read(tmp_path)] == ["GAI-GS", "knn", "mean"]
+
+
+def test_a_baseline_with_other_options_than_the_system_of_its_name_is_told_apart(tmp_path):
+    write_run(tmp_path, "gaigs", 0.9)
+    own = write_run(tmp_path, "knn", 0.8)
+    metrics = json.loads((own / "metrics.json").read_text())
+    metrics["models"]["knn"] = scores(0.7)
+    (own / "metrics.json").write_text(json.dumps(metrics))
+    content = dict(np.load(own / "predictions.npz")) | {"ssim_knn": 0.7 + 0.01 * np.arange(5)}
+    np.savez(own / "predictions.npz", **content)
+    report(tmp_path)
+    medians = {row["system"]: float(row["median SSIM"]) for row in read(tmp_path)}
+    assert medians == {"GAI-GS": 0.9, "knn": 0.7, "knn (baseline)": 0.9, "mean": 0.6}
+    files = {run.overrides["model"]: run.folder / "predictions.npz" for run in read_runs(tmp_path)}
+    found = stored_scores(files, "ssim")
+    assert {name: values[0] for name, values in found.items()} == {
+        "gaigs": 0.9,
+        "knn": 0.7,
+        "mean": 0.6,
+        "knn (baseline)": 0.9,
+    }
+
+
+def test_systems_with_other_test_links_are_not_drawn_together(tmp_path):
+    write_run(tmp_path, "gaigs", 0.9)
+    own = write_run(tmp_path, "mlp", 0.8)
+    content = dict(np.load(own / "predictions.npz"))
+    np.savez(own / "predictions.npz", **content | {"labels": content["labels"] + 1})
+    report(tmp_path)
+    assert not [*tmp_path.glob("systems_*.png")]
+    assert len(read(tmp_path)) == 4
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[:100], lambda content: b"", lambda content: b"no archive"])
+def test_damaged_predictions_leave_the_table_as_it_is(tmp_path, damage):
+    write_run(tmp_path, "gaigs", 0.9)
+    file = write_run(tmp_path, "mlp", 0.8) / "predictions.npz"
+    file.write_bytes(damage(file.read_bytes()))
+    report(tmp_path)
+    assert not [*tmp_path.glob("systems_*.png")]
+    assert len(read(tmp_path)) == 4
+
+
+def test_seeds_that_failed_are_told_beside_those_that_ended(tmp_path):
+    for seed in (0, 1):
+        write_run(tmp_path, "gaigs", 0.9 + 0.01 * seed, seed=seed)
+    write_run(tmp_path, "mlp", 0.8, seed=1)
+    write_run(tmp_path, "mlp", seed=0, said=["gaigs: the disk is full"])
+    report(tmp_path)
+    rows = {row["system"]: row for row in read(tmp_path)}
+    assert float(rows["MLP"]["median SSIM"]) == 0.8
+    assert "- without a result: MLP: seed 0: the disk is full\n" in (tmp_path / "systems.md").read_text()
+
+
+def test_a_seed_that_was_run_twice_counts_once(tmp_path):
+    for part in ("one", "two"):
+        write_run(tmp_path / part, "gaigs", 0.9)
+        write_run(tmp_path / part, "mlp", 0.8)
+    report(tmp_path)
+    assert "sd" not in "".join(read(tmp_path)[0])
+
+
+def test_what_is_published_is_of_systems_as_they_are(tmp_path):
+    for model in ("gaigs", "mlp"):
+        for jitter in ("0.0", "0.1"):
+            own = write_run(tmp_path / jitter, model, 0.9)
+            overrides = ["data=room", f"model={model}", "seed=0", f"training.jitter={jitter}"]
+            (own / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(overrides))
+    report(tmp_path)
+    assert "published" not in "".join(read(tmp_path)[0])
 
 
 def test_runs_of_two_splits_are_not_drawn_side_by_side(tmp_path):

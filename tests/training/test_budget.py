@@ -226,7 +226,7 @@ def test_options(options, max_time, every):
 def test_a_time_that_cannot_be_read_is_refused(option, time):
     if option == "val_check_interval" and time == 180:
         return  # steps
-    message = rf"trainer\.{option} must be a time of at least a second as 'DD:HH:MM:SS', got {re.escape(repr(time))}"
+    message = rf"trainer\.{option} must be a time of at least a second as 'DD:HH:MM:SS', .*got {re.escape(repr(time))}"
     with pytest.raises(ValueError, match=message):
         make_budget({"max_steps": 10, option: time}, Timer())
 

@@ -6,6 +6,7 @@ import logging
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -86,7 +87,7 @@ def _read(file: Path) -> dict[str, np.ndarray]:
     try:
         with file.open("rb") as stream:  # numpy would not close a file that it cannot read
             return dict(np.load(stream, allow_pickle=False))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{file} must be a whole file of paths, and is damaged ({error}); delete it") from error
 
 
