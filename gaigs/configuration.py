@@ -110,6 +110,12 @@ def installed(*names: str) -> str:
     return ",".join(name for name in names if name in known)
 
 
+def known(kind: str, name: str, otherwise: str) -> str:
+    """A name of a kind where some configuration folder has its file, and else another: for choices by task."""
+    folders = (conf_dir(), *plugin_conf_dirs())
+    return name if any((folder / kind / f"{name}.yaml").is_file() for folder in folders) else otherwise
+
+
 def launcher(name: str) -> str:
     """A launcher that joblib is needed for, where it is installed; else Hydra's own, which runs job by job."""
     try:
@@ -122,6 +128,7 @@ def launcher(name: str) -> str:
 # At import: a launcher's workers need them too.
 OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
 OmegaConf.register_new_resolver("installed", installed, replace=True, use_cache=True)
+OmegaConf.register_new_resolver("known", known, replace=True)
 OmegaConf.register_new_resolver("launcher", launcher, replace=True)
 
 

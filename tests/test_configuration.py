@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gaigs import configuration
-from gaigs.configuration import conf_dir, installed, launcher
+from gaigs.configuration import conf_dir, installed, known, launcher
 from gaigs.registry import registry
 
 DATA = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
@@ -87,6 +87,12 @@ def test_systems_are_swept_over_as_far_as_they_are_installed(configure, task, mo
     assert swept[-2:] == ["gaigs", "mirrored"]
     assert settings.sweep.dir == f"runs/systems_{task}"
     assert settings.callbacks.report["_target_"] == "gaigs.report.at_end.AtEnd"
+
+
+def test_a_choice_by_task_is_made_where_there_is_one():
+    configuration.install()
+    assert known("pooling", "mirrored/rssi", "spectrum") == "mirrored/rssi"
+    assert known("pooling", "mirrored/delay", "mean_power") == "mean_power"
 
 
 def test_what_is_not_installed_is_left_out_and_told(caplog):

@@ -11,6 +11,10 @@ ENDLESS = 2**40
 that goes on would miss those."""
 
 
+VALIDATING = 0.2
+"""The share of a training by time that validations take at the most, where they are slow: they wait until then."""
+
+
 class Budget(Callback):
     """Ends a training when its time is up, and has it validate by time.
 
@@ -21,20 +25,22 @@ class Budget(Callback):
     Args:
         timer: Measures the time; it stands before this one among the callbacks, and the trainer has no ``max_time``.
         max_time: Of the training [s]; None where steps alone end it.
-        every: Time from the end of a validation to the next [s]; None where steps say when to validate.
+        every: Time from the end of a validation to the next, or more where validations are slow [s]; None where steps
+            say when to validate.
     """
 
     def __init__(self, timer: Timer, max_time: float | None, every: float | None):
         self.timer, self.max_time, self.every = timer, max_time, every
         self.share = 0.0
-        self.validated = 0.0
+        self.began = self.validated = 0.0  # the last validation, and its end [s]
         self.is_due = False
 
     def state_dict(self) -> dict:
-        return {"share": self.share, "validated": self.validated, "is_due": self.is_due}
+        return {"share": self.share, "began": self.began, "validated": self.validated, "is_due": self.is_due}
 
     def load_state_dict(self, state: dict) -> None:
-        self.share, self.validated, self.is_due = state["share"], state["validated"], state["is_due"]
+        self.share, self.is_due = state["share"], state["is_due"]
+        self.began, self.validated = state["began"], state["validated"]
 
     def on_fit_start(self, trainer, module) -> None:
         self._stop_in_time(trainer)  # a run that was killed once its time was up
@@ -45,9 +51,12 @@ class Budget(Callback):
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
         elapsed = self._look(trainer)
-        self.is_due = trainer.should_stop or (self.every is not None and elapsed >= self.validated + self.every)
+        pause = (self.validated - self.began) * (1 - VALIDATING) / VALIDATING
+        is_time = self.every is not None and elapsed >= self.validated + max(self.every, pause)
+        self.is_due = trainer.should_stop or is_time
         if self.is_due:
             trainer.val_check_batch = trainer.global_step
+            self.began = elapsed
         elif self.every is not None:
             trainer.val_check_batch = ENDLESS
 

@@ -15,6 +15,7 @@ from gaigs.directions import Rays
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import from_spherical, to_spherical
 from gaigs.query import Batch, Query
+from gaigs.task.spectrum import Spectrum
 from gaigs.testing import check_loss, check_pooling, example_links
 
 with repository():
@@ -336,6 +337,18 @@ def test_a_task_without_a_pooling_is_refused():
     config = composed("data=synthetic", *SMALL)["model"] | {"pooling": None}
     with pytest.raises(ValueError, match="no pooling for labels of task 'spectrum'; use another model"):
         build("model", config, scene=LINKS.scene)
+
+
+def test_labels_of_one_elevation_are_refused():
+    with pytest.raises(ValueError, match=r"needs labels of two elevations or more, got them from 0\.5 to 0\.5 rad"):
+        model_of(scene=replace(LINKS.scene, task=Spectrum(torch.tensor([0.5]), LINKS.task.directions.azimuths, "none")))
+
+
+def test_levels_that_no_amplitude_gives_are_refused():
+    links = example_links("rssi")
+    links = replace(links, labels=links.labels - 60)
+    with pytest.raises(ValueError, match="gives levels above -100 dBm, and a training label is -1"):
+        model_of("rssi").fit(links)
 
 
 def test_several_carriers_are_refused():

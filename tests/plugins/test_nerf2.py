@@ -265,6 +265,13 @@ def test_options_out_of_range(changes, message):
         make(example_links("rssi").scene, **changes)
 
 
+def test_levels_that_no_amplitude_gives():
+    links = example_links("rssi")
+    links = replace(links, labels=links.labels - 60)
+    with pytest.raises(ValueError, match="gives levels above -100 dBm, and a training label is -1"):
+        make(links.scene).fit(links)
+
+
 def test_labels_of_another_kind():
     scene = replace(example_links("rssi").scene, task=Delay())
     with pytest.raises(ValueError, match="these labels are of task 'delay'; take another model"):

@@ -93,6 +93,13 @@ def test_samples_lie_evenly_from_the_antenna_to_where_waves_arrive_from(package)
         torch.testing.assert_close(views[b, k, i, :3], way / way.norm(), rtol=0, atol=1e-5)
 
 
+def test_all_fields_have_gradients_whoever_hears():
+    model = make().train()
+    model(LINKS.batch((LINKS.query.receivers == 0).nonzero()[:3, 0])).value.abs().sum().backward()
+    assert all(parameter.grad is not None for parameter in model.parameters())
+    assert not any(parameter.grad.any() for parameter in model.fields[1].parameters())
+
+
 # --- arrivals ---
 
 ROOM = Room(size=(6.0, 5.0, 3.0), walls=("metal",) * 6)

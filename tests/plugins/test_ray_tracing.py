@@ -253,6 +253,16 @@ def test_levels_are_fitted_to_the_training_links(tracer, hall):
     torch.testing.assert_close(model.predict(links.query), louder.labels, rtol=0, atol=1e-3)
 
 
+def test_a_receiver_without_training_links_has_the_others_gain(tracer, hall):
+    links = example_links("rssi", carrier=CARRIER)
+    links = replace(links, receivers=(*links.receivers, replace(links.receivers[0], name="new")))
+    model = build(links.scene, calibrate=False, mesh=str(hall))
+    model.fit(links)
+    gains = model.log_gains[:, 0]
+    assert gains[-1] == gains[:-1].median()
+    assert gains[-1] != 0
+
+
 @pytest.mark.parametrize("conjugated", [False, True])
 def test_gains_and_the_sign_of_phases_are_fitted_to_channels(tracer, hall, conjugated):
     links = example_links("csi")

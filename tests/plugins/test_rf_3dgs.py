@@ -251,6 +251,15 @@ def test_a_first_stage_of_nothing_or_of_all(share):
         model_of(fitted=False, first_stage=share)
 
 
+def test_several_processes(monkeypatch):
+    model = model_of()
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+    with pytest.raises(ValueError, match=r"which one process can do, not 2; set trainer\.devices=1"):
+        model.train()(LINKS.batch(torch.arange(2)))
+    assert model.eval().predict([[1.0, 1.0, 1.0]]).isfinite().all()
+
+
 def test_unknown_options():
     with pytest.raises(ValueError, match="model 'rf_3dgs' has no option 'geometrie'"):
         model_of(fitted=False, geometrie=None)

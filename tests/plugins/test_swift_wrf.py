@@ -11,6 +11,7 @@ from splatting import build, check_task, composed, run
 
 from gaigs.directions import Grid
 from gaigs.query import Batch, Query
+from gaigs.task.spectrum import Spectrum
 from gaigs.testing import check_model, example_links
 
 LINKS = example_links()
@@ -53,6 +54,11 @@ def test_it_keeps_the_contract_with_several_carriers():
 def test_labels_without_a_plane_are_refused(task):
     with pytest.raises(ValueError, match=f"labels of task '{task}' have no directions; take another model"):
         make(example_links(task).scene)
+
+
+def test_labels_of_one_elevation_are_refused():
+    with pytest.raises(ValueError, match=r"needs labels of two elevations or more, got \(1, \d+\) directions"):
+        make(replace(SCENE, task=Spectrum(torch.tensor([0.5]), SCENE.task.directions.azimuths, "none")))
 
 
 @pytest.mark.parametrize("option", ["count", "width", "layers"])

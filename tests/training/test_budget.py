@@ -103,6 +103,12 @@ def test_validations_come_by_time_from_the_end_of_one_to_the_next(train, spent, 
     assert clock.validated == validated
 
 
+def test_slow_validations_take_a_fifth_of_the_time(train):
+    clock = Clock(validation=3.0)
+    train(clock, max_time="00:00:00:40")
+    assert clock.validated == [4, 16, 28, 31], "4 s, 3 s to validate, four times as long, ..., the end"
+
+
 def test_steps_may_end_what_validates_by_time(train, tmp_path):
     clock = Clock()
     trainer = train(clock, steps=6, max_time=None)

@@ -64,6 +64,11 @@ class ComplexGaussians(Gaussians):
             raise ValueError(f"model.degree must be at least 0, got {degree}")
         if count < 1:
             raise ValueError(f"model.count must be at least 1, got {count}")
+        if not zone[0] < zone[1]:
+            raise ValueError(
+                f"model 'gsrf' needs labels of two elevations or more, got them from {zone[0]:.6g} to {zone[1]:.6g} "
+                "rad; take another model"
+            )
         means = heard(cubic_grid(scene, count, pitch, margin), scene, zone)
         if len(means) < len(scene.receivers):
             raise ValueError(

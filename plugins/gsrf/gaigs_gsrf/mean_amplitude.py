@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gaigs.data import Links
 from gaigs.directions import Directions
 from gaigs.pooling import Pooling, sphere
 from gaigs.query import Query
@@ -26,6 +27,19 @@ class MeanAmplitude(Pooling):
     def __init__(self, grid: list[int]):
         super().__init__()
         self.grid = sphere("pooling.grid", grid)
+
+    def fit(self, links: Links) -> None:
+        """Sees to it that the training labels can be predicted.
+
+        Raises:
+            ValueError: One is at -100 dBm or below, where no amplitude is.
+        """
+        least = links.labels[links.split.train].min().item()
+        if least <= -RANGE:
+            raise ValueError(
+                f"pooling 'mean_amplitude' gives levels above -100 dBm, and a training label is {least:.6g} dBm; leave "
+                "such readings out, or take another pooling"
+            )
 
     def forward(
         self, image: Float[Tensor, "b 2 rows columns"], query: Query, directions: Directions | None = None

@@ -78,6 +78,19 @@ class Level(Reading):
         super().__init__()
         self.grid, self.carriers = grid, torch.tensor([frequency], dtype=torch.float64)
 
+    def fit(self, links: Links) -> None:
+        """Sees to it that the training labels can be predicted.
+
+        Raises:
+            ValueError: One is at -100 dBm or below, where no amplitude is.
+        """
+        least = links.labels[links.split.train].min().item()
+        if least <= -100:
+            raise ValueError(
+                f"a radiance field gives levels above -100 dBm, and a training label is {least:.6g} dBm; leave such "
+                "readings out, or take another model"
+            )
+
     def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
         return 1 + labels / 100
 

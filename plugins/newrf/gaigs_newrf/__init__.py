@@ -175,7 +175,9 @@ class NeWrf(Model):
         for receiver in query.receivers.unique().tolist() or [0]:  # no links have a label's shape too
             links.append((query.receivers == receiver).nonzero()[:, 0])
             values.append(self._march(query.transmitters[links[-1]], receiver))
-        return Prediction(torch.cat(values)[torch.cat(links).argsort()], {})
+        # Several processes train together, and each must have a gradient of all fields.
+        idle = sum(0 * parameter.sum() for parameter in self.parameters()) if self.training else 0
+        return Prediction(torch.cat(values)[torch.cat(links).argsort()] + idle, {})
 
     def _march(self, places: Float[Tensor, "b 3"], receiver: int) -> Complex[Tensor, "b e s"]:
         """Channels between places and one receiver."""

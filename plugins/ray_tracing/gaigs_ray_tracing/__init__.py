@@ -168,6 +168,10 @@ class RayTracing(Model):
                     self.log_gains[receiver] = torch.stack((amplitude, -int(self.sign) * alike.sum().angle()))
             else:
                 self.log_gains[receiver, 0] = (labels[own] - values[own]).median() / NEPER
+        trained = query.receivers.unique()
+        unheard = torch.ones(len(self.log_gains), dtype=torch.bool).index_fill(0, trained, False)
+        if len(trained):  # of amplitudes alone: nothing tells their phases
+            self.log_gains[unheard, 0] = self.log_gains[trained, 0].median()
 
     @property
     def predicts_untrained(self) -> bool:

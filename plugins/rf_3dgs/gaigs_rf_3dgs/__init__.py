@@ -4,10 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import distributed, nn
 
 from gaigs.data import Links
 from gaigs.gaussians import SH_DC
+from gaigs.model import Prediction
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.query import Batch
 from gaigs.registry import call
@@ -57,6 +58,19 @@ class Rf3dgs(GaussianSplatting):
         self.register_buffer("stage", torch.tensor(1))
         self.register_load_state_dict_post_hook(lambda module, _: module._enter())
         self._enter()
+
+    def forward(self, batch: Batch) -> Prediction:
+        """As the pipeline's.
+
+        Raises:
+            ValueError: Several processes train, which cannot freeze what they have shared from the start.
+        """
+        if self.training and distributed.is_available() and distributed.is_initialized():
+            raise ValueError(
+                "model 'rf_3dgs' freezes its geometry within the training, which one process can do, not "
+                f"{distributed.get_world_size()}; set trainer.devices=1"
+            )
+        return super().forward(batch)
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:

@@ -55,6 +55,11 @@ class SwiftWrf(Model):
                 f"model 'swift_wrf' lays its Gaussians in the plane of a spectrum, and labels of task "
                 f"{scene.task.name!r} have no directions; take another model"
             )
+        if not grid.pitch > 0:
+            raise ValueError(
+                f"model 'swift_wrf' needs labels of two elevations or more, got {tuple(grid.shape)} directions; take "
+                "another model"
+            )
         for option, number in (("count", count), ("width", width), ("layers", layers)):
             if number < 1:
                 raise ValueError(f"model.{option} must be at least 1, got {number}")
