@@ -137,7 +137,8 @@ def report(folder: Path) -> Group:
         writer = csv.DictWriter(file, _columns(written_rows))
         writer.writeheader()
         writer.writerows(written_rows)
-    markdown = f"{_markdown(rows, titles)}\n{caption}\n"
+    failures = [f"{run.name}: {run.failure}" for run in runs if run.failure is not None]
+    markdown = f"{_markdown(rows, titles)}\n{caption}\n" + "".join(f"- without a result: {why}\n" for why in failures)
     if groups:
         markdown += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
     (folder / "ablation.md").write_text(markdown)
@@ -150,7 +151,7 @@ def report(folder: Path) -> Group:
     varied = [[value for key, value in run.overrides.items() if key not in shared] for run in runs]
     if all(varied.count(values) == 1 for values in varied):
         hidden.add("run")  # whose name would repeat the varied overrides
-    caption += "; all columns in ablation.md"
+    caption = "\n".join([*failures, f"{caption}; all columns in ablation.md"])
     tables = [_table(f"Runs of {folder}", rows, titles, hidden, caption)]
     if groups:
         tables.append(_table("Over seeds", groups, titles, hidden | {"status"}, f"{SEEDS}; all columns in ablation.md"))

@@ -369,3 +369,11 @@ def test_a_package_brings_what_is_published_of_its_own(tmp_path, monkeypatch):
         file.write_text(broken)
         with pytest.raises(ValueError, match=r"published\.yaml must have the form of conf/published\.yaml: "):
             read_published()
+
+
+def test_a_failure_is_told_where_there_is_no_table_of_systems(tmp_path):
+    write_run(tmp_path, "gaigs", 0.9)
+    write_run(tmp_path, "mlp", said=["gaigs: the disk is full"])
+    report(tmp_path)
+    assert not (tmp_path / "systems.md").exists()
+    assert "- without a result: model=mlp,seed=0: the disk is full\n" in (tmp_path / "ablation.md").read_text()
