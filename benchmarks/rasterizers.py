@@ -137,7 +137,8 @@ def _splats(means: Tensor, deviations: Tensor, uniform) -> Splats:
     angles, depths = uniform(0, math.pi, *deviations.shape[:2]), uniform(1, 5, len(means))
     axes = torch.stack((angles.cos(), -angles.sin(), angles.sin(), angles.cos()), -1).unflatten(-1, (2, 2))
     half = axes * deviations[..., None, :]
-    return Splats(means, half @ half.mT, depths, depths > 0)
+    factors = torch.linalg.cholesky(half @ half.mT)[..., [0, 1, 1], [0, 0, 1]]
+    return Splats(means, factors, depths, depths > 0)
 
 
 def inspect(scene: Scene) -> tuple[int, int, Tensor]:
@@ -151,8 +152,9 @@ def inspect(scene: Scene) -> tuple[int, int, Tensor]:
         du, dv = plane.u - splats.means2d[i, 0, None, None], plane.v - splats.means2d[i, 1, None, None]
         if plane.period is not None:
             du = du - plane.period * (du / plane.period).round()
-        a, b, _, d = torch.linalg.inv(splats.covariances2d[:, i]).flatten(-2)[..., None, None].unbind(2)
-        footprints = torch.exp(-0.5 * (a * du * du + 2 * b * du * dv + d * dv * dv))
+        p, q, r = splats.factors[:, i, :, None, None].unbind(2)
+        across = du / p
+        footprints = torch.exp(-0.5 * (across.square() + ((dv - q * across) / r).square()))
         product = opacities[:, i, None, None] * footprints
         acts = product >= ALPHA_MIN
         for bound in (ALPHA_MIN, ALPHA_MAX):
@@ -171,10 +173,10 @@ def inspect(scene: Scene) -> tuple[int, int, Tensor]:
 def run(rasterizer: Rasterizer, scene: Scene, pixels: Tensor) -> tuple[float, float, Tensor, list[Tensor]]:
     """Times of the forward and the backward pass [s], the map, and the gradients of a sum over ``pixels``."""
     splats, *parameters, plane = scene
-    parameters = [splats.means2d, splats.covariances2d, *parameters]
+    parameters = [splats.means2d, splats.factors, *parameters]
     parameters = [None if tensor is None else tensor.clone().requires_grad_() for tensor in parameters]
-    means2d, covariances2d, signal, opacities, attenuations = parameters
-    splats = Splats(means2d, covariances2d, splats.depths, splats.visible)
+    means2d, factors, signal, opacities, attenuations = parameters
+    splats = Splats(means2d, factors, splats.depths, splats.visible)
     outputs = pixels[:, None].repeat(1, signal.shape[-1], 1, 1), pixels
     start = _now(signal.device)
     image, left = rasterizer(splats, signal, opacities, attenuations, plane)

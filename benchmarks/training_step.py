@@ -75,7 +75,7 @@ class Watch(Callback):
         outputs = self.rasterizers[self.name](splats, *arguments)
         self.lap("compositing")
         self.lap_back(REST, *outputs)
-        self.lap_back("backward: rasterizer", splats.means2d, splats.covariances2d, *arguments[:-1])
+        self.lap_back("backward: rasterizer", splats.means2d, splats.factors, *arguments[:-1])
         return outputs
 
     def deform(self, deformation, inputs, residuals) -> None:

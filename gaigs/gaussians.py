@@ -10,7 +10,7 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor, nn
 
-from gaigs.geometry import covariances, from_spherical
+from gaigs.geometry import from_spherical, semi_axes
 from gaigs.scene import Scene
 
 SH_DC = 0.5 / math.sqrt(math.pi)
@@ -114,7 +114,8 @@ class Gaussians(nn.Module):
     @property
     def covariances(self) -> Float[Tensor, "n 3 3"]:
         """World frame [m²]."""
-        return covariances(self.quats, self.scales)
+        axes = semi_axes(self.quats, self.scales)
+        return axes @ axes.mT
 
     @property
     def bands(self) -> Float[Tensor, "n c k"]:

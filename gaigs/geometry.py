@@ -1,4 +1,4 @@
-"""Poses, quaternions, covariances, spherical coordinates and harmonics; conventions stand in docs/conventions.md."""
+"""Poses, quaternions, spherical coordinates and harmonics; conventions stand in docs/conventions.md."""
 
 import math
 from dataclasses import dataclass
@@ -76,10 +76,13 @@ def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, 
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
-def covariances(quats: Float[Tensor, "*batch 4"], scales: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Covariances R diag(scales²) Rᵀ [m²] of Gaussians with quaternions (w, x, y, z) and standard deviations [m]."""
-    half = quaternions_to_rotations(quats) * scales[..., None, :]
-    return half @ half.mT
+def semi_axes(quats: Float[Tensor, "*batch 4"], scales: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """R diag(scales) [m], a column an axis, of Gaussians with quaternions (w, x, y, z) and standard deviations [m].
+
+    Times its transpose this is the covariance, whose condition number is the square: of a Gaussian 10,000 times as long
+    as wide float32 would keep nothing of the width there.
+    """
+    return quaternions_to_rotations(quats) * scales[..., None, :]
 
 
 def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:

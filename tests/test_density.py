@@ -9,6 +9,7 @@ import torch
 
 from gaigs import density
 from gaigs.gaussians import Gaussians
+from gaigs.geometry import semi_axes
 from gaigs.projection.mercator import Mercator
 from gaigs.rasterizer import ALPHA_MIN
 from gaigs.rasterizer.torch import TorchRasterizer
@@ -56,7 +57,8 @@ def optimizer_of(gaussians, kind=torch.optim.AdamW):
 def render(gaussians, scene):
     grid = scene.task.directions
     projection = Mercator(grid.pitch)
-    splats = projection.project(gaussians.means, gaussians.covariances[None], scene.receivers[0].pose)
+    axes = semi_axes(gaussians.quats, gaussians.scales)[None]
+    splats = projection.project(gaussians.means, axes, scene.receivers[0].pose)
     signal, opacities = gaussians.signal.squeeze(-1)[None], gaussians.opacities[None]
     return TorchRasterizer()(splats, signal, opacities, None, projection.plane(grid))[0]
 

@@ -12,7 +12,7 @@ from gaigs.data import Links
 from gaigs.deformation import Residuals
 from gaigs.directions import Directions
 from gaigs.gaussians import SH_DC, Gaussians
-from gaigs.geometry import covariances, spherical_harmonics
+from gaigs.geometry import semi_axes, spherical_harmonics
 from gaigs.model import Model, Prediction
 from gaigs.placement import Placed
 from gaigs.projection import Splats
@@ -324,7 +324,7 @@ class GaussianSplatting(Model):
         if residuals.delta_scales is not None:
             scales = scales + residuals.delta_scales[which]
         return self.projection.project(
-            means if not self.draws_map else means[0], covariances(quats, scales), self.scene.receivers[receiver].pose
+            means if not self.draws_map else means[0], semi_axes(quats, scales), self.scene.receivers[receiver].pose
         )
 
 

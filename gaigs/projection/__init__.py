@@ -21,15 +21,22 @@ class Splats:
 
     Attributes:
         means2d: Centres (n, 2) as (u, v); (b, n, 2) where they follow the transmitter, which ``aperture`` alone takes.
-        covariances2d: (1 or b, n, 2, 2); one for all transmitters where nothing deforms the Gaussians.
+        factors: p, q and r of the lower triangular factor [[p, 0], [q, r]] of each covariance, p and r above 0
+            (1 or b, n, 3); one for all transmitters where nothing deforms the Gaussians.
         depths: Distance to the receiver, as many as centres [m].
         visible: False where a Gaussian has no direction (it sits on the receiver), as many as centres.
     """
 
     means2d: Float[Tensor, "*b n 2"]
-    covariances2d: Float[Tensor, "b n 2 2"]
+    factors: Float[Tensor, "b n 3"]
     depths: Float[Tensor, "*b n"]
     visible: Bool[Tensor, "*b n"]
+
+    @property
+    def covariances2d(self) -> Float[Tensor, "b n 2 2"]:
+        """The factor times its transpose, which has fewer digits for what is long and thin."""
+        p, q, r = self.factors.unbind(-1)
+        return torch.stack((p * p, p * q, p * q, q * q + r * r), -1).unflatten(-1, (2, 2))
 
 
 @dataclass(frozen=True)
@@ -91,12 +98,12 @@ class Projection(ABC):
         u, v = self.coordinates(vectors if vectors.ndim == 3 else vectors[None]).unbind(-1)
         return Plane(u, v, self.period)
 
-    def project(self, means: Float[Tensor, "*b n 3"], covariances: Float[Tensor, "b n 3 3"], receiver: Pose) -> Splats:
+    def project(self, means: Float[Tensor, "*b n 3"], semi_axes: Float[Tensor, "b n 3 3"], receiver: Pose) -> Splats:
         """Gaussians as the receiver sees them.
 
         Args:
             means: Centres, world frame [m]; one set, or one a transmitter.
-            covariances: World frame [m²]; one set (b = 1), or one a transmitter.
+            semi_axes: A column for each axis, world frame [m]; one set (b = 1), or one a transmitter.
             receiver: Position [m] and orientation of the antenna array.
         """
         receiver = receiver.to(means)
@@ -105,6 +112,23 @@ class Projection(ABC):
         visible = ~(depths < NEAR)  # a centre that is NaN is no reason to hide it
         # A Gaussian on the receiver has no direction: a stand-in keeps values and gradients finite, `visible` hides it.
         points = torch.where(visible[..., None], points, points.new_tensor([1.0, 0.0, 0.0]))
-        half = self.jacobian(points) @ receiver.rotation.mT
-        pixel = self.pixel_variance * torch.eye(2, dtype=means.dtype, device=means.device)
-        return Splats(self.coordinates(points), half @ covariances @ half.mT + pixel, depths, visible)
+        across, along = (self.jacobian(points) @ receiver.rotation.mT @ semi_axes).unbind(-2)
+        return Splats(self.coordinates(points), factor(across, along, self.pixel_variance), depths, visible)
+
+
+def factor(
+    across: Float[Tensor, "*batch k"], along: Float[Tensor, "*batch k"], variance: float
+) -> Float[Tensor, "*batch 3"]:
+    """p, q and r of the lower triangular factor of [across; along] [across; along]' + variance I.
+
+    With e = across / p: q = e . along and r² = variance + |e x along|² + variance |along|² / p². Roots are of sums of
+    squares alone, so no digit is lost to a difference, however long and thin the ellipse is.
+
+    Args:
+        across, along: Footprints of the semi-axes in u and v, k = 3.
+        variance: Above 0, added to both of the ellipse's.
+    """
+    p = (across.square().sum(-1) + variance).sqrt()
+    unit = across / p[..., None]
+    beside = torch.linalg.cross(unit, along).square().sum(-1) + (variance / p.square()) * along.square().sum(-1)
+    return torch.stack((p, (unit * along).sum(-1), (beside + variance).sqrt()), -1)

@@ -25,7 +25,7 @@ class Rasterizer(Protocol):
         map = sum_i signal_i A_i T_i        T_i = prod_{j<i} (1 - A_j) d_j^{G_j}
 
     x is the pixel minus the splat's centre, u taken to the nearest image where the plane is periodic. Splats that are
-    not ``visible`` do nothing. Every input but depths is differentiable: means2d, covariances2d, signal, opacities,
+    not ``visible`` do nothing. Every input but depths is differentiable: means2d, factors, signal, opacities,
     attenuations. A signal may have any number of channels.
 
     A rasterizer with ``draws_map = False`` is not called. It has two methods instead, on splats of the plane of

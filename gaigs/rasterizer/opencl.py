@@ -78,7 +78,7 @@ class OpenCLRasterizer:
         plane: Plane,
     ) -> bool:
         """Whether dtype, device and number of what it is given suit it; where they do not, ``torch`` takes them."""
-        floats = splats.means2d, splats.covariances2d, splats.depths, signal, opacities, attenuations, plane.u, plane.v
+        floats = splats.means2d, splats.factors, splats.depths, signal, opacities, attenuations, plane.u, plane.v
         suits = (x is None or (x.dtype == torch.float32 and x.device.type == "cpu") for x in floats)
         return all(suits) and signal.shape[2] >= 1 and signal.shape[1] < SPLATS
 
@@ -101,8 +101,7 @@ class OpenCLRasterizer:
         call = functools.partial(_Composite.apply, open_queue(self.device), splats, plane, torch.is_grad_enabled())
         # What autograd differentiates has to be an argument of its own; `_Render` finds it in the splats.
         chunks = [
-            call(splats.means2d, splats.covariances2d, part, opacities, attenuations)
-            for part in signal.split(CHANNELS, 2)
+            call(splats.means2d, splats.factors, part, opacities, attenuations) for part in signal.split(CHANNELS, 2)
         ]
         images, transmittances = zip(*chunks, strict=True)
         return torch.cat(images, 1) if len(images) > 1 else images[0], transmittances[0]
@@ -141,7 +140,7 @@ def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tens
     height, width = plane.shape
     tensors = {
         "means2d": (splats.means2d, [(n, 2)]),
-        "covariances2d": (splats.covariances2d, [(1, n, 2, 2), (b, n, 2, 2)]),
+        "factors": (splats.factors, [(1, n, 3), (b, n, 3)]),
         "depths": (splats.depths, [(n,)]),
         "visible": (splats.visible, [(n,)]),
         "signal": (signal, [(b, n, c)]),
@@ -170,7 +169,7 @@ def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tens
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, queue, splats, plane, grad_enabled, means, covariances, signal, opacities, attenuations):
+    def forward(ctx, queue, splats, plane, grad_enabled, means, factors, signal, opacities, attenuations):
         ctx.render = _Render(queue, splats, signal, opacities, attenuations, plane)
         return ctx.render.forward(grad_enabled and any(ctx.needs_input_grad))
 
@@ -200,7 +199,7 @@ class _Render:
         self.queue = queue
         b, n, self.channels = signal.shape
         height, width = plane.shape
-        sets = len(splats.covariances2d)
+        sets = len(splats.factors)
         groups = b if sets > 1 else max(1, -(-b // GROUP))
         group = -(-b // groups)
         down, across, words = -(-height // ROWS), -(-width // COLUMNS), -(-n // WORD)
@@ -224,7 +223,7 @@ class _Render:
         geometry = self._empty(sets * words * WORD * GEOMETRY)
         appearance = self._empty(words * WORD * b * appearance_size)
         hits = self._empty(sets * words * (across + down if separable else 2 * self.tiles))
-        inputs = splats.means2d, splats.covariances2d, splats.visible, signal, opacities, attenuations
+        inputs = splats.means2d, splats.factors, splats.visible, signal, opacities, attenuations
         inputs = [self._share(tensor) for tensor in inputs]  # named, so that they live until the kernels are through
         self._run("prepare", sets * words, order, *inputs, spans, geometry, appearance, hits)
 
@@ -263,7 +262,7 @@ class _Render:
         images = self._share(image_gradient), self._share(left_gradient)
         partials = self._empty(self.groups_per_list * sizes.entries * self.partials)
         self._run("backward", sizes.groups * self.tiles, *self.scene, *self.path, *images, partials)
-        shapes = (n, 2), (sizes.sets, n, 2, 2), (b, n, self.channels), (b, n), (b, n) if self.attenuates else None
+        shapes = (n, 2), (sizes.sets, n, 3), (b, n, self.channels), (b, n), (b, n) if self.attenuates else None
         gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
         outputs = [self._share(gradient) for gradient in gradients]
         *_, entries, geometry, appearance = self.scene

@@ -40,14 +40,13 @@ class TorchRasterizer:
         """The map, and the transmittance left behind the last splat; see ``gaigs.rasterizer.Rasterizer``."""
         order = torch.argsort(splats.depths, stable=True)
         order = order[splats.visible[order]]
-        a, b, c, d = splats.covariances2d[:, order].flatten(-2).unbind(-1)
-        conics = torch.stack((d, -(b + c) / 2, a), -1) / (a * d - b * c)[..., None]
+        factors = splats.factors[:, order]
         with torch.no_grad():
-            tiles = _Tiles(plane, splats.means2d[order], torch.stack((a, d), -1), opacities[:, order])
+            tiles = _Tiles(plane, splats.means2d[order], factors, opacities[:, order])
         return _Composite.apply(
             tiles,
             splats.means2d[order],
-            conics,
+            factors,
             signal[:, order],
             opacities[:, order],
             None if attenuations is None else attenuations[:, order].log(),
@@ -57,7 +56,7 @@ class TorchRasterizer:
 class _Tiles:
     """Which splats reach which tile, in chunks of tiles whose lists have similar lengths."""
 
-    def __init__(self, plane: Plane, means: Tensor, variances: Tensor, opacities: Tensor):
+    def __init__(self, plane: Plane, means: Tensor, factors: Tensor, opacities: Tensor):
         self.shape = plane.shape
         self.period = None if plane.period is None else _split(plane.period, plane.u.dtype)
         self.down, self.across = (-(-edge // TILE) for edge in self.shape)
@@ -69,8 +68,9 @@ class _Tiles:
 
         # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box has these halves.
         # Comparisons with NaN keep the splat, for what is broken must show.
-        reach = 2 * (opacities / ALPHA_MIN).log().clamp_min(0)
-        halves = (reach[..., None] * variances).amax(0).sqrt()
+        reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()
+        p, q, r = factors.unbind(-1)
+        halves = (reach[..., None] * torch.stack((p, torch.hypot(q, r)), -1)).amax(0)
         touches = ~(opacities.amax(0) < ALPHA_MIN).expand(self.down * self.across, -1)
         for axis, (coordinate, period) in enumerate(((u, self.period), (v, None))):
             coordinate = coordinate.flatten(1)
@@ -146,10 +146,10 @@ def _nearest(a: Tensor, b: Tensor, period: tuple[float, float] | None) -> Tensor
 
 @dataclass
 class _Weights:
-    """One chunk composited: everything is (b, t, k, y x) but ``left`` (b, t, y x)."""
+    """One chunk composited: all is (b, t, k, y x) but ``left`` (b, t, y x), and ``s`` and ``y`` of ``_whiten``."""
 
-    du: Tensor
-    dv: Tensor
+    s: Tensor
+    y: Tensor
     footprint: Tensor
     alpha: Tensor
     live: Tensor
@@ -157,15 +157,23 @@ class _Weights:
     left: Tensor
 
 
+def _whiten(du: Tensor, dv: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
+    """(s, y) = L^-1 (du, dv), in which the footprint is exp(-(s² + y²) / 2).
+
+    Of all forms of the exponent this one loses the fewest digits where a splat is long and thin.
+    """
+    p, q, r = (part[..., None, None] for part in factors.unbind(-1))
+    s = du / p
+    return s, dv / r - (q / r) * s
+
+
 def _weigh(
-    tiles: _Tiles, chosen: Tensor, k: Tensor, means: Tensor, conics: Tensor, opacities: Tensor, logs: Tensor | None
+    tiles: _Tiles, chosen: Tensor, k: Tensor, means: Tensor, factors: Tensor, opacities: Tensor, logs: Tensor | None
 ) -> _Weights:
     """Footprints, opacities and transmittances of one chunk: tiles ``chosen`` (t,) and their splats (t, k)."""
-    du, dv = tiles.offsets(chosen, means[k])
-    uu, uv, vv = (conic[..., None, None] for conic in conics[:, k].unbind(-1))
-    exponent = (-0.5 * uu * du * du) + (-0.5 * vv * dv * dv)
-    exponent = exponent.addcmul_(-uv * dv, du).flatten(-2)
-    footprint = exponent.exp_()
+    s, y = _whiten(*tiles.offsets(chosen, means[k]), factors[:, k])
+    exponent = torch.addcmul(-0.5 * s * s, y, y, value=-0.5)
+    footprint = exponent.exp_().flatten(-2)
     alpha = footprint * opacities[:, k, None]
     live = alpha >= ALPHA_MIN
     alpha = alpha.clamp_max(ALPHA_MAX).mul_(live)
@@ -174,7 +182,7 @@ def _weigh(
         passed.addcmul_(footprint * live, logs[:, k, None])
     total = passed.cumsum(-2)
     left = total[..., -1, :].exp()
-    return _Weights(du, dv, footprint, alpha, live, total.sub_(passed).exp_(), left)
+    return _Weights(s, y, footprint, alpha, live, total.sub_(passed).exp_(), left)
 
 
 class _Composite(torch.autograd.Function):
@@ -182,15 +190,15 @@ class _Composite(torch.autograd.Function):
     d/dA_i = T_i D_i - S_i / (1 - A_i), and a change of log T behind splat i acts with S_i."""
 
     @staticmethod
-    def forward(ctx, tiles, means, conics, signal, opacities, logs):
+    def forward(ctx, tiles, means, factors, signal, opacities, logs):
         ctx.tiles = tiles
-        ctx.save_for_backward(means, conics, signal, opacities, logs)
+        ctx.save_for_backward(means, factors, signal, opacities, logs)
         b, _, c = signal.shape
         image = signal.new_zeros(b, c, tiles.down * tiles.across, TILE * TILE)
         left = signal.new_ones(b, tiles.down * tiles.across, TILE * TILE)
-        means, conics, signal, opacities, logs = _filled(means, conics, signal, opacities, logs)
+        means, factors, signal, opacities, logs = _filled(means, factors, signal, opacities, logs)
         for chosen, k in tiles.chunks:
-            w = _weigh(tiles, chosen, k, means, conics, opacities, logs)
+            w = _weigh(tiles, chosen, k, means, factors, opacities, logs)
             image[:, :, chosen] = (signal[:, k].mT @ w.transmittance.mul_(w.alpha)).transpose(1, 2)
             left[:, chosen] = w.left
         return tiles.join(image), tiles.join(left)
@@ -200,12 +208,12 @@ class _Composite(torch.autograd.Function):
     def backward(ctx, image_gradient, left_gradient):
         tiles = ctx.tiles
         inputs = _filled(*ctx.saved_tensors)
-        means, conics, signal, opacities, logs = inputs
+        means, factors, signal, opacities, logs = inputs
         gradients = [None if tensor is None else torch.zeros_like(tensor) for tensor in inputs]
         image_gradient = tiles.split(image_gradient)
         left_gradient = tiles.split(left_gradient)
         for chosen, k in tiles.chunks:
-            w = _weigh(tiles, chosen, k, means, conics, opacities, logs)
+            w = _weigh(tiles, chosen, k, means, factors, opacities, logs)
             towards = image_gradient[:, :, chosen].transpose(1, 2)
             blend = w.alpha * w.transmittance
             d_signal = blend @ towards.mT
@@ -222,38 +230,41 @@ class _Composite(torch.autograd.Function):
                 covered = behind.mul_(w.footprint).mul_(w.live)
                 d_logs = covered.sum(-1)
                 d_exponent = d_exponent + covered * logs[:, k][..., None]
-            d_means, d_conics = _moments(d_exponent.unflatten(-1, (TILE, TILE)), w.du, w.dv, conics[:, k])
-            found = (d_means.sum(0), d_conics.sum_to_size(conics[:, k].shape), d_signal, d_opacity, d_logs)
+            d_means, d_factors = _moments(d_exponent.unflatten(-1, (TILE, TILE)), w.s, w.y, factors[:, k])
+            found = (d_means.sum(0), d_factors.sum_to_size(factors[:, k].shape), d_signal, d_opacity, d_logs)
             for gradient, part, axis in zip(gradients, found, (0, 1, 1, 1, 1), strict=True):
                 if gradient is not None:
                     gradient.index_add_(axis, k.flatten(), part.flatten(axis, axis + 1))
-        means, conics, *others = gradients  # the last splat is the filling
-        return None, means[:-1], conics[:, :-1], *(None if other is None else other[:, :-1] for other in others)
+        means, factors, *others = gradients  # the last splat is the filling
+        return None, means[:-1], factors[:, :-1], *(None if other is None else other[:, :-1] for other in others)
 
 
-def _filled(means, conics, signal, opacities, logs):
+def _filled(means, factors, signal, opacities, logs):
     """The splats and, behind them, one that does nothing: it fills the tiles' lists up."""
     pad = torch.nn.functional.pad
     return (
         pad(means, (0, 0, 0, 1)),
-        pad(conics, (0, 0, 0, 1)),
+        pad(factors, (0, 0, 0, 1), value=1.0),
         pad(signal, (0, 0, 0, 1)),
         pad(opacities, (0, 1)),
         None if logs is None else pad(logs, (0, 1)),
     )
 
 
-def _moments(d_exponent: Tensor, du: Tensor, dv: Tensor, conics: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of centres (b, t, k, 2) and conics (b, t, k, 3) from that of the exponents (b, t, k, y, x)."""
-    if du.shape[-2] == dv.shape[-1] == 1:  # the plane is a product of columns and rows: contract the columns first
-        powers = torch.cat((torch.ones_like(du), du, du * du), -2).mT
-        m0, m1, m2 = (d_exponent @ powers).unbind(-1)
-        dv = dv.squeeze(-1)
+def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from that of the exponents (b, t, k, y, x).
+
+    Sums run over s and y themselves: those over du and dv would cancel where a splat is long and thin.
+    """
+    d_y = d_exponent * y
+    yy = (d_y * y).sum((-2, -1))
+    if s.shape[-2] == 1:  # the same in all rows: contract the columns first
+        d_s, ss = (d_exponent @ torch.cat((s, s * s), -2).mT).sum(-2).unbind(-1)
+        d_y, sy = (d_y @ torch.cat((torch.ones_like(s), s), -2).mT).sum(-2).unbind(-1)
     else:
-        m0, m1 = d_exponent.flatten(-2), (d_exponent * du).flatten(-2)
-        du, dv = (offset.flatten(-2) for offset in torch.broadcast_tensors(du, dv))
-        m2 = m1 * du
-    u, v = m1.sum(-1), (m0 * dv).sum(-1)
-    uu, uv, vv = m2.sum(-1), (m1 * dv).sum(-1), (m0 * dv * dv).sum(-1)
-    a, b, c = conics.unbind(-1)
-    return torch.stack((a * u + b * v, b * u + c * v), -1), torch.stack((-0.5 * uu, -uv, -0.5 * vv), -1)
+        weighed = d_exponent * s
+        d_s, ss = weighed.sum((-2, -1)), (weighed * s).sum((-2, -1))
+        d_y, sy = d_y.sum((-2, -1)), (d_y * s).sum((-2, -1))
+    p, q, r = factors.unbind(-1)
+    d_means = torch.stack(((d_s - q / r * d_y) / p, d_y / r), -1)
+    return d_means, torch.stack(((ss - q / r * sy) / p, sy / r, yy / r), -1)

@@ -99,10 +99,8 @@ def _scenes() -> Iterator[tuple[str, dict]]:
     def scene(n=9, b=2, array=scattered, spread=(1e-3, 0.3), coherence=(0, 1), bandwidth=4e8, own=True):
         random = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
         rows = (b,) if own else ()
-        half = random(*spread, b if own else 1, n, 2, 2)
-        splats = Splats(
-            random(-0.7, 0.7, *rows, n, 2), half @ half.mT, random(1, 9, *rows, n), random(0, 1, *rows, n) > 0.1
-        )
+        factors = random(*spread, b if own else 1, n, 3) * torch.tensor([1, -1, 1])
+        splats = Splats(random(-0.7, 0.7, *rows, n, 2), factors, random(1, 9, *rows, n), random(0, 1, *rows, n) > 0.1)
         return {
             "splats": splats,
             "amplitudes": torch.randn(b, n, dtype=torch.complex64, generator=generator),
@@ -150,25 +148,23 @@ ARGUMENTS = {
 
 def _sum(function, what: str, scene: dict) -> dict[str, Tensor]:
     """What a function gives, and the gradients of a fixed sum of it, each times the size of what it is by."""
-    leaves = {"means2d": scene["splats"].means2d, "covariances2d": scene["splats"].covariances2d}
+    leaves = {"means2d": scene["splats"].means2d, "factors": scene["splats"].factors}
     leaves |= {name: scene[name] for name in LEAVES[what] if scene[name] is not None}
     leaves = {name: leaf.detach().clone().requires_grad_() for name, leaf in leaves.items()}
-    splats = replace(scene["splats"], means2d=leaves["means2d"], covariances2d=leaves["covariances2d"])
+    splats = replace(scene["splats"], means2d=leaves["means2d"], factors=leaves["factors"])
     value = function(splats, *(leaves.get(name, scene[name]) for name in ARGUMENTS[what]))
     gradients = torch.autograd.grad(fixed_sum(value), [*leaves.values()], allow_unused=True)
     results = {what: value.detach()}
     for (name, leaf), gradient in zip(leaves.items(), gradients, strict=True):
         size = leaf.detach().abs().amax() if leaf.numel() else 1
-        gradient = torch.zeros_like(leaf) if gradient is None else gradient * size
-        # A covariance is symmetric: how its gradient is shared between [0, 1] and [1, 0] does not matter.
-        results[f"gradient of {what} by {name}"] = (gradient + gradient.mT) / 2 if name == "covariances2d" else gradient
+        results[f"gradient of {what} by {name}"] = torch.zeros_like(leaf) if gradient is None else gradient * size
     return results
 
 
 def _cast(scene: dict, device: torch.device | str, dtype: torch.dtype) -> dict:
     def to(part):
         if isinstance(part, Splats):
-            return Splats(*map(to, (part.means2d, part.covariances2d, part.depths)), part.visible.to(device))
+            return Splats(*map(to, (part.means2d, part.factors, part.depths)), part.visible.to(device))
         if isinstance(part, Tensor):
             return part.to(device, dtype.to_complex() if part.is_complex() else dtype)
         return part
@@ -180,7 +176,7 @@ def _only_last(scene: dict) -> dict:
     """The last query by itself."""
     splats = scene["splats"]
     if splats.means2d.ndim == 3:
-        parts = splats.means2d[-1:], splats.covariances2d[-1:], splats.depths[-1:], splats.visible[-1:]
+        parts = splats.means2d[-1:], splats.factors[-1:], splats.depths[-1:], splats.visible[-1:]
         splats = Splats(*parts)
     rows = {name: scene[name][-1:] for name in ("amplitudes", "lengths", "carriers", "offsets")}
     return scene | rows | {"splats": splats}
@@ -188,10 +184,10 @@ def _only_last(scene: dict) -> dict:
 
 def _check_nan_shows(rasterizer, device: torch.device | str) -> None:
     """What is broken must not vanish."""
-    for name in ("means2d", "covariances2d", "amplitudes"):
+    for name in ("means2d", "factors", "amplitudes"):
         scene = _cast(next(_scenes())[1], device, torch.float32)
         splats = scene["splats"]
-        broken = {"means2d": splats.means2d, "covariances2d": splats.covariances2d}.get(name, scene["amplitudes"])
+        broken = {"means2d": splats.means2d, "factors": splats.factors}.get(name, scene["amplitudes"])
         broken[:, int(splats.visible[0].int().argmax())] = torch.nan
         for what, arguments in ARGUMENTS.items():
             value = getattr(rasterizer, what)(splats, *(scene[argument] for argument in arguments))

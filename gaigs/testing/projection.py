@@ -68,21 +68,19 @@ def _check_footprints(projection: Projection, device: torch.device | str) -> Non
     identity = Pose(torch.zeros(3), torch.eye(3))
     for dtype in (torch.float64, torch.float32):
         means = torch.tensor(places, dtype=dtype, device=device).requires_grad_()
-        covariances = (0.01 * torch.eye(3, dtype=dtype, device=device)).repeat(2, len(places), 1, 1).requires_grad_()
-        splats = projection.project(means, covariances, identity)
-        shapes = {"means2d": (len(places), 2), "covariances2d": (2, len(places), 2, 2), "depths": (len(places),)}
+        semi_axes = (0.1 * torch.eye(3, dtype=dtype, device=device)).repeat(2, len(places), 1, 1).requires_grad_()
+        splats = projection.project(means, semi_axes, identity)
+        shapes = {"means2d": (len(places), 2), "factors": (2, len(places), 3), "depths": (len(places),)}
         for name, shape in shapes.items():
             require_tensor(f"{name} at hard places", getattr(splats, name), shape, dtype, device)
         require(
             splats.visible.tolist() == [True] * (len(places) - 1) + [False], "only what sits on the receiver is hidden"
         )
         require_close(splats.depths, means.norm(dim=-1), 1e-5, "depths must be distances to the receiver")
-        require_gradients([splats.means2d, splats.covariances2d], {"means": means, "covariances": covariances})
-        if dtype == torch.float64:
-            smallest = torch.linalg.eigvalsh(splats.covariances2d)[..., 0]
-            require(bool(smallest.gt(0).all()), "covariances2d must be positive definite")
-        shared = projection.project(means, covariances[:1], identity).covariances2d
-        require_close(shared, splats.covariances2d[:1], 1e-6, "covariances2d must not depend on the other transmitters")
+        require_gradients([splats.means2d, splats.factors], {"means": means, "semi_axes": semi_axes})
+        require(bool(splats.factors[..., [0, 2]].gt(0).all()), "p and r of factors must be above 0")
+        shared = projection.project(means, semi_axes[:1], identity).factors
+        require_close(shared, splats.factors[:1], 1e-6, "factors must not depend on the other transmitters")
 
 
 def _check_frames(projection: Projection, points: Tensor) -> None:
@@ -90,10 +88,9 @@ def _check_frames(projection: Projection, points: Tensor) -> None:
     n, exact = len(points), {"dtype": points.dtype, "device": points.device}
     turn = quaternions_to_rotations(torch.tensor([0.4, -0.2, 0.7, 0.1], **exact))
     receiver = Pose(torch.tensor([1.0, -2.0, 0.5], **exact), turn)
-    covariances = torch.diag(torch.tensor([0.01, 0.02, 0.05], **exact))
-    here = projection.project(points, covariances.expand(1, n, 3, 3), Pose(torch.zeros(3), torch.eye(3)))
-    turned = (turn @ covariances @ turn.mT).expand(1, n, 3, 3)
-    there = projection.project(receiver.world(points), turned, receiver)
-    for name in ("means2d", "covariances2d", "depths"):
+    semi_axes = torch.diag(torch.tensor([0.1, 0.14, 0.22], **exact))
+    here = projection.project(points, semi_axes.expand(1, n, 3, 3), Pose(torch.zeros(3), torch.eye(3)))
+    there = projection.project(receiver.world(points), (turn @ semi_axes).expand(1, n, 3, 3), receiver)
+    for name in ("means2d", "factors", "depths"):
         rule = f"{name} must be those in the receiver's own frame"
         require_close(getattr(there, name), getattr(here, name), 1e-9, rule)

@@ -77,9 +77,9 @@ def _footprints(splats: Splats, plane: Plane) -> tuple[Tensor, Float[Tensor, "b 
     du, dv = plane.u.double() - u, plane.v.double() - v
     if plane.period is not None:
         du = torch.remainder(du + plane.period / 2, plane.period) - plane.period / 2
-    x = torch.stack(torch.broadcast_tensors(du, dv), -1)
-    precisions = torch.linalg.inv(splats.covariances2d[:, order].double())
-    return order, torch.exp(-0.5 * torch.einsum("nrsi,bnij,nrsj->bnrs", x, precisions, x))
+    p, q, r = splats.factors[:, order].double()[..., None, None].unbind(2)
+    s = du / p
+    return order, torch.exp(-0.5 * (s.square() + ((dv - q * s) / r).square()))
 
 
 @torch.no_grad()
@@ -104,7 +104,8 @@ def _scenes() -> Iterator[tuple[str, tuple]]:
         turns = random(0, math.pi, b if own else 1, n)
         axes = torch.stack((turns.cos(), -turns.sin(), turns.sin(), turns.cos()), -1).unflatten(-1, (2, 2))
         half = axes * random(math.log(spread[0]), math.log(spread[1]), len(turns), n, 2).exp()[..., None, :]
-        splats = Splats(random(low, high, n, 2), half @ half.mT, random(0.5, 5, n), random(0, 1, n) > 0.1)
+        factors = torch.linalg.cholesky(half @ half.mT)[..., [0, 1, 1], [0, 0, 1]]
+        splats = Splats(random(low, high, n, 2), factors, random(0.5, 5, n), random(0, 1, n) > 0.1)
         signal = torch.randn(b, n, c, generator=generator)
         return splats, signal, random(*opacity, b, n), random(0.3, 1, b, n) if attenuations else None, plane
 
@@ -132,48 +133,46 @@ def _scenes() -> Iterator[tuple[str, tuple]]:
     splats.depths.round_()
     yield "equal depths", (splats, *rest)
     splats, *rest = scene()
-    splats.covariances2d[:, ~splats.visible], splats.means2d[~splats.visible] = torch.nan, torch.inf
+    splats.factors[:, ~splats.visible], splats.means2d[~splats.visible] = torch.nan, torch.inf
     yield "rubbish that is not visible", (splats, *rest)
 
 
 def _render(rasterizer: Rasterizer, arguments: tuple, pixels: Bool[Tensor, "b rows columns"]) -> dict[str, Tensor]:
     """Map and transmittance at ``pixels``, and the gradients of a fixed function of both."""
     splats, signal, opacities, attenuations, plane = arguments
-    leaves = {"means2d": splats.means2d, "covariances2d": splats.covariances2d}
+    leaves = {"means2d": splats.means2d, "factors": splats.factors}
     leaves |= {"signal": signal, "opacities": opacities, "attenuations": attenuations}
     leaves = {name: None if leaf is None else leaf.detach().clone().requires_grad_() for name, leaf in leaves.items()}
-    means2d, covariances2d, *others = leaves.values()
-    image, left = rasterizer(replace(splats, means2d=means2d, covariances2d=covariances2d), *others, plane)
+    means2d, factors, *others = leaves.values()
+    image, left = rasterizer(replace(splats, means2d=means2d, factors=factors), *others, plane)
     image, left = image * pixels[:, None], left * pixels
     (fixed_sum(image) + fixed_sum(left)).backward()
     results = {"map": image.detach(), "transmittance": left.detach()}
     for name, leaf in leaves.items():
         if leaf is not None:
-            gradient = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
-            # A covariance is symmetric: how its gradient is shared between [0, 1] and [1, 0] does not matter.
-            results[f"gradient of {name}"] = (gradient + gradient.mT) / 2 if name == "covariances2d" else gradient
+            results[f"gradient of {name}"] = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
     return results
 
 
 def _cast(arguments: tuple, device: torch.device | str, dtype: torch.dtype) -> tuple:
     splats, signal, opacities, attenuations, plane = arguments
     to = lambda tensor: None if tensor is None else tensor.to(device, dtype)
-    splats = Splats(*map(to, (splats.means2d, splats.covariances2d, splats.depths)), splats.visible.to(device))
+    splats = Splats(*map(to, (splats.means2d, splats.factors, splats.depths)), splats.visible.to(device))
     return splats, to(signal), to(opacities), to(attenuations), Plane(to(plane.u), to(plane.v), plane.period)
 
 
 def _only_last(arguments: tuple) -> tuple:
     """The last transmitter by itself."""
     splats, signal, opacities, attenuations, plane = arguments
-    splats = replace(splats, covariances2d=splats.covariances2d[-1:])
+    splats = replace(splats, factors=splats.factors[-1:])
     return splats, signal[-1:], opacities[-1:], None if attenuations is None else attenuations[-1:], plane
 
 
 def _check_nan_shows(rasterizer: Rasterizer, device: torch.device | str) -> None:
     """What is broken must not vanish."""
-    for name in ("means2d", "covariances2d", "signal", "opacities"):
+    for name in ("means2d", "factors", "signal", "opacities"):
         splats, signal, opacities, attenuations, plane = _cast(next(_scenes())[1], device, torch.float32)
-        broken = {"means2d": splats.means2d[None], "covariances2d": splats.covariances2d, "signal": signal}
+        broken = {"means2d": splats.means2d[None], "factors": splats.factors, "signal": signal}
         front = torch.where(splats.visible, splats.depths, torch.inf).argmin()
         broken.get(name, opacities)[:, front] = torch.nan
         image, _ = rasterizer(splats, signal, opacities, attenuations, plane)

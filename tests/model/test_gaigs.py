@@ -9,7 +9,7 @@ from torch import nn
 
 from gaigs.data import Split
 from gaigs.directions import Grid
-from gaigs.geometry import covariances
+from gaigs.geometry import semi_axes
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.placement import Placed, Placement
 from gaigs.query import Query
@@ -31,10 +31,10 @@ def test_it_is_the_papers_pipeline_step_by_step(build, batch, links):
     gaussians, pose = model.gaussians, links.receivers[0].pose
     residuals = excite(model, batch.query)
     quats = torch.nn.functional.normalize(gaussians.quats) + residuals.delta_quats
-    matrices = covariances(quats, gaussians.log_scales.exp() + residuals.delta_scales)
+    axes = semi_axes(quats, gaussians.log_scales.exp() + residuals.delta_scales)
     signal = 0.28209479 * (gaussians.signal + residuals.delta_signal)[..., 0]  # times the constant spherical harmonic
     opacities = (gaussians.opacity_logits.sigmoid() + residuals.delta_opacities).clamp(0, 1)
-    splats = model.projection.project(gaussians.means, matrices, pose)
+    splats = model.projection.project(gaussians.means, axes, pose)
     plane = model.projection.plane(links.task.directions)
     image, _ = rasterize_densely(splats, signal, opacities, residuals.attenuations, plane)
     value, penalties = model(batch)
@@ -136,7 +136,7 @@ def test_only_deformed_gaussians_need_a_footprint_for_each_transmitter(build, ba
         watch(model, drawn)
         model(batch)
         (arguments,) = drawn
-        assert arguments[0].covariances2d.shape == (sets, 40, 2, 2)
+        assert arguments[0].factors.shape == (sets, 40, 3)
         drawn.clear()
 
 

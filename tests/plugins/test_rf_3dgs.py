@@ -11,7 +11,7 @@ from scipy.special import sph_harm_y
 from splatting import build, composed, repository, run
 
 from gaigs.gaussians import SH_DC
-from gaigs.geometry import covariances
+from gaigs.geometry import semi_axes
 from gaigs.registry import registry
 from gaigs.testing import check_model, example_links
 from gaigs.testing.rasterizer import rasterize_densely
@@ -145,8 +145,8 @@ def test_the_rendering_equation_is_splattings_with_harmonics_towards_the_transmi
                     wave = sph_harm_y(n, abs(m), math.acos(z), math.atan2(y, x))
                     term = wave.real if m == 0 else math.sqrt(2) * (wave.real if m > 0 else wave.imag)
                     signal[b, i] += own[n**2 + n + m] * term
-    matrices = covariances(gaussians.quats, gaussians.scales)[None]
-    splats = model.projection.project(gaussians.means, matrices, LINKS.receivers[1].pose)
+    axes = semi_axes(gaussians.quats, gaussians.scales)[None]
+    splats = model.projection.project(gaussians.means, axes, LINKS.receivers[1].pose)
     grid = LINKS.task.directions
     opacities = gaussians.opacities.expand(2, -1)
     plane = model.projection.plane(grid.to(torch.float64))

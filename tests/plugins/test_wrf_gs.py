@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from gaigs.deformation.two_branch import CLEAR, DARKEST
 from gaigs.directions import Grid
-from gaigs.geometry import covariances
+from gaigs.geometry import semi_axes
 from gaigs.placement import Placed
 from gaigs.query import Query
 from gaigs.testing import check_deformation, check_pooling, check_tokenizer, example_links
@@ -156,8 +156,8 @@ def test_its_rendering_is_the_dense_reference(model):
     tokens = model.tokenizer(placed, gaussians.opacities.detach(), query)
     signal, attenuations = map(torch.from_numpy, transcribed(model.deformation, tokens, placed, query))
     with torch.no_grad():
-        matrices = covariances(normalize(gaussians.quats), gaussians.log_scales.exp())[None]
-        splats = model.projection.project(gaussians.means, matrices, pose)
+        axes = semi_axes(normalize(gaussians.quats), gaussians.log_scales.exp())[None]
+        splats = model.projection.project(gaussians.means, axes, pose)
         opacities = gaussians.opacity_logits.sigmoid().expand(3, -1)
         plane = model.projection.plane(LINKS.task.directions)
         # The network's signal in place of the constant spherical harmonic's coefficient.

@@ -8,7 +8,7 @@ import torch
 from splatting import build, check_task, composed, run
 from torch.nn.functional import normalize
 
-from gaigs.geometry import covariances
+from gaigs.geometry import semi_axes
 from gaigs.placement import Placed
 from gaigs.testing import check_deformation, check_tokenizer, example_links
 from gaigs.testing.rasterizer import rasterize_densely
@@ -123,8 +123,8 @@ def test_its_rendering_is_the_dense_reference(model):
     gaussians, tokens = model.gaussians, ask(model)[0]
     quats, scales, signal = map(torch.from_numpy, transcribed(model.deformation, tokens, channels=2))
     with torch.no_grad():
-        matrices = covariances(normalize(gaussians.quats) + quats, gaussians.log_scales.exp() + scales)
-        splats = model.projection.project(gaussians.means.double(), matrices, LINKS.receivers[0].pose)
+        axes = semi_axes(normalize(gaussians.quats) + quats, gaussians.log_scales.exp() + scales)
+        splats = model.projection.project(gaussians.means.double(), axes, LINKS.receivers[0].pose)
         opacities = gaussians.opacity_logits.sigmoid().expand(3, -1)
         # Static signal and residual, times the constant spherical harmonic.
         signal = 0.28209479 * (gaussians.signal[..., 0] + signal)

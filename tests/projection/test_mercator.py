@@ -44,8 +44,8 @@ def test_a_small_round_gaussian_stays_round_anywhere():
         indexing="ij",
     )
     points = (5 * from_spherical(azimuths, elevations)).flatten(0, 1)
-    covariances = (0.01**2 * torch.eye(3, dtype=torch.float64)).expand(1, len(points), 3, 3)
-    footprints = Mercator(1e-9).project(points, covariances, HERE).covariances2d[0]
+    semi_axes = (0.01 * torch.eye(3, dtype=torch.float64)).expand(1, len(points), 3, 3)
+    footprints = Mercator(1e-9).project(points, semi_axes, HERE).covariances2d[0]
     least = math.cos(math.atan(math.sinh(math.pi)))
     widths = 0.01 / 5 / elevations.cos().clamp_min(least).flatten()
     torch.testing.assert_close(footprints, widths.square()[:, None, None] * torch.eye(2, dtype=torch.float64))

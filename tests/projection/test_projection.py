@@ -22,19 +22,19 @@ with_a_seam = pytest.mark.parametrize("kind", [Mercator, Equirectangular])
 
 def ball(n, radius, dtype=torch.float32):
     """Covariances of round Gaussians."""
-    return (radius**2 * torch.eye(3, dtype=dtype)).expand(1, n, 3, 3)
+    return (radius * torch.eye(3, dtype=dtype)).expand(1, n, 3, 3)
 
 
 def direction(azimuth, elevation, dtype=torch.float32):
     return from_spherical(*torch.tensor([azimuth, elevation], dtype=dtype).deg2rad())
 
 
-def draw(projection, means, covariances, pose=HERE, grid=None):
+def draw(projection, means, semi_axes, pose=HERE, grid=None):
     """The map of Gaussians that all send 1 at opacity 0.5."""
     grid = grid or Grid.degrees()
     n = len(means)
     plane = projection.plane(grid)
-    splats = projection.project(means, covariances, pose)
+    splats = projection.project(means, semi_axes, pose)
     image, _ = TorchRasterizer()(splats, torch.ones(1, n, 1), torch.full((1, n), 0.5), None, plane)
     return image[0, 0]
 
@@ -58,14 +58,13 @@ def test_gaussians_that_stand_elsewhere_for_each_transmitter_are_projected_one_b
     means = torch.randn(3, 5, 3, generator=generator)
     means[1, 2] = 0  # on the receiver
     half = torch.randn(sets, 5, 3, 3, generator=generator)
-    covariances = half @ half.mT
-    together = kind(PIXEL).project(means, covariances, HERE)
+    together = kind(PIXEL).project(means, half, HERE)
     assert not together.visible[1, 2]
     assert together.visible.sum() == 14
     for k in range(3):
-        alone = kind(PIXEL).project(means[k], covariances[k % sets][None], HERE)
+        alone = kind(PIXEL).project(means[k], half[k % sets][None], HERE)
         torch.testing.assert_close(together.means2d[k], alone.means2d)
-        torch.testing.assert_close(together.covariances2d[k], alone.covariances2d[0])
+        torch.testing.assert_close(together.factors[k], alone.factors[0])
         torch.testing.assert_close(together.depths[k], alone.depths)
         assert torch.equal(together.visible[k], alone.visible)
 
@@ -81,8 +80,7 @@ def test_footprints_are_the_covariances_of_projected_samples(kind, place):
     projection = kind(1e-9)
     turn = Rotation.from_euler("zyx", [110, -35, 70], degrees=True)
     pose = Pose(torch.tensor([3.0, -1, 2], dtype=torch.float64), torch.from_numpy(turn.as_matrix()))
-    covariance = pose.rotation @ half @ half.mT @ pose.rotation.mT
-    splats = projection.project(pose.world(mean[None]), covariance[None, None], pose)
+    splats = projection.project(pose.world(mean[None]), (pose.rotation @ half)[None, None], pose)
     off = projection.coordinates(samples) - splats.means2d
     if kind is not DirectionCosine:
         off[:, 0] = (off[:, 0] + math.pi).remainder(math.tau) - math.pi
@@ -93,8 +91,8 @@ def test_footprints_are_the_covariances_of_projected_samples(kind, place):
 
 @every
 def test_a_pixels_variance_is_added(kind):
-    means, covariances = 3 * torch.randn(9, 3, dtype=torch.float64), ball(9, 0.1, torch.float64)
-    narrow, wide = (kind(pixel).project(means, covariances, HERE).covariances2d for pixel in (1e-9, 0.3))
+    means, semi_axes = 3 * torch.randn(9, 3, dtype=torch.float64), ball(9, 0.1, torch.float64)
+    narrow, wide = (kind(pixel).project(means, semi_axes, HERE).covariances2d for pixel in (1e-9, 0.3))
     square = torch.full((1, 9, 2, 2), 0.3**2 / 12, dtype=torch.float64) * torch.eye(2)
     torch.testing.assert_close(wide - narrow, square)
 
@@ -135,7 +133,7 @@ def test_a_hidden_gaussian_changes_nothing(kind):
     means = torch.tensor([[1.0, 2.0, 3.5], [1.0, 2.0, 0.5], [2.0, 3.0, 1.0]])
     splats = kind(PIXEL).project(means, ball(3, 0.2), pose)
     assert splats.visible.tolist() == [True, False, True]
-    assert splats.covariances2d.isfinite().all()
+    assert splats.factors.isfinite().all()
     seen = means[[0, 2]]
     assert torch.equal(draw(kind(PIXEL), means, ball(3, 0.2), pose), draw(kind(PIXEL), seen, ball(2, 0.2), pose))
 
@@ -154,8 +152,8 @@ def test_gradients_of_a_projected_gaussian_are_those_of_finite_differences(kind)
     half = torch.randn(2, 3, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
 
     def project(means, half):
-        splats = kind(PIXEL).project(means, half @ half.mT, pose)
-        return splats.means2d, splats.covariances2d
+        splats = kind(PIXEL).project(means, half, pose)
+        return splats.means2d, splats.factors
 
     assert torch.autograd.gradcheck(project, (means, half))
 

@@ -1,5 +1,7 @@
 """The contract of kind ``rasterizer`` written down densely and in float64: the truth of the rasterizers' tests."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -58,5 +60,10 @@ def _footprint(splats: Splats, i: int, plane: Plane) -> Float[Tensor, "b rows co
     if plane.period is not None:
         du = du - plane.period * (du / plane.period).round()
     x = torch.stack(torch.broadcast_tensors(du, dv), -1)
-    precision = torch.linalg.inv(splats.covariances2d[:, i].double())
+    precision = torch.linalg.inv(replace(splats, factors=splats.factors[:, [i]].double()).covariances2d[:, 0])
     return torch.exp(-0.5 * torch.einsum("rci,bij,rcj->brc", x, precision, x))
+
+
+def factors_of(covariances: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 3"]:
+    """p, q and r of ``gaigs.projection.Splats``."""
+    return torch.linalg.cholesky(covariances)[..., [0, 1, 1], [0, 0, 1]]

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from reference import factors_of
 from scipy.constants import speed_of_light
 
 from gaigs.projection import Plane, Splats
@@ -22,8 +23,8 @@ def draw(n=6, b=2, spread=0.2, seed=0):
     """Splats, amplitudes and path lengths, float64."""
     generator = torch.Generator().manual_seed(seed)
     random = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)
-    half = spread * (random(b, n, 2, 2) - 0.5)
-    splats = Splats(random(b, n, 2) - 0.5, half @ half.mT, random(b, n), torch.ones(b, n, dtype=torch.bool))
+    factors = spread * (random(b, n, 3) - 0.5)
+    splats = Splats(random(b, n, 2) - 0.5, factors, random(b, n), torch.ones(b, n, dtype=torch.bool))
     return splats, torch.randn(b, n, dtype=torch.complex128, generator=generator), 2 + 10 * random(b, n)
 
 
@@ -104,7 +105,7 @@ def test_spread_power_decorrelates_elements():
         centre, covariance = splats.means2d[b, 0].numpy(), splats.covariances2d[b, 0].numpy()
         directions = torch.from_numpy(random.multivariate_normal(centre, covariance, count))
         visible = torch.ones(1, count, dtype=torch.bool)
-        points = Splats(directions[None], torch.zeros(1, count, 2, 2).double(), torch.ones(1, count), visible)
+        points = Splats(directions[None], torch.zeros(1, count, 3).double(), torch.ones(1, count), visible)
         equal = amplitudes[b : b + 1].expand(1, count) / math.sqrt(count)
         nothing = torch.zeros(count).double()
         expected = Aperture().lags(points, equal, equal.abs(), nothing, None, ARRAY, carriers(1))
@@ -146,7 +147,7 @@ def test_it_is_a_map_of_faint_splats_on_a_fine_grid():
     """
     splats, amplitudes, _ = draw(b=1, n=5, spread=0.3)
     covariances = splats.covariances2d + 0.004 * torch.eye(2).double()
-    shared = Splats(splats.means2d[0] * 0.6, covariances, splats.depths[0], splats.visible[0])
+    shared = Splats(splats.means2d[0] * 0.6, factors_of(covariances), splats.depths[0], splats.visible[0])
     step = 0.01
     axis = torch.arange(-1.5, 1.5, step, dtype=torch.float64)
     plane = Plane(axis[None], axis[:, None], None)
@@ -159,7 +160,7 @@ def test_it_is_a_map_of_faint_splats_on_a_fine_grid():
     for k in range(5):
         one = Splats(
             shared.means2d[k : k + 1],
-            shared.covariances2d[:, k : k + 1],
+            shared.factors[:, k : k + 1],
             *(t[k : k + 1] for t in (shared.depths, shared.visible)),
         )
         image, _ = TorchRasterizer()(one, torch.view_as_real(amplitudes[:, k : k + 1]), opacity, None, plane)
@@ -176,9 +177,8 @@ def test_it_is_a_map_of_faint_splats_on_a_fine_grid():
 def test_what_hides_what_is_all_that_a_map_has_beyond():
     """Faint splats one behind the other in one map: what is missing is of the order of their opacities."""
     splats, amplitudes, _ = draw(b=1, n=4, spread=0.2)
-    shared = Splats(
-        0 * splats.means2d[0], splats.covariances2d + 0.01 * torch.eye(2).double(), splats.depths[0], splats.visible[0]
-    )
+    covariances = splats.covariances2d + 0.01 * torch.eye(2).double()
+    shared = Splats(0 * splats.means2d[0], factors_of(covariances), splats.depths[0], splats.visible[0])
     step = 0.02
     axis = torch.arange(-1, 1, step, dtype=torch.float64)
     plane = Plane(axis[None], axis[:, None], None)

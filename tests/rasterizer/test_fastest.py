@@ -16,7 +16,7 @@ _devices = pytest.importorskip("gaigs.rasterizer._devices", exc_type=ImportError
 def scene(n=12, dtype=torch.float32, channels=2, attenuations=None):
     generator = torch.Generator().manual_seed(0)
     random = lambda *shape: torch.rand(*shape, generator=generator).to(dtype)
-    splats = Splats(random(n, 2), 0.01 * torch.eye(2, dtype=dtype).expand(1, n, 2, 2), random(n), random(n) < 2)
+    splats = Splats(random(n, 2), 0.1 * torch.tensor([1, 0, 1]).to(dtype).expand(1, n, 3), random(n), random(n) < 2)
     return splats, random(3, n, channels), random(3, n), attenuations, Plane(random(1, 9), random(7, 1), None)
 
 

@@ -36,7 +36,7 @@ PLACES = {
     "at the horizon": lambda uniform, n: from_spherical(uniform(0, math.tau, n), uniform(-0.1, 0.1, n)),
     "on the pole": lambda uniform, n: torch.tensor([[0.0, 0.0, 1.0]]).expand(n, 3),
 }
-NAMES = ("means2d", "covariances2d", "signal", "opacities", "attenuations")
+NAMES = ("means2d", "factors", "signal", "opacities", "attenuations")
 PROJECTIONS = {"mercator": Mercator, "equirectangular": Equirectangular, "direction_cosine": DirectionCosine}
 
 
@@ -58,7 +58,7 @@ def scene(
     projection = PROJECTIONS[projection](GRID.pitch)
     means = PLACES[place](uniform, n) * uniform(0.5, 4, n, 1)
     half = size * torch.randn(b if own else 1, n, 3, 3, generator=generator)
-    splats = projection.project(means, half @ half.mT, HERE)
+    splats = projection.project(means, half, HERE)
     plane = projection.plane(DIRECTIONS[directions])
     signal = torch.randn(b, n, channels, generator=generator)
     return splats, signal, uniform(*opacity, b, n), uniform(0.2, 1, b, n) if attenuations else None, plane
@@ -67,9 +67,9 @@ def scene(
 def render(rasterizer, arguments, pixels, dtype=torch.float64):
     """Map, transmittance, and the gradients of a random function of both at ``pixels``."""
     splats, *others, plane = arguments
-    leaves = [None if leaf is None else leaf.to(dtype) for leaf in (splats.means2d, splats.covariances2d, *others)]
+    leaves = [None if leaf is None else leaf.to(dtype) for leaf in (splats.means2d, splats.factors, *others)]
     leaves = [None if leaf is None else leaf.detach().clone().requires_grad_() for leaf in leaves]
-    splats = replace(splats, means2d=leaves[0], covariances2d=leaves[1])
+    splats = replace(splats, means2d=leaves[0], factors=leaves[1])
     results = rasterizer(splats, *leaves[2:], plane)
     generator = torch.Generator().manual_seed(0)
     image, left = (result * at for result, at in zip(results, (pixels[:, None], pixels), strict=True))
@@ -116,8 +116,8 @@ def test_narrow_splats_at_the_seam_are_as_good_as_elsewhere():
         u = centre + width * torch.linspace(-2, 2, 9)[None]
         means = torch.stack((centre + width * torch.randn(n, generator=generator), torch.zeros(n)), -1)
         means[::2, 0] -= math.tau * bool(centre)  # the same places, a turn away
-        covariances = (width**2 * torch.eye(2)).expand(1, n, 2, 2)
-        splats = Splats(means, covariances, torch.arange(1.0 * n), torch.ones(n).bool())
+        factors = (width * torch.tensor([1.0, 0, 1])).expand(1, n, 3)
+        splats = Splats(means, factors, torch.arange(1.0 * n), torch.ones(n).bool())
         arguments = splats, torch.rand(1, n, 1, generator=generator), torch.full((1, n), 0.1), None
         plane = Plane(u, torch.zeros(1, 1), math.tau)
         image, _ = TorchRasterizer()(*arguments, plane)
@@ -184,13 +184,12 @@ def test_gradients_are_those_of_finite_differences(projection, own):
     splats, signal, opacities, attenuations, plane = scene(n=6, own=own, projection=projection, size=0.5)
     plane = Plane(plane.u[::7, ::9], plane.v[::7, ::9], plane.period)
 
-    def rasterize_half(means, halves, *others):
-        return TorchRasterizer()(replace(splats, means2d=means, covariances2d=halves @ halves.mT), *others, plane)
+    def rasterize_with(means, factors, *others):
+        return TorchRasterizer()(replace(splats, means2d=means, factors=factors), *others, plane)
 
-    halves = torch.linalg.cholesky(splats.covariances2d.double())
-    inputs = (splats.means2d, halves, signal, 0.9 * opacities, attenuations)
+    inputs = (splats.means2d, splats.factors, signal, 0.9 * opacities, attenuations)
     leaves = tuple(leaf.detach().double().requires_grad_() for leaf in inputs)
-    assert torch.autograd.gradcheck(rasterize_half, leaves, fast_mode=True)
+    assert torch.autograd.gradcheck(rasterize_with, leaves, fast_mode=True)
 
 
 @pytest.mark.parametrize("chunk", [1, 3000, 2**40])
@@ -209,7 +208,9 @@ def test_how_tiles_are_chunked_does_not_matter(monkeypatch, chunk, projection):
     [((1, 2, 3), (0, 1, 2)), ((3, 1, 2), (1, 2, 0)), ((2, 2, 1), (2, 0, 1)), ((2, math.inf, 2), (0, 2, 1))],
 )
 def test_depth_decides_and_among_equals_the_index(depths, order):
-    splats = Splats(torch.zeros(3, 2), torch.eye(2).expand(1, 3, 2, 2), torch.tensor(depths), torch.ones(3).bool())
+    splats = Splats(
+        torch.zeros(3, 2), torch.tensor([1.0, 0, 1]).expand(1, 3, 3), torch.tensor(depths), torch.ones(3).bool()
+    )
     signal = torch.tensor([[[1.0], [10.0], [100.0]]])
     image, left = TorchRasterizer()(splats, signal, torch.full((1, 3), 0.9), None, Plane(*torch.zeros(2, 1, 1), None))
     assert image.item() == pytest.approx(sum(0.9 * 0.1**k * 10**i for k, i in enumerate(order)), rel=1e-5)
@@ -220,7 +221,7 @@ def test_what_is_invisible_does_nothing_and_gets_no_gradient():
     splats, *others = scene()
     hidden = torch.arange(40) % 3 == 0
     splats = replace(splats, visible=~hidden)
-    splats.means2d[hidden], splats.covariances2d[:, hidden] = torch.inf, torch.nan
+    splats.means2d[hidden], splats.factors[:, hidden] = torch.inf, torch.nan
     pixels = torch.ones(2, *GRID.shape)
     found = render(TorchRasterizer(), (splats, *others), pixels)
     assert found["image"].isfinite().all()
@@ -231,17 +232,17 @@ def test_what_is_invisible_does_nothing_and_gets_no_gradient():
         assert found[name].any()
 
 
-@pytest.mark.parametrize("name", ["means2d", "covariances2d", "variance", "signal", "opacities", "attenuations"])
+@pytest.mark.parametrize("name", ["means2d", "factors", "width", "signal", "opacities", "attenuations"])
 def test_nan_shows_in_the_map(name):
     splats, signal, opacities, attenuations, plane = scene(own=True)
     front = int(splats.depths.argmin())
     opacities[1, front] = 0.5
-    broken = {"variance": splats.covariances2d[..., 0, 0], "covariances2d": splats.covariances2d, "signal": signal}
+    broken = {"width": splats.factors[..., 0], "factors": splats.factors, "signal": signal}
     broken |= {"opacities": opacities, "attenuations": attenuations, "means2d": splats.means2d.expand(2, -1, -1)}
     broken[name][1, front] = torch.nan
     image, left = TorchRasterizer()(splats, signal, opacities, attenuations, plane)
     assert image[1].isnan().any()
-    if name in ("opacities", "variance", "covariances2d"):
+    if name in ("opacities", "width", "factors"):
         assert not image[0].isnan().any()
         assert left[1].isnan().any()
 
@@ -258,8 +259,8 @@ n, grid = 20_000, Grid.degrees()
 projection = Mercator(grid.pitch)
 points = (3 * fibonacci_lattice(n, 0.0, 1.57)).requires_grad_()
 width = 3 * (2 * torch.pi / n) ** 0.5  # to the next Gaussian
-covariances = (width**2 * torch.eye(3)).expand(1, n, 3, 3)
-splats = projection.project(points, covariances, Pose(torch.zeros(3), torch.eye(3)))
+semi_axes = (width * torch.eye(3)).expand(1, n, 3, 3)
+splats = projection.project(points, semi_axes, Pose(torch.zeros(3), torch.eye(3)))
 opacities, signal = torch.full((1, n), 0.1, requires_grad=True), torch.randn(1, n, 2, requires_grad=True)
 attenuations = torch.full((1, n), 0.9, requires_grad=True)
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 2**10

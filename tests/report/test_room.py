@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from scipy.integrate import quad
 
-from gaigs.geometry import covariances
+from gaigs.geometry import semi_axes
 from gaigs.report.room import DRAWN, Cloud, paths, room
 from gaigs.report.shapes import LearntRoom, Matter, Path, Plane
 
@@ -19,7 +19,8 @@ def rng():
 
 def test_gaussians_are_ellipses_of_one_standard_deviation():
     generator = torch.Generator().manual_seed(2)
-    sigma = covariances(torch.randn(20, 4, generator=generator), 0.1 + torch.rand(20, 3, generator=generator)).double()
+    axes = semi_axes(torch.randn(20, 4, generator=generator), 0.1 + torch.rand(20, 3, generator=generator)).double()
+    sigma = axes @ axes.mT
     means, strengths = torch.randn(20, 3, generator=generator), torch.rand(20, generator=generator)
     cloud = Cloud(means.numpy(), sigma.numpy(), strengths.numpy())
     point = np.zeros((1, 3))

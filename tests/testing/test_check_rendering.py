@@ -53,8 +53,8 @@ class Single(DirectionCosine):
 
 
 class Hiding(Mercator):
-    def project(self, means, covariances, receiver):
-        splats = super().project(means, covariances, receiver)
+    def project(self, means, semi_axes, receiver):
+        splats = super().project(means, semi_axes, receiver)
         return replace(splats, visible=splats.depths < 100)
 
 
@@ -62,7 +62,7 @@ class Hiding(Mercator):
     ("projection", "message"),
     [
         (Skewed, "jacobian must be the derivative of coordinates"),
-        (Unclamped, "covariances2d at hard places must be finite"),
+        (Unclamped, "factors at hard places must be finite"),
         (Shifted, "plane.v must be coordinates' v"),
         (Unwrapping, "a plane must have the projection's period"),
         (Gridded, r"plane.v of a list of rays must be of shape \(1, 1\) or \(1, 108\), got \(108, 1\)"),
@@ -151,7 +151,7 @@ class Unseeing(Aperture):
 
 class Pointed(Aperture):
     def lags(self, splats, *others):
-        return super().lags(replace(splats, covariances2d=0 * splats.covariances2d), *others)
+        return super().lags(replace(splats, factors=0 * splats.factors), *others)
 
 
 class Narrowband(Aperture):

@@ -39,7 +39,7 @@ static inline uint all_bits(masks bits) {
  *   appearance  (words 32, transmitters, APPEARANCE)
  * and says which spans meet the box outside of which a splat does nothing:
  *   hits        (sets, spans of u and of v, words), a bit a splat */
-kernel void prepare(sizes_t sizes, global const int *order, global const float *means, global const float *covariances,
+kernel void prepare(sizes_t sizes, global const int *order, global const float *means, global const float *factors,
                     global const uchar *visible, global const float *signal, global const float *opacities,
                     global const float *attenuations, global const span_t *spans, global float *geometry,
                     global float *appearance, global uint *hits) {
@@ -67,21 +67,19 @@ kernel void prepare(sizes_t sizes, global const int *order, global const float *
 #endif
             for (int c = 0; c < CHANNELS; c++) look[1 + ATTENUATION + c] = signal[at * CHANNELS + c];
         }
-        global const float *covariance = covariances + (set * sizes.splats + from) * 4;
-        float uu = covariance[0], uv = .5f * (covariance[1] + covariance[2]), vv = covariance[3];
-        /* Kahan's difference of products: right to the last digits where a splat is long and thin. */
-        float product = uv * uv, determinant = fma(uu, vv, -product) - fma(uv, uv, -product);
+        global const float *factor = factors + (set * sizes.splats + from) * 3;
+        float p = factor[0], q = factor[1], r = factor[2], height = hypot(q, r);
         const float h = 0.849321800f; /* sqrt(log2(e) / 2) */
-        float across = h / sqrt(uu), along = h * sqrt(uu / determinant), shear = along * uv / uu;
+        float across = h / p, along = h / r, shear = along * (q / p);
         float reach = opacity < ALPHA_MIN ? -INFINITY : sqrt(log2(opacity / ALPHA_MIN));
-        float half_v = reach * sqrt(vv) / h;
+        float half_v = reach * height / h;
         row[0] = box[0] = means[2 * from];
         row[1] = box[32] = means[2 * from + 1];
         row[2] = across;
         row[3] = along;
         row[4] = shear;
         row[5] = reach;
-        row[6] = half_v * uv / vv;
+        row[6] = half_v * (q / height) * (p / height);
         row[7] = 1 / along;
         box[64] = reach / across * 1.0001f; /* slack: in doubt a splat is listed, and each pixel decides */
         box[96] = half_v * 1.0001f;

@@ -1,6 +1,6 @@
 /* What all kernels share: sizes, the geometry of a splat, and its footprint.
  *
- * With the Cholesky factor C = L L' of a splat's covariance the footprint exp(-x' C^-1 x / 2) is 2^-(s^2 + y^2), where
+ * With the factor L = [p, 0; q, r] of a splat's covariance C = L L' the footprint exp(-x' C^-1 x / 2) is 2^-(s^2 + y^2), where
  * (s, y) = sqrt(log2(e) / 2) L^-1 x depends on x = (du, dv) as s = across du and y = along dv - shear du. Of all forms
  * of the exponent this one loses the fewest digits to cancellation, and where u depends on the column alone, s^2 and
  * shear du are one value a column.

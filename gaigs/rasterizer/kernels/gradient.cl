@@ -178,12 +178,12 @@ kernel void backward(sizes_t sizes, global const float *u, global const float *v
  *
  * With z = (s, y) = h L^-1 x and h^2 = log2(e) / 2,
  *
- *   d(log G)/d(mean) = L^-T z / h        d(log G)/dC = L^-T z z' L^-1 / (2 h^2)
+ *   d(log G)/d(mean) = L^-T z / h        d(log G)/dL = the lower triangle of L^-T z z' / h^2
  *
  * and L^-T / h = [across, -shear; 0, along] / h^2. */
 kernel void gather(sizes_t sizes, global const int *order, global const int *blocks, global const int *ends,
                    global const uint *entries, global const float *geometry, global const float *appearance,
-                   global const float *partials, global float *means, global float *covariances, global float *signal,
+                   global const float *partials, global float *means, global float *factors, global float *signal,
                    global float *opacities, global float *attenuations) {
     int block = get_global_id(0), base = block * BLOCK * 32, rest = sizes.splats - base, size = LEAST(rest, BLOCK * 32);
     int tiles = sizes.down * sizes.across, together = sizes.sets == 1; /* one set of lists, walked by every group */
@@ -221,11 +221,11 @@ kernel void gather(sizes_t sizes, global const int *order, global const int *blo
             float s = sums[j][0], y = sums[j][1], ss = sums[j][2], sy = sums[j][3], yy = sums[j][4];
             centres[j][0] += inverse * (a * s - k * y);
             centres[j][1] += inverse * b * y;
-            global float *covariance = covariances + (set * sizes.splats + to) * 4;
-            float scale = .5f * inverse * inverse;
-            covariance[0] = scale * (a * a * ss - 2 * a * k * sy + k * k * yy);
-            covariance[1] = covariance[2] = scale * b * (a * sy - k * yy);
-            covariance[3] = scale * b * b * yy;
+            global float *factor = factors + (set * sizes.splats + to) * 3;
+            const float root = 1.17741002f; /* 1 / h */
+            factor[0] = inverse * root * (a * ss - k * sy);
+            factor[1] = inverse * root * b * sy;
+            factor[2] = inverse * root * b * yy;
         }
     }
     for (int j = 0; j < size; j++)
