@@ -10,7 +10,7 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor, nn
 
-from gaigs.geometry import from_spherical, semi_axes
+from gaigs.geometry import from_spherical, semi_axes, unit_quaternions
 from gaigs.scene import Scene
 
 SH_DC = 0.5 / math.sqrt(math.pi)
@@ -109,7 +109,7 @@ class Gaussians(nn.Module):
     @property
     def unit_quats(self) -> Float[Tensor, "n 4"]:
         """Orientations as unit quaternions (w, x, y, z)."""
-        return nn.functional.normalize(self.quats, dim=-1)
+        return unit_quaternions(self.quats)
 
     @property
     def covariances(self) -> Float[Tensor, "n 3 3"]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 
 @dataclass(frozen=True)
@@ -61,19 +62,32 @@ class Pose:
 
 
 def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z) of any length but zero.
+    """Rotation matrices of quaternions (w, x, y, z) of any length; of length zero no rotation.
 
     The matrix is that of the normalised quaternion; dividing by the squared length keeps the gradient
     free of a component along the quaternion.
     """
+    quats = _of_moderate_length(quats)
     w, x, y, z = quats.unbind(-1)
-    s = 2 / (quats * quats).sum(-1)
+    squares = (quats * quats).sum(-1)
+    s = 2 / torch.where(squares == 0, 1, squares)
     rows = (
         1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
         s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x),
         s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y),
     )  # fmt: skip
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Quaternions of length 1; one of length zero stays as it is."""
+    return normalize(_of_moderate_length(quats), dim=-1)
+
+
+def _of_moderate_length(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """The same directions with a largest component of 1, so that squares neither overflow nor vanish."""
+    largest = quats.detach().abs().amax(-1, keepdim=True)
+    return quats / torch.where(largest == 0, 1, largest)
 
 
 def semi_axes(quats: Float[Tensor, "*batch 4"], scales: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -15,11 +15,19 @@ ALPHA_MAX = 0.99
 (1 - a G) in a gradient costs two of float32's seven digits at the most."""
 
 
+OPAQUE = -(2.0**18)
+"""The logarithm of an attenuation of 0: wherever a footprint acts, G times this is as good as minus infinity in float64
+too, and products with it stay finite."""
+
+STEEPEST = 1e-30
+"""The gradient by an attenuation below this is that at this, as its own would overflow float32."""
+
+
 class Rasterizer(Protocol):
     """The contract of kind ``rasterizer``.
 
     Front to back by ``depths`` (ties by index), with a_i the effective opacity in [0, 1], d_i the attenuation in
-    (0, 1], G_i the footprint exp(-x' C^-1 x / 2) at the pixel, A_i = min(a_i G_i, ALPHA_MAX) where that is at least
+    [0, 1], G_i the footprint exp(-x' C^-1 x / 2) at the pixel, A_i = min(a_i G_i, ALPHA_MAX) where that is at least
     ALPHA_MIN (elsewhere splat i does nothing at this pixel):
 
         map = sum_i signal_i A_i T_i        T_i = prod_{j<i} (1 - A_j) d_j^{G_j}

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.projection import Plane, Splats
-from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN
+from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
 from gaigs.rasterizer._devices import cause_of, default_device, devices, find_fault, name_of, open_queue
 from gaigs.registry import register
 
@@ -212,7 +212,8 @@ class _Render:
         self.partials = MOMENTS + self.group_capacity * appearance_size
         separable = plane.u.shape[0] == plane.v.shape[1] == 1
         macros = {"CHANNELS": self.channels, "ATTENUATION": int(self.attenuates), "TRANSMITTERS": self.group_capacity}
-        macros |= {"SEPARABLE": int(separable), "ALPHA_MIN": _literal(ALPHA_MIN), "ALPHA_MAX": _literal(ALPHA_MAX)}
+        bounds = {"ALPHA_MIN": ALPHA_MIN, "ALPHA_MAX": ALPHA_MAX, "OPAQUE": OPAQUE, "STEEPEST": STEEPEST}
+        macros |= {"SEPARABLE": int(separable)} | {name: _literal(value) for name, value in bounds.items()}
         if plane.period is not None:
             rest = plane.period - float(np.float32(plane.period))
             macros |= {"PERIOD": _literal(plane.period), "PERIOD_REST": _literal(rest)}

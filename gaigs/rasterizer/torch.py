@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.projection import Plane, Splats
-from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN
+from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
 from gaigs.registry import register
 
 TILE = 16
@@ -49,7 +49,7 @@ class TorchRasterizer:
             factors,
             signal[:, order],
             opacities[:, order],
-            None if attenuations is None else attenuations[:, order].log(),
+            None if attenuations is None else attenuations[:, order],
         )
 
 
@@ -182,7 +182,8 @@ def _weigh(
         passed.addcmul_(footprint * live, logs[:, k, None])
     total = passed.cumsum(-2)
     left = total[..., -1, :].exp()
-    return _Weights(s, y, footprint, alpha, live, total.sub_(passed).exp_(), left)
+    before = torch.nn.functional.pad(total[..., :-1, :], (0, 0, 1, 0))
+    return _Weights(s, y, footprint, alpha, live, before.exp_(), left)
 
 
 class _Composite(torch.autograd.Function):
@@ -190,8 +191,9 @@ class _Composite(torch.autograd.Function):
     d/dA_i = T_i D_i - S_i / (1 - A_i), and a change of log T behind splat i acts with S_i."""
 
     @staticmethod
-    def forward(ctx, tiles, means, factors, signal, opacities, logs):
+    def forward(ctx, tiles, means, factors, signal, opacities, attenuations):
         ctx.tiles = tiles
+        logs = None if attenuations is None else torch.where(attenuations == 0, OPAQUE, attenuations.log())
         ctx.save_for_backward(means, factors, signal, opacities, logs)
         b, _, c = signal.shape
         image = signal.new_zeros(b, c, tiles.down * tiles.across, TILE * TILE)
@@ -235,6 +237,8 @@ class _Composite(torch.autograd.Function):
             for gradient, part, axis in zip(gradients, found, (0, 1, 1, 1, 1), strict=True):
                 if gradient is not None:
                     gradient.index_add_(axis, k.flatten(), part.flatten(axis, axis + 1))
+        if logs is not None:
+            gradients[-1] /= logs.exp().clamp_min(STEEPEST)
         means, factors, *others = gradients  # the last splat is the filling
         return None, means[:-1], factors[:, :-1], *(None if other is None else other[:, :-1] for other in others)
 

@@ -63,7 +63,7 @@ kernel void prepare(sizes_t sizes, global const int *order, global const float *
             look[0] = opacities[at];
             opacity = opacity >= look[0] || opacity != opacity ? opacity : look[0]; /* the largest, or NaN */
 #if ATTENUATION
-            look[1] = log2(attenuations[at]);
+            look[1] = attenuations[at] == 0 ? OPAQUE : log2(attenuations[at]);
 #endif
             for (int c = 0; c < CHANNELS; c++) look[1 + ATTENUATION + c] = signal[at * CHANNELS + c];
         }

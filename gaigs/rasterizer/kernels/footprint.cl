@@ -11,7 +11,7 @@
  *   TRANSMITTERS  most transmitters that one work-item composites; they share covariances, hence footprints
  *   SEPARABLE     1 where u depends on the column alone and v on the row alone
  *   PERIOD        the period of u, where it has one, as PERIOD + PERIOD_REST, the second below the first one's rounding
- *   ALPHA_MIN, ALPHA_MAX
+ *   ALPHA_MIN, ALPHA_MAX, OPAQUE, STEEPEST
  *
  * A tile is ROWS rows of COLUMNS pixels; a row is one vector, `lanes`. Inner loops hold operators only: calls of
  * OpenCL's own functions stay calls on PoCL, lane by lane.

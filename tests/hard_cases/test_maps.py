@@ -1,0 +1,216 @@
+"""From Gaussians to a map where float32 runs out: every projection and rasterizer against float64.
+
+Inputs are rounded to float32 first, so that both precisions are asked the same question.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from gaigs.directions import Grid
+from gaigs.geometry import Pose, from_spherical, semi_axes
+from gaigs.projection import NEAR, Plane, Splats
+from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN
+from gaigs.registry import registry
+from gaigs.testing.rasterizer import rasterize_densely
+
+VALUES = 1e-4
+"""How far a map in float32 may be from that in float64, of the largest value or of 1."""
+
+GRADIENTS = 5e-3
+"""The same of gradients, each of its largest."""
+
+GRID = Grid(torch.linspace(1, 90, 30, dtype=torch.float64).deg2rad(), torch.arange(0, 360, 9).double().deg2rad())
+PIXEL = math.radians(1)
+ASIDE = torch.tensor([0.7, 1.0, 0.4], dtype=torch.float64)
+"""No multiple of the grid's pitch: half a turn away from a pixel either image is the nearest."""
+
+LOOSE = {"beside the receiver": 0.1}
+"""Gradients of footprints of a hundred thousand radians."""
+
+DRAWING = [name for name in registry("rasterizer").names() if name != "aperture"]
+ON = Pose(torch.tensor([1.0, -2.0, 0.5]), torch.eye(3))
+
+
+def build_rasterizer(name):
+    try:
+        return registry("rasterizer").build({"name": name})
+    except RuntimeError as error:
+        if "needs an OpenCL driver" not in str(error) and "cannot build kernels" not in str(error):
+            raise
+        pytest.skip(str(error))
+
+
+def build_projection(name):
+    return registry("projection").build({"name": name}, pixel=PIXEL)
+
+
+@dataclass
+class Gaussians:
+    """What a map is drawn of, for one transmitter; float64 with float32's digits."""
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    attenuations: torch.Tensor
+    pose: Pose = ON
+
+    def leaves(self, dtype):
+        names = ("means", "quats", "scales", "opacities", "attenuations")
+        return {name: getattr(self, name).float().to(dtype).requires_grad_() for name in names}
+
+
+def random_gaussians(n=12, seed=0):
+    """In all directions above the horizon, at 1 to 5 m."""
+    generator = torch.Generator().manual_seed(seed)
+    uniform = lambda low, high, *shape: (
+        low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+    )
+    directions = from_spherical(uniform(0, 2 * math.pi, n), uniform(0.05, 1.5, n))
+    means = ON.position + directions * uniform(1, 5, n, 1)
+    quats = torch.randn(n, 4, generator=generator, dtype=torch.float64)
+    return Gaussians(means, quats, uniform(0.05, 0.5, n, 3), uniform(0.2, 0.9, n), uniform(0.2, 1, n))
+
+
+def with_scales(*scales):
+    return lambda: replace(random_gaussians(), scales=torch.tensor(scales, dtype=torch.float64).expand(12, 3))
+
+
+def towards(azimuth, elevation, distance=2.0):
+    """All in about one direction [deg]."""
+
+    def make():
+        azimuths, elevations = (
+            torch.full((12,), math.radians(angle), dtype=torch.float64) for angle in (azimuth, elevation)
+        )
+        means = ON.position + distance * from_spherical(azimuths, elevations)
+        return replace(random_gaussians(), means=means + 1e-3 * torch.linspace(-1, 1, 12).double()[:, None] * ASIDE)
+
+    return make
+
+
+def with_quats(scale):
+    return lambda: replace(random_gaussians(), quats=scale * random_gaussians().quats)
+
+
+def at_the_receiver(distance):
+    def make():
+        gaussians = random_gaussians()
+        gaussians.means[::2] = ON.position + distance * torch.tensor([0.6, 0, 0.8])
+        return gaussians
+
+    return make
+
+
+def with_attenuations(*values):
+    return lambda: replace(random_gaussians(), attenuations=torch.tensor(values, dtype=torch.float64).repeat(12)[:12])
+
+
+def with_opacities(*values):
+    return lambda: replace(random_gaussians(), opacities=torch.tensor(values, dtype=torch.float64).repeat(12)[:12])
+
+
+def far_from_the_origin():
+    gaussians = random_gaussians()
+    shift = torch.tensor([1e6, -1e6, 5e5], dtype=torch.float64)
+    pose = replace(ON, position=(ON.position.double() + shift).float())
+    return replace(gaussians, means=gaussians.means + shift, pose=pose)
+
+
+def first(count):
+    def make():
+        gaussians = random_gaussians()
+        parts = ("means", "quats", "scales", "opacities", "attenuations")
+        return replace(gaussians, **{part: getattr(gaussians, part)[:count] for part in parts})
+
+    return make
+
+
+CASES = {
+    "ordinary": random_gaussians,
+    "on the zenith": towards(0, 90),
+    "beside the zenith": towards(200, 89.99),
+    "across the seam": towards(180, 30),
+    "at azimuth 0": towards(0, 30),
+    "on the horizon": towards(75, 0),
+    "below the horizon": towards(75, -40),
+    "at the nadir": towards(0, -90),
+    "on the receiver": at_the_receiver(0.0),
+    "nearer than near": at_the_receiver(NEAR / 2),
+    "beside the receiver": at_the_receiver(2 * NEAR),
+    "points": with_scales(1e-6, 1e-6, 1e-6),
+    "larger than the room": with_scales(1e3, 1e3, 1e3),
+    "needles of 10 m": with_scales(10, 1e-3, 1e-3),
+    "needles of 30 m": with_scales(1e-3, 30, 1e-3),
+    "needles of 1 km": with_scales(1e3, 1e-6, 1e-6),
+    "discs of condition 1e12": with_scales(1e3, 1e-9, 1.0),
+    "scales of 0": with_scales(0, 0, 0),
+    "quaternions of 0": with_quats(0.0),
+    "quaternions of 1e-30": with_quats(1e-30),
+    "quaternions of 1e30": with_quats(1e30),
+    "attenuations of 0": with_attenuations(0.0),
+    "hardly any let through": with_attenuations(1e-45, 1e-38, 1e-30, 1e-6),
+    "all let through": with_attenuations(1.0),
+    "some let through": with_attenuations(0.0, 1.0, 1e-38),
+    "opacities at their ends": with_opacities(0.0, 1.0),
+    "opacities at their bounds": with_opacities(ALPHA_MIN, ALPHA_MAX),
+    "faint beyond digits": with_opacities(1e-45, 1e-38),
+    "far from the origin": far_from_the_origin,
+    "none": first(0),
+    "one": first(1),
+}
+
+
+def draw(gaussians, projection, rasterizer, dtype):
+    """Map and transmittance of two channels, and the leaves that they depend on."""
+    leaves = gaussians.leaves(dtype)
+    means, quats, scales, opacities, attenuations = leaves.values()
+    splats = projection.project(means, semi_axes(quats, scales)[None], gaussians.pose)
+    plane = projection.plane(GRID)
+    plane = Plane(plane.u.float().to(dtype), plane.v.float().to(dtype), plane.period)
+    signal = torch.arange(2 * len(means)).cos().reshape(1, -1, 2).to(dtype)
+    image, left = rasterizer(splats, signal, opacities[None], attenuations[None], plane)
+    return image, left, leaves, splats, plane
+
+
+def near_a_jump(splats, opacities, plane):
+    """Pixels where some a G is so near to a bound that precisions may rightly decide differently."""
+    splats = Splats(
+        *(part.detach().double() for part in (splats.means2d, splats.factors, splats.depths)), splats.visible
+    )
+    shown = torch.zeros(plane.shape, dtype=torch.bool)
+    for i in splats.visible.nonzero()[:, 0].tolist():
+        one = Splats(splats.means2d[[i]], splats.factors[:, [i]], splats.depths[[i]], splats.visible[[i]])
+        full = torch.full((1, 1), ALPHA_MAX, dtype=torch.float64)
+        footprint = rasterize_densely(one, torch.ones(1, 1, 1), full, None, plane)[0][0, 0] / ALPHA_MAX
+        product = opacities[i].item() * footprint
+        for bound in (ALPHA_MIN, ALPHA_MAX):
+            shown |= (product / bound - 1).abs() < 3e-3
+    return shown
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("projection", registry("projection").names())
+@pytest.mark.parametrize("rasterizer", DRAWING)
+def test_a_map_is_that_of_float64(case, projection, rasterizer):
+    gaussians, projection = CASES[case](), build_projection(projection)
+    true, true_left, true_leaves, splats, plane = draw(gaussians, projection, rasterize_densely, torch.float64)
+    found, left, leaves, *_ = draw(gaussians, projection, build_rasterizer(rasterizer), torch.float32)
+    sure = ~near_a_jump(splats, gaussians.opacities, plane)
+    assert sure.double().mean() > 0.5
+    for value, truth in ((found, true), (left, true_left)):
+        assert value.isfinite().all()
+        assert (value - truth)[..., sure].abs().max() < VALUES * max(1.0, truth.abs().max().item())
+    for values, parts in (((found, left), leaves), ((true, true_left), true_leaves)):
+        total = sum((value * value.detach().numel() ** -0.5 * sure).sum() for value in values)
+        if len(gaussians.means):
+            total.backward()
+    assert all(leaf.grad is None or leaf.grad.isfinite().all() for leaf in leaves.values())
+    for name, leaf in leaves.items():
+        truth = true_leaves[name].grad
+        if truth is not None and name in ("means", "scales", "opacities"):
+            error = (leaf.grad.double() - truth).abs().max().item()
+            assert error <= LOOSE.get(case, GRADIENTS) * max(truth.abs().max().item(), 1e-6), name
