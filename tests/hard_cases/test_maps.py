@@ -204,7 +204,7 @@ def test_a_map_is_that_of_float64(case, projection, rasterizer):
     for value, truth in ((found, true), (left, true_left)):
         assert value.isfinite().all()
         assert (value - truth)[..., sure].abs().max() < VALUES * max(1.0, truth.abs().max().item())
-    for values, parts in (((found, left), leaves), ((true, true_left), true_leaves)):
+    for values, _parts in (((found, left), leaves), ((true, true_left), true_leaves)):
         total = sum((value * value.detach().numel() ** -0.5 * sure).sum() for value in values)
         if len(gaussians.means):
             total.backward()
