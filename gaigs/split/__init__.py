@@ -42,7 +42,7 @@ def part(
         ValueError: An option is out of range, or there are too few groups.
     """
     check_fractions(test, validation)
-    generator = torch.Generator().manual_seed(seed)
+    generator = generator_of(seed)
     train, testing = hold_out(torch.arange(len(links)), groups, test, generator)
     train, validating = hold_out(train, groups, validation, generator)
     words = [name, f"test {test:g}", *([f"validation {validation:g}"] if validation else []), f"seed {seed}"]
@@ -100,6 +100,27 @@ def folds(links: Links, count: int, seed: int) -> list[Split]:
         )
         for i in range(count)
     ]
+
+
+def generator_of(seed: int) -> torch.Generator:
+    """What draws at random.
+
+    Raises:
+        ValueError: torch has no such seed.
+    """
+    check("seed", seed, 0 <= seed < 2**63, "a whole number from 0 to 2**63 - 1")
+    return torch.Generator().manual_seed(seed)
+
+
+def runs_of(links: Links, length: int) -> Int[Tensor, "n"]:
+    """Number of the run of rows that each link is in.
+
+    Raises:
+        ValueError: A run has no row.
+    """
+    check("length", length, length >= 1, "a whole number of rows, at least 1")
+    rows = rows_of(links)
+    return rows // min(length, int(rows.max()) + 1)  # a longer run holds all rows too, and may be beyond int64
 
 
 def check_fractions(test: float, validation: float) -> None:

@@ -1,12 +1,13 @@
 """Cubes of space are held out."""
 
-import math
-
 import torch
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
 from gaigs.split import TEST, check, part
+
+EDGES = 1e-6, 1e6
+"""From the first to the second lies a cube's edge [m]: float32 tells no places apart below, and no data reach above."""
 
 
 @register("split", "blocks")
@@ -23,7 +24,8 @@ def blocks(links: Links, edge: float, test: float = TEST, validation: float = 0.
     Raises:
         ValueError: An option is out of range, or there are too few cubes.
     """
-    check("edge", edge, 0 < edge < math.inf, "positive [m]")
+    low, high = EDGES
+    check("edge", edge, low <= edge <= high, f"from {low:g} to {high:g} m")
     places = links.query.transmitters.double()
     cubes = ((places - places.amin(0)) / edge).floor().long()
     return part(f"blocks {edge:g} m", links, torch.unique(cubes, dim=0, return_inverse=True)[1], test, validation, seed)

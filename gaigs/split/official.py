@@ -1,10 +1,8 @@
 """The parts that came with the data."""
 
-import torch
-
 from gaigs.data import Links, Split
 from gaigs.registry import register
-from gaigs.split import check, hold_out, rows_of
+from gaigs.split import check, generator_of, hold_out, runs_of
 
 
 @register("split", "official")
@@ -22,11 +20,11 @@ def official(links: Links, length: int = 1, validation: float = 0.1, seed: int =
     """
     if links.official is None:
         raise ValueError("this data has no official split; choose split=random, sparse, runs or blocks")
-    check("length", length, length >= 1, "a whole number of rows, at least 1")
+    runs = runs_of(links, length)
     check("validation", validation, 0 <= validation < 1, "in [0, 1)")
+    generator = generator_of(seed)
     train, test = (part.sort().values for part in links.official())
-    generator = torch.Generator().manual_seed(seed)
-    train, validating = hold_out(train, rows_of(links) // length, validation, generator)
+    train, validating = hold_out(train, runs, validation, generator)
     words = ["official"]
     if validation:
         words += [f"validation {validation:g}{f' in runs of {length}' if length > 1 else ''}", f"seed {seed}"]

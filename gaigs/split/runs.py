@@ -2,7 +2,7 @@
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
-from gaigs.split import TEST, check, part, rows_of
+from gaigs.split import TEST, part, runs_of
 
 
 @register("split", "runs")
@@ -19,5 +19,4 @@ def runs(links: Links, length: int, test: float = TEST, validation: float = 0.1,
     Raises:
         ValueError: An option is out of range, or there are too few runs.
     """
-    check("length", length, length >= 1, "a whole number of rows, at least 1")
-    return part(f"runs of {length}", links, rows_of(links) // length, test, validation, seed)
+    return part(f"runs of {length}", links, runs_of(links, length), test, validation, seed)

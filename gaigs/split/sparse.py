@@ -4,7 +4,7 @@ import torch
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
-from gaigs.split import TEST, check, check_fractions, hold_out, rows_of
+from gaigs.split import TEST, check, check_fractions, generator_of, hold_out, rows_of
 
 
 @register("split", "sparse")
@@ -22,7 +22,7 @@ def sparse(links: Links, train: int, test: float = TEST, validation: float = 0.1
         ValueError: An option is out of range, or there are too few rows.
     """
     check_fractions(test, validation)
-    rows, generator = rows_of(links), torch.Generator().manual_seed(seed)
+    rows, generator = rows_of(links), generator_of(seed)
     training, testing = hold_out(torch.arange(len(links)), rows, test, generator)
     present = rows[training].unique()
     check("train", train, 1 <= train <= len(present), f"in 1..{len(present)}, the rows that do not test")
