@@ -2,6 +2,9 @@
 
 import csv
 import math
+import os
+import re
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -11,10 +14,22 @@ from torch import Tensor
 SHOWN = 10
 """Defects that an error lists one by one."""
 
+LONGEST = 400
+"""Characters of a defect that an error shows."""
+
 FAR = 1e5
 """No coordinate reaches it [m]: float32 tells places apart by 8 mm there, and by half a metre at UTM's northings."""
 
 NEAR = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
+
+CARRIERS = 1e4, 1e12
+"""All carriers lie from the first to below the second [Hz]; a smaller number is in MHz or GHz."""
+
+BESIDE_QUOTE = re.compile(r"(?<=\")[ \t]+(?=,|$)")
+"""Blanks behind a quoted cell."""
+
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+"""A number as it is written: ``float`` takes 1_0, the digits of other scripts and infinities too."""
 
 
 def find_folder(root: str | Path) -> Path:
@@ -23,26 +38,52 @@ def find_folder(root: str | Path) -> Path:
     Raises:
         FileNotFoundError: There is none.
     """
-    root = Path(root).expanduser()
-    if not root.is_dir():
+    root = Path(os.path.expanduser(root))
+    if not os.path.isdir(root):  # Path.is_dir raises where a name is too long or a folder is closed
         raise FileNotFoundError(f"{root} must be the folder of a data set, and is none; set the data's root")
     return root
+
+
+def find_file(file: str | Path, content: str) -> Path:
+    """The file of a data set that is one file.
+
+    Raises:
+        FileNotFoundError: There is none.
+    """
+    file = Path(os.path.expanduser(file))
+    if not os.path.isfile(file):
+        raise FileNotFoundError(f"{file} must be {content}, and is no file; set the data's file")
+    return file
+
+
+def has_file(file: Path) -> bool:
+    """Whether a folder has an optional file. One that cannot be read, as a link to nothing, is there too."""
+    return os.path.lexists(file)
 
 
 def refuse(place: Path, defects: Sequence[str]) -> None:
     """Raises a ``ValueError`` that lists the defects, if there are any."""
     if defects:
+        shown = [defect if len(defect) <= LONGEST else f"{defect[:LONGEST]} ..." for defect in defects[:SHOWN]]
+        shown = ["".join(c if c.isprintable() else ascii(c)[1:-1] for c in defect) for defect in shown]
         more = [f"... and {len(defects) - SHOWN} more"] if len(defects) > SHOWN else []
         count = "1 defect" if len(defects) == 1 else f"{len(defects)} defects"
-        raise ValueError("\n  ".join([f"{place} has {count}:", *defects[:SHOWN], *more]))
+        raise ValueError("\n  ".join([f"{place} has {count}:", *shown, *more]))
 
 
 def read_lines(file: Path, expected: str, defects: list[str]) -> list[str]:
     """Lines of a text file without the blank ones at its end."""
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = "missing" if isinstance(error, FileNotFoundError) else f"unreadable ({error})"
+    text, reason = "", None
+    if not has_file(file):
+        reason = "missing"
+    elif not os.path.isfile(file):  # a pipe would be waited for
+        reason = "no file, but a folder, a device or a link to nothing"
+    else:
+        try:
+            text = file.read_text(encoding="utf-8-sig")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = f"unreadable ({error})"
+    if reason:
         defects.append(f"{file.name}: {reason}; expected {expected}")
         return []
     lines = text.rstrip().splitlines()
@@ -68,8 +109,9 @@ def read_points(file: Path, names: Sequence[str], expected: str, defects: list[s
 def to_cells(line: str) -> list[str]:
     """Cells of a line with commas, without the blanks around them."""
     try:
-        (cells,) = csv.reader([line], skipinitialspace=True)
-    except csv.Error:  # a cell of 100,000 characters: no table of ours
+        # Only blanks may stand beside quotes: what else does, csv would join to what they hold.
+        (cells,) = csv.reader([BESIDE_QUOTE.sub("", line)], skipinitialspace=True, strict=True)
+    except csv.Error:  # a quote inside a cell or without its end, or a cell of 100,000 characters: no table of ours
         cells = []
     return [cell.strip() for cell in cells] or [line]
 
@@ -109,10 +151,15 @@ def to_coordinates(place: str, names: Sequence[str], cells: Sequence[str], defec
 
 def to_number(cell: str) -> float:
     """What a cell says, not a number where it says none."""
-    try:
-        return float(cell)
-    except ValueError:
-        return math.nan
+    return float(cell) if NUMBER.fullmatch(cell.strip()) else math.nan
+
+
+def to_index(text: str) -> int | None:
+    """A whole number from 0 in decimal digits; None where there is none."""
+    if not (text.isascii() and text.isdecimal()):
+        return None
+    digits = text.lstrip("0")
+    return int(digits or "0") if len(digits) < 19 else sys.maxsize  # Python takes no thousands of digits
 
 
 def number_places(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:

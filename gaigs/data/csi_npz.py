@@ -1,7 +1,7 @@
 """Complex channels from one file of numpy arrays; docs/data.md describes them."""
 
+import warnings
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gaigs.data import Links
-from gaigs.data._files import FAR, NEAR, number_places, refuse
+from gaigs.data._files import CARRIERS, FAR, NEAR, find_file, number_places, refuse
 from gaigs.geometry import Pose
 from gaigs.query import Query
 from gaigs.registry import register
@@ -31,6 +31,9 @@ ARRAYS = {
 
 OPTIONAL = "elements"
 
+STRENGTHS = 1e-18, 1e18
+"""From the first to below the second lies the strongest entry of a channel: float32 holds its square."""
+
 
 @register("data", "csi_npz")
 def read(file: str | Path) -> Links:
@@ -51,9 +54,7 @@ def read(file: str | Path) -> Links:
         FileNotFoundError: There is no such file.
         ValueError: Something is wrong with the file; the message lists the defects by array and value.
     """
-    file = Path(file).expanduser()
-    if not file.is_file():
-        raise FileNotFoundError(f"{file} must be an .npz file of channels, and is no file; set the data's file")
+    file = find_file(file, "an .npz file of channels")
     defects: list[str] = []
     arrays, ignored = _load(file, defects)
     _check_shapes(arrays, defects)
@@ -96,28 +97,43 @@ def read(file: str | Path) -> Links:
 
 def _load(file: Path, defects: list[str]) -> tuple[dict[str, np.ndarray], list[str]]:
     """The arrays by name, and the names of others, which stay unread."""
-    broken = OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error
     arrays, ignored = {}, []
-    with file.open("rb") as stream:  # numpy would not close a file that it cannot read
-        try:
+    expected = "expected an .npz file, as numpy.savez writes it"
+    try:
+        # Opened here, since numpy would not close a file that it cannot read; it warns of headers written by Python 2.
+        with file.open("rb") as stream, warnings.catch_warnings(action="ignore"):
             content = np.load(stream, allow_pickle=False)
-        except broken as error:
-            defects.append(f"expected an .npz file, as numpy.savez writes it, which numpy cannot read ({error})")
-            return arrays, ignored
-        if not isinstance(content, Mapping):
-            got = f"a single array of shape {content.shape}"
-            defects.append(f"expected an .npz file, as numpy.savez writes it, got {got}")
-            return arrays, ignored
-        for name, (kind, sizes) in ARRAYS.items():
-            if name in content:
-                try:
-                    arrays[name] = np.asanyarray(content[name])
-                except broken as error:
-                    defects.append(f"{name}: unreadable ({error})")
-            elif name != OPTIONAL:
-                defects.append(f"{name}: missing; expected {kind} numbers of shape {_shape(sizes)}")
-        ignored += [name for name in content if name not in ARRAYS]
+            if not isinstance(content, Mapping):
+                defects.append(f"{expected}, got a single array of shape {content.shape}")
+                return arrays, ignored
+            members = [name.removesuffix(".npy") for name in content.zip.namelist()]
+            for name, (kind, sizes) in ARRAYS.items():
+                if members.count(name) == 1:
+                    try:
+                        arrays[name] = _read(content.zip, f"{name}.npy")
+                    except Exception as error:  # whatever a damaged array makes numpy and zipfile raise
+                        defects.append(f"{name}: unreadable ({error})")
+                elif name in members:
+                    defects.append(f"{name}: stands there {members.count(name)} times; expected it once")
+                elif name != OPTIONAL:
+                    defects.append(f"{name}: missing; expected {kind} numbers of shape {_shape(sizes)}")
+            ignored += [name for name in members if name not in ARRAYS]
+    except Exception as error:  # whatever a file of another kind makes them raise
+        defects.append(f"{expected}, which numpy cannot read ({error})")
     return arrays, ignored
+
+
+def _read(archive: zipfile.ZipFile, member: str) -> np.ndarray:
+    """An array, read to the end of its member, where zipfile compares the checksum.
+
+    Raises:
+        ValueError: The member goes on behind the array.
+    """
+    with archive.open(member) as stream:
+        array = np.lib.format.read_array(stream, allow_pickle=False)
+        if stream.read(1):
+            raise ValueError(f"more numbers than its shape {array.shape} has")
+    return array
 
 
 def _check_shapes(arrays: Mapping[str, np.ndarray], defects: list[str]) -> None:
@@ -142,17 +158,23 @@ def _check_shapes(arrays: Mapping[str, np.ndarray], defects: list[str]) -> None:
 def _check_values(arrays: dict[str, np.ndarray], defects: list[str]) -> None:
     """Ranges; arrays become those of the types that are reckoned with."""
     for name, array in arrays.items():
-        with np.errstate(over="ignore"):  # what is too large for a type becomes infinite, and is refused
+        with np.errstate(all="ignore"):  # what is too large for a type becomes infinite, and is refused
             dtype = {"h": np.complex64, "rx_index": np.int64}.get(name, np.float64)
             arrays[name] = array = array.astype(dtype, copy=False)
         match name:
             case "h":
-                holds, expected = np.isfinite(array), "finite numbers within float32"
+                low, high = STRENGTHS
+                with np.errstate(over="ignore"):
+                    strengths = np.abs(array)
+                strongest = strengths.max((1, 2), keepdims=True)
+                holds = (strengths < high) & ~((strongest > 0) & (strongest < low))
+                expected = f"numbers below {high:g}, the largest of a link {low:g} or more unless all are 0"
             case "rx_index":
                 count = len(arrays["rx"])
                 holds, expected = (array >= 0) & (array < count), f"a row of rx, 0..{count - 1}"
             case "frequencies":
-                holds, expected = np.isfinite(array) & (array > 0), "a finite frequency above 0 Hz"
+                low, high = CARRIERS
+                holds, expected = (low <= array) & (array < high), f"a frequency from {low:g} to below {high:g} Hz"
             case _:
                 holds, expected = np.abs(array) < FAR, NEAR
         wrong = np.flatnonzero(~holds.reshape(len(array), -1).all(1))
@@ -160,7 +182,9 @@ def _check_values(arrays: dict[str, np.ndarray], defects: list[str]) -> None:
             first, entries = wrong[0], f"{len(wrong)} of {len(array)} such rows"
             value = array[first][~holds[first]] if array.ndim > 1 else array[first]
             defects.append(f"{name}[{first}]: expected {expected}, got {np.atleast_1d(value)[0]}; {entries}")
-        if name == "h" and not len(wrong) and not array.any():
+        elif name == "frequencies" and len(np.unique(array)) < len(array):
+            defects.append("frequencies: expected different ones, got one twice; leave one of its subcarriers out")
+        elif name == "h" and not array.any():
             defects.append("h: expected a channel that is not zero throughout, got none")
 
 

@@ -7,23 +7,23 @@ from functools import partial
 from pathlib import Path
 
 import torch
-import yaml
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gaigs.data import Links, Parts
 from gaigs.data._files import (
-    FAR,
-    NEAR,
     find_folder,
+    has_file,
     read_lines,
     read_points,
     refuse,
     to_cells,
     to_columns,
+    to_index,
     to_number,
     to_numbers,
 )
+from gaigs.data._yaml import read_mapping, to_position
 from gaigs.geometry import Pose
 from gaigs.query import Query
 from gaigs.registry import register
@@ -65,7 +65,7 @@ def read(root: str | Path) -> Links:
     names, readings = _read_readings(root, gateways, defects)
     if positions and readings and len(positions) != len(readings):
         defects.append(f"{READINGS}: expected {len(positions)} rows of readings as in tx_pos.csv, got {len(readings)}")
-    walls = read_walls(root / LAYOUT, defects) if (root / LAYOUT).exists() else torch.zeros(0, 2, 3)
+    walls = read_walls(root / LAYOUT, defects) if has_file(root / LAYOUT) else torch.zeros(0, 2, 3)
     refuse(root, defects)
 
     dbm = torch.tensor(readings, dtype=torch.float64)
@@ -119,31 +119,11 @@ def to_dbm(
 
 def _read_gateways(root: Path, defects: list[str]) -> dict[str, tuple[int, list[float]]]:
     """Line and position [m] of each gateway."""
-    text = "\n".join(read_lines(root / POSITIONS, "each gateway's name: [x, y, z] [m]", defects))
-    try:
-        # Nodes have lines, and keys as they are written: PyYAML takes the name 010 for 8, and the last of two alike.
-        node = yaml.compose(text, yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        defects.append(f"{POSITIONS}: no YAML: {' '.join(str(error).split())}")
-        return {}
-    entries = node.value if isinstance(node, yaml.MappingNode) else []
-    if text and not entries:
-        defects.append(f"{POSITIONS}: expected each gateway's name: [x, y, z], got {text.splitlines()[0]!r}")
-    gateways = {}
-    for key, value in entries:
-        name, line = str(key.value), key.start_mark.line + 1
-        place = f"{POSITIONS}, line {line}: {name}"
-        items = value.value if isinstance(value, yaml.SequenceNode) else []
-        position = [to_number(item.value) for item in items if isinstance(item, yaml.ScalarNode)]
-        written = " ".join(text[value.start_mark.index : value.end_mark.index].split())
-        if len(items) != 3 or len(position) != 3 or not all(map(math.isfinite, position)):
-            defects.append(f"{place}: position must be 3 finite numbers x, y, z, got {written!r}")
-        elif max(map(abs, position)) >= FAR:
-            defects.append(f"{place}: expected {NEAR}, got {written!r}")
-        if name in gateways:
-            defects.append(f"{place} has a position in line {gateways[name][0]} already")
-        gateways[name] = line, position
-    return gateways
+    entries = read_mapping(root / POSITIONS, "each gateway's name: [x, y, z] [m]", defects)
+    return {
+        name: (entry.line, to_position(f"{POSITIONS}, line {entry.line}: {name}", entry, defects))
+        for name, entry in entries.items()
+    }
 
 
 def _read_readings(root: Path, gateways: Mapping, defects: list[str]) -> tuple[list[str], list[list[float]]]:
@@ -194,13 +174,13 @@ def _read_official(root: Path, heard: Bool[Tensor, "rows gateways"], names: Sequ
         for number, line in enumerate(read_lines(root / file, f"{expected[None]}, on each line", defects), 1):
             place = f"{file}, line {number}"
             row, *column = re.split(r"\s*,\s*|\s+", line.strip(), maxsplit=1)
-            is_row = row.isascii() and row.isdecimal()
-            paired = bool(column) if paired is None and is_row else paired
-            if not is_row or bool(column) != paired:
+            index = to_index(row)
+            paired = bool(column) if paired is None and index is not None else paired
+            if index is None or bool(column) != paired:
                 defects.append(f"{place}: expected {expected[paired]}, got {line!r}")
                 continue
-            entry = (int(row), *(columns.get(name) for name in column))
-            if int(row) >= len(heard):
+            entry = (index, *(columns.get(name) for name in column))
+            if index >= len(heard):
                 defects.append(f"{place}: expected a row in 0..{len(heard) - 1}, got {row}")
             elif None in entry:
                 defects.append(f"{place}: expected a gateway by name or column from 0, got {column[0]!r}")

@@ -1,7 +1,9 @@
 """Spatial spectra in the folder layout of NeRF²; docs/data.md describes the files."""
 
 import math
+import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +18,18 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gaigs.data import Links, Parts
-from gaigs.data._files import find_folder, number_places, read_lines, read_points, refuse, to_number
+from gaigs.data._files import (
+    CARRIERS,
+    find_folder,
+    has_file,
+    number_places,
+    read_lines,
+    read_points,
+    refuse,
+    to_index,
+    to_number,
+)
+from gaigs.data._yaml import read_mapping, to_entries, to_position, to_vector
 from gaigs.directions import Grid
 from gaigs.geometry import Pose
 from gaigs.query import Query
@@ -31,9 +44,6 @@ NORMALISATION = "min-max of each spectrum's amplitude"
 
 FREQUENCIES = "freq.txt"
 """Carrier of each link [GHz]; most folders have none."""
-
-HIGHEST = 1000.0
-"""No carrier reaches it [GHz]: a larger number is in MHz or Hz."""
 
 
 @register("data", "nerf2_spectrum")
@@ -73,7 +83,7 @@ def read(
     files = [root / "spectrum" / f"{k:05d}.png" for k in range(1, len(positions) + 1)]
     defects += _image_defects(root, files)
     frequencies = None if frequency is None else torch.full((len(files),), float(frequency))
-    has_own = (root / FREQUENCIES).exists()
+    has_own = has_file(root / FREQUENCIES)
     if has_own:
         frequencies = _read_frequencies(root, len(files), defects)
     refuse(root, defects)
@@ -170,42 +180,35 @@ def write(folder: str | Path, links: Links) -> None:
 def _check_options(elements: Sequence[int] | None, frequency: float | None, bandwidth: float | None) -> None:
     if bandwidth is not None and not 0 <= bandwidth < math.inf:
         raise ValueError(f"bandwidth must be that of a band, 0 or more [Hz], or null, got {bandwidth}")
-    if frequency is not None and not 0 < frequency < HIGHEST * 1e9:
-        raise ValueError(f"frequency must be a carrier above 0 and below 1e12 Hz, or null, got {frequency}")
+    low, high = CARRIERS
+    if frequency is not None and not low <= frequency < high:
+        raise ValueError(f"frequency must be a carrier from {low:g} to below {high:g} Hz, or null, got {frequency}")
     is_pair = isinstance(elements, Sequence) and len(elements) == 2
     if elements is not None and not (is_pair and all(isinstance(count, int) and count > 0 for count in elements)):
         raise ValueError(f"elements must be the array's rows and columns, such as [4, 4], or null, got {elements!r}")
 
 
 def _read_receiver(root: Path, defects: list[str]) -> Receiver | None:
-    file = "gateway_info.yml"
-    lines = read_lines(root / file, "the gateway's position [m] and orientation (quaternion x, y, z, w)", defects)
-    if not lines:
-        return None
-    try:
-        content = yaml.safe_load("\n".join(lines))
-    except yaml.YAMLError as error:
-        defects.append(f"{file}: no YAML: {' '.join(str(error).split())}")
-        return None
-    content = content if isinstance(content, dict) else {}
-    gateways = {name: value for name, value in content.items() if isinstance(value, dict)}
+    file = root / "gateway_info.yml"
+    expected = "the gateway's position [m] and orientation (quaternion x, y, z, w)"
+    content = read_mapping(file, expected, defects)
+    gateways = {name: entry for name, entry in content.items() if entry.is_mapping}
+    if content and len(gateways) != 1:
+        got = ", ".join(gateways) or "none"
+        defects.append(f"{file.name}: expected one gateway with position and orientation, got {got}")
     if len(gateways) != 1:
-        defects.append(f"{file}: expected one gateway with position and orientation, got {list(gateways) or 'none'}")
         return None
-    name, gateway = gateways.popitem()
-    vectors = []
-    for key, length in (("position", 3), ("orientation", 4)):
-        try:
-            vector = [float(value) for value in gateway[key]]  # PyYAML takes 1e-3, without a point, for a string
-        except (KeyError, TypeError, ValueError):
-            vector = []
-        if len(vector) != length:
-            defects.append(f"{file}: {name}: {key} must be {length} numbers, got {gateway.get(key)}")
-        vectors.append(vector)
+    ((name, gateway),) = gateways.items()
+    place = f"{file.name}, line {gateway.line}: {name}"
+    before, pose = len(defects), to_entries(file.name, gateway.node, defects)
+    position = to_position(place, pose.get("position"), defects)
+    orientation = to_vector(f"{place}: orientation", pose.get("orientation"), "xyzw", defects)
+    if len(defects) > before:
+        return None
     try:
-        return Receiver(str(name), Pose.from_xyzw(*vectors)) if all(vectors) else None
+        return Receiver(name, Pose.from_xyzw(position, orientation))
     except ValueError as error:
-        defects.append(f"{file}: {name}: {error}")
+        defects.append(f"{place}: {error}")
         return None
 
 
@@ -215,9 +218,10 @@ def _read_frequencies(root: Path, count: int, defects: list[str]) -> Float[Tenso
     if lines and count and len(lines) != count:
         defects.append(f"{FREQUENCIES}: expected {count} lines, one for each row of tx_pos.csv, got {len(lines)}")
     gigahertz = [to_number(line) for line in lines]
+    low, high = (bound / 1e9 for bound in CARRIERS)
     for number, value in enumerate(gigahertz, 1):
-        if not 0 < value < HIGHEST:
-            expected = f"one carrier above 0 and below {HIGHEST:g} GHz"
+        if not low <= value < high:
+            expected = f"one carrier from {low:g} to below {high:g} GHz"
             defects.append(f"{FREQUENCIES}, line {number}: expected {expected}, got {lines[number - 1]!r}")
     return (1e9 * torch.tensor(gigahertz, dtype=torch.float64)).float()
 
@@ -236,9 +240,9 @@ def _image_defects(root: Path, files: list[Path]) -> Iterator[str]:
             yield f"{place}: missing; row {number} of tx_pos.csv belongs to it"
             continue
         try:
-            with Image.open(file, formats=["PNG"]) as image:  # reads the header, decodes nothing
+            with _opened(file) as image:  # reads the header, decodes nothing
                 mode, (width, height) = image.mode, image.size
-        except (OSError, Image.DecompressionBombError) as error:
+        except ValueError as error:
             yield f"{place}: no readable PNG file ({error})"
             continue
         if mode != "L":
@@ -260,15 +264,16 @@ def _read_official(root: Path, count: int) -> Parts:
         part = []
         for number, line in enumerate(read_lines(root / file, "one image number from 1 a line", defects), 1):
             place, text = f"{file}, line {number}", line.strip()
-            if not (text.isascii() and text.isdecimal()):
+            image = to_index(text)
+            if image is None:
                 defects.append(f"{place}: expected one image number, got {line!r}")
-            elif not 1 <= int(text) <= count:
+            elif not 1 <= image <= count:
                 defects.append(f"{place}: expected an image number in 1..{count}, got {text}")
-            elif int(text) in seen:
-                defects.append(f"{place}: image {text} stands in {seen[int(text)]} already")
+            elif image in seen:
+                defects.append(f"{place}: image {text} stands in {seen[image]} already")
             else:
-                seen[int(text)] = place
-                part.append(int(text) - 1)
+                seen[image] = place
+                part.append(image - 1)
         parts.append(torch.tensor(sorted(part), dtype=torch.long))
     refuse(root, defects)
     return parts[0], parts[1]
@@ -276,7 +281,23 @@ def _read_official(root: Path, count: int) -> Parts:
 
 def _decode(file: Path) -> Tensor:
     try:
-        with Image.open(file) as image:
+        with _opened(file) as image:
+            image.verify()  # compares the checksums, which decoding does not
+        with _opened(file) as image:
             return torch.from_numpy(np.array(image))
-    except (OSError, SyntaxError) as error:  # Pillow reports a broken chunk as a SyntaxError
+    except ValueError as error:
         raise ValueError(f"{file} must be a whole PNG file, and is damaged ({error}); copy it again") from error
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Image.Image]:
+    """A PNG file whose header is read.
+
+    Raises:
+        ValueError: It cannot be read, or Pillow warns of it.
+    """
+    try:
+        with warnings.catch_warnings(action="error"), Image.open(file, formats=["PNG"]) as image:
+            yield image
+    except Exception as error:  # whatever a damaged file makes Pillow raise
+        raise ValueError(str(error)) from error

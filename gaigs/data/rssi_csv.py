@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from gaigs.data import Links
-from gaigs.data._files import number_places, read_lines, refuse, to_cells, to_columns, to_coordinates
+from gaigs.data._files import find_file, number_places, read_lines, refuse, to_cells, to_columns, to_coordinates
 from gaigs.data.nerf2_rssi import LOUDEST, NOT_HEARD, gateway, read_walls, to_dbm
 from gaigs.query import Query
 from gaigs.registry import register
@@ -58,9 +58,7 @@ def read(
         raise ValueError(f"fixed must be tx or rx, or null for the end with fewer places, got {fixed!r}")
     if not isinstance(not_heard, int | float) or not math.isfinite(not_heard):
         raise ValueError(f"not_heard must be a finite number [dBm], got {not_heard!r}; write such a number in the file")
-    file = Path(file).expanduser()
-    if not file.is_file():
-        raise FileNotFoundError(f"{file} must be a table of readings, and is no file; set the data's file")
+    file = find_file(file, "a table of readings")
     defects: list[str] = []
     points, dbm, ignored = _read_table(file, not_heard, defects)
     walls = torch.zeros(0, 2, 3) if layout is None else read_walls(Path(layout).expanduser(), defects)

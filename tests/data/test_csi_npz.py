@@ -1,6 +1,7 @@
 """Reading complex channels from one file of arrays; the arrays are made here by numpy."""
 
 import re
+import warnings
 import zipfile
 
 import numpy as np
@@ -198,14 +199,31 @@ DEFECTS = {
     "tx infinite": (put("tx", (6, 1), np.inf), "(subtract a common origin from all), got inf; 1 of 10 such rows"),
     "rx far": (put("rx", (1, 0), -1e5), "rx[1]: expected positions within 1e5 m of the origin on each axis"),
     "element far": (put("elements", (2, 2), 5e6), "elements[2]: expected positions within 1e5 m"),
-    "frequency zero": (put("frequencies", 0, 0), "frequencies[0]: expected a finite frequency above 0 Hz, got 0.0"),
-    "frequency nan": (put("frequencies", 3, np.nan), "frequencies[3]: expected a finite frequency above 0 Hz, got nan"),
+    "frequency zero": (
+        put("frequencies", 0, 0),
+        "frequencies[0]: expected a frequency from 10000 to below 1e+12 Hz, got 0.0",
+    ),
+    "frequency nan": (
+        put("frequencies", 3, np.nan),
+        "frequencies[3]: expected a frequency from 10000 to below 1e+12 Hz, got nan",
+    ),
     "offsets for frequencies": (
         {"frequencies": np.array([-3e7, -1e7, 1e7, 3e7])},
-        "frequencies[0]: expected a finite frequency above 0 Hz, got -30000000.0; 2 of 4 such rows",
+        "frequencies[0]: expected a frequency from 10000 to below 1e+12 Hz, got -30000000.0; 2 of 4 such rows",
     ),
-    "channel nan": (put("h", (8, 1, 2), np.nan), "h[8]: expected finite numbers within float32, got (nan+0j)"),
-    "channel beyond float32": (put("h", (8, 1, 2), 1e60), "h[8]: expected finite numbers within float32, got (inf+0j)"),
+    "frequency in GHz": (put("frequencies", 1, 2.4), "frequencies[1]: expected a frequency from 10000 to"),
+    "frequency vast": (put("frequencies", 1, 1e300), "below 1e+12 Hz, got 1e+300; 1 of 4 such rows"),
+    "frequency twice": (put("frequencies", 1, 2.40e9), "frequencies: expected different ones, got one twice"),
+    "channel whose square is infinite": (
+        put("h", (8, 1, 2), 1e19),
+        "h[8]: expected numbers below 1e+18, the largest of a link 1e-18 or more unless all are 0, got (9.99",
+    ),
+    "channel whose square is zero": (
+        {"h": np.full((10, 3, 4), 1e-30j)},
+        "the largest of a link 1e-18 or more unless all are 0, got 1.00000000",
+    ),
+    "channel nan": (put("h", (8, 1, 2), np.nan), "unless all are 0, got (nan+0j)"),
+    "channel beyond float32": (put("h", (8, 1, 2), 1e60), "unless all are 0, got (inf+0j)"),
     "zeros": (
         {"h": np.zeros((10, 3, 4), complex)},
         "h: expected a channel that is not zero throughout, got none",
@@ -250,9 +268,38 @@ def damage(file):
     file.write_bytes(content)
 
 
+def store(file, member, content):
+    """The file with one member of such bytes, whose checksum is right."""
+    with zipfile.ZipFile(file) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members[member] = content(members[member])
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, stored in members.items():
+            archive.writestr(name, stored)
+
+
+def halve(file):
+    """A header of half the precision, as one damaged byte writes it, whose checksum is that of the whole."""
+    changed(file, rx=np.ones((2000, 3)))  # zipfile compares what it has read to the end, and reads 4 kB ahead
+    before, start, content = file.read_bytes().partition(b"rx.npy")
+    assert b"'<f8'" in content[:200]
+    file.write_bytes(before + start + content.replace(b"'<f8'", b"'<f4'", 1))
+
+
+def repeat(file):
+    with zipfile.ZipFile(file, "a") as archive, warnings.catch_warnings(action="ignore"):
+        archive.writestr("tx.npy", archive.read("tx.npy"))
+
+
 @pytest.mark.parametrize(
     ("break_file", "message"),
     [
+        (halve, "rx: unreadable (more numbers than its shape (2000, 3) has)"),
+        (repeat, "tx: stands there 2 times; expected it once"),
+        (lambda f: store(f, "tx.npy", lambda old: old + b"0"), "tx: unreadable (more numbers than its shape"),
+        (lambda f: store(f, "tx.npy", lambda old: old.replace(b"(10, 3)", b"(10*3) ")), "tx: unreadable ("),
+        (lambda f: store(f, "tx.npy", lambda old: old.replace(b"(10, 3)", b"(9**9,)")), "tx: unreadable ("),
+        (lambda f: store(f, "tx.npy", lambda old: old.replace(b"        ", b"0" * 8)), "tx: unreadable ("),
         (
             lambda f: f.write_text("tx,rx\n1,2\n"),
             UNREADABLE,
@@ -265,7 +312,7 @@ def damage(file):
             UNREADABLE,
         ),
     ],
-    ids=["text", "empty", "cut", "damaged", "pickle"],
+    ids=["half", "twice", "longer", "no shape", "power", "header", "text", "empty", "cut", "damaged", "pickle"],
 )
 def test_files_that_are_no_whole_archive_are_refused(file, break_file, message):
     break_file(file)

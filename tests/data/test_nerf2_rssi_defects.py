@@ -97,11 +97,13 @@ DEFECTS = {
     ),
     "gateway of two numbers": (
         lambda f: replace(f, "gateway_position.yml", "[5.0, 1, 2]", "[5.0, 1]"),
-        "gateway_position.yml, line 1: east: position must be 3 finite numbers x, y, z, got '[5.0, 1]'",
+        "gateway_position.yml, line 1: east: position must be 3 finite numbers x, y, z, written as 1.5 or -2e-3, "
+        "got '[5.0, 1]'",
     ),
     "gateway of words": (
         lambda f: replace(f, "gateway_position.yml", "- 1", "- high"),
-        "gateway_position.yml, line 2: west: position must be 3 finite numbers x, y, z, got '- 0.5 - high - 2'",
+        "gateway_position.yml, line 2: west: position must be 3 finite numbers x, y, z, written as 1.5 or -2e-3, "
+        "got '- 0.5 - high - 2'",
     ),
     "gateway far": (
         lambda f: replace(f, "gateway_position.yml", "5.0, 1, 2", "5.0, -100000, 2"),
@@ -115,19 +117,21 @@ DEFECTS = {
     ),
     "gateway infinite": (
         lambda f: replace(f, "gateway_position.yml", "5.0", ".inf"),
-        "gateway_position.yml, line 1: east: position must be 3 finite numbers x, y, z, got '[.inf, 1, 2]'",
+        "gateway_position.yml, line 1: east: position must be 3 finite numbers x, y, z, written as 1.5 or -2e-3, "
+        "got '[.inf, 1, 2]'",
     ),
     "gateway nested": (
         lambda f: replace(f, "gateway_position.yml", "[5.0, 1, 2]", "[[5.0, 1, 2], 1, 2]"),
-        "gateway_position.yml, line 1: east: position must be 3 finite numbers x, y, z, got '[[5.0, 1, 2], 1, 2]'",
+        "gateway_position.yml, line 1: east: position must be 3 finite numbers x, y, z, written as 1.5 or -2e-3, "
+        "got '[[5.0, 1, 2], 1, 2]'",
     ),
     "gateway twice": (
         lambda f: replace(f, "gateway_position.yml", "attic", "east"),
-        "gateway_position.yml, line 6: east has a position in line 1 already",
+        "gateway_position.yml, line 6: east stands in line 1 already",
     ),
     "gateways a list": (
         lambda f: (f / "gateway_position.yml").write_text("- [1, 2, 3]\n"),
-        "gateway_position.yml: expected each gateway's name: [x, y, z], got '- [1, 2, 3]'",
+        "gateway_position.yml: expected each gateway's name: [x, y, z] [m], got '- [1, 2, 3]'",
     ),
     "gateways no YAML": (
         lambda f: replace(f, "gateway_position.yml", "[5.0", "[[5.0"),
@@ -139,11 +143,11 @@ DEFECTS = {
     ),
     "gateways only a comment": (
         lambda f: (f / "gateway_position.yml").write_text("# none\n"),
-        "gateway_position.yml: expected each gateway's name: [x, y, z], got '# none'",
+        "gateway_position.yml: expected each gateway's name: [x, y, z] [m], got '# none'",
     ),
     "gateways none": (
         lambda f: (f / "gateway_position.yml").write_text("{}\n"),
-        "gateway_position.yml: expected each gateway's name: [x, y, z], got '{}'",
+        "gateway_position.yml: expected each gateway's name: [x, y, z] [m], got '{}'",
     ),
     "gateways missing": (
         lambda f: (f / "gateway_position.yml").unlink(),

@@ -160,9 +160,11 @@ def test_what_is_unknown_of_array_and_carrier_is_left_open(folder):
         ({"elements": [4, 0]}, "elements must be the array's rows and columns"),
         ({"elements": [4, 2.0]}, "elements must be the array's rows and columns"),
         ({"elements": 16}, "elements must be the array's rows and columns, .* got 16"),
-        ({"frequency": 0.0}, "frequency must be a carrier above 0 and below 1e12 Hz, or null, got 0.0"),
-        ({"frequency": float("nan")}, "frequency must be a carrier above 0"),
-        ({"frequency": 1e12}, "frequency must be a carrier above 0"),
+        ({"frequency": 0.0}, r"frequency must be a carrier from 10000 to below 1e\+12 Hz, or null, got 0.0"),
+        ({"frequency": float("nan")}, "frequency must be a carrier from"),
+        ({"frequency": 1e-300}, "frequency must be a carrier from"),
+        ({"frequency": 920}, "frequency must be a carrier from"),
+        ({"frequency": 1e12}, "frequency must be a carrier from"),
     ],
 )
 def test_options_out_of_range_are_refused(folder, options, message):

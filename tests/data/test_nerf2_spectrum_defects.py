@@ -154,18 +154,22 @@ DEFECTS = {
     "no index": (lambda f: (f / "test_index.txt").unlink(), "test_index.txt: missing; expected one image number"),
     "frequency negative": (
         lambda f: frequencies(f, 3, "-2.4"),
-        "freq.txt, line 3: expected one carrier above 0 and below 1000 GHz, got '-2.4'",
+        "freq.txt, line 3: expected one carrier from 1e-05 to below 1000 GHz, got '-2.4'",
     ),
-    "frequency zero": (lambda f: frequencies(f, 1, "0"), "freq.txt, line 1: expected one carrier above 0"),
+    "frequency zero": (lambda f: frequencies(f, 1, "0"), "freq.txt, line 1: expected one carrier from 1e-05"),
+    "frequency in vain": (
+        lambda f: frequencies(f, 1, "1e-300"),
+        "freq.txt, line 1: expected one carrier from 1e-05 to below 1000 GHz, got '1e-300'",
+    ),
     "frequency in Hz": (
         lambda f: frequencies(f, 6, "2.4e9"),
-        "line 6: expected one carrier above 0 and below 1000 GHz, got '2.4e9'",
+        "line 6: expected one carrier from 1e-05 to below 1000 GHz, got '2.4e9'",
     ),
-    "frequency nan": (lambda f: frequencies(f, 2, "nan"), "freq.txt, line 2: expected one carrier above 0"),
-    "frequency infinite": (lambda f: frequencies(f, 2, "inf"), "freq.txt, line 2: expected one carrier above 0"),
+    "frequency nan": (lambda f: frequencies(f, 2, "nan"), "freq.txt, line 2: expected one carrier from 1e-05"),
+    "frequency infinite": (lambda f: frequencies(f, 2, "inf"), "freq.txt, line 2: expected one carrier from 1e-05"),
     "frequency with its unit": (
         lambda f: frequencies(f, 2, "2.4 GHz"),
-        "line 2: expected one carrier above 0 and below 1000 GHz, got '2.4 GHz'",
+        "line 2: expected one carrier from 1e-05 to below 1000 GHz, got '2.4 GHz'",
     ),
     "frequency blank between": (lambda f: frequencies(f, 2, ""), "freq.txt, line 2: expected one carrier"),
     "frequencies too few": (
@@ -175,23 +179,25 @@ DEFECTS = {
     "frequencies empty": (lambda f: (f / "freq.txt").write_text("\n"), "freq.txt: empty; expected the carrier [GHz]"),
     "quaternion long": (
         lambda f: replace(f, "gateway_info.yml", "0.5]", "0.6]"),
-        "gateway_info.yml: gateway1: a rotation quaternion must have length 1, got 1.05",
+        "gateway_info.yml, line 2: gateway1: a rotation quaternion must have length 1, got 1.05",
     ),
     "quaternion of three": (
         lambda f: replace(f, "gateway_info.yml", ", 0.5]", "]"),
-        "gateway_info.yml: gateway1: orientation must be 4 numbers, got [0.5, -0.5, -0.5]",
+        "gateway_info.yml, line 2: gateway1: orientation must be 4 finite numbers x, y, z, w, written as 1.5 or -2e-3, "
+        "got '[0.5, -0.5, -0.5]'",
     ),
     "quaternion of words": (
         lambda f: replace(f, "gateway_info.yml", "-0.5", "half"),
-        "gateway_info.yml: gateway1: orientation must be 4 numbers, got [0.5, 'half', -0.5, 0.5]",
+        "orientation must be 4 finite numbers x, y, z, w, written as 1.5 or -2e-3, got '[0.5, half, -0.5, 0.5]'",
     ),
     "position infinite": (
         lambda f: replace(f, "gateway_info.yml", "5.0", ".inf"),
-        "gateway_info.yml: gateway1: a pose must be finite, got position [inf,",
+        "gateway_info.yml, line 2: gateway1: position must be 3 finite numbers x, y, z, written as 1.5 or -2e-3, "
+        "got '[.inf,",
     ),
     "no orientation": (
         lambda f: replace(f, "gateway_info.yml", "orientation", "rotation"),
-        "gateway_info.yml: gateway1: orientation must be 4 numbers, got None",
+        "orientation must be 4 finite numbers x, y, z, w, written as 1.5 or -2e-3, got none",
     ),
     "no gateway": (
         lambda f: (f / "gateway_info.yml").write_text("dataset_name: room\n"),
@@ -199,7 +205,7 @@ DEFECTS = {
     ),
     "two gateways": (
         lambda f: replace(f, "gateway_info.yml", "gateway1", "gateway2: {}\ngateway1"),
-        "gateway_info.yml: expected one gateway with position and orientation, got ['gateway2', 'gateway1']",
+        "gateway_info.yml: expected one gateway with position and orientation, got gateway2, gateway1",
     ),
     "gateway no YAML": (
         lambda f: replace(f, "gateway_info.yml", "[5.0", "[[5.0"),
