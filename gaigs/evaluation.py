@@ -13,6 +13,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from gaigs.data import Links, Split
+from gaigs.files import whole
 from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.model import Model
 from gaigs.registry import registry
@@ -93,7 +94,8 @@ def test(models: Mapping[str, Model], baselines: Mapping[str, Mapping], links: L
         scores[key] = task.scores(labels, values)
         content.setdefault("prediction", task.packed(values))
         content |= {f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()}
-    np.savez_compressed(folder / "predictions.npz", **content)
+    with whole(folder / "predictions.npz") as part:
+        np.savez_compressed(part, **content)
     return scores
 
 
@@ -205,7 +207,8 @@ def write_figures(
     (folder / "figures").mkdir(exist_ok=True)
     files = {folder / "figures" / f"{name}.png": figure for name, figure in figures.items()}
     for file, figure in files.items():
-        figure.savefig(file, dpi=DPI)
+        with whole(file) as part:
+            figure.savefig(part, dpi=DPI)
     return list(files)
 
 

@@ -23,6 +23,7 @@ from torch import Tensor, distributed
 from gaigs import checkpoint, evaluation
 from gaigs.configuration import check_keys, differences
 from gaigs.data import Links, load
+from gaigs.files import whole
 from gaigs.loss import Loss
 from gaigs.model import Model
 from gaigs.processes import STOPPING, Stopped, is_first, only_run
@@ -38,6 +39,10 @@ log = logging.getLogger(__name__)
 
 WRITTEN = ("config.yaml", "best.ckpt", "log", "predictions.npz", "gaussians.ply", "radio_map.npz", "figures")
 """What a run writes into its folder before there is anything to go on from."""
+
+
+RESUMED = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "epoch", "global_step", "split", "links")
+"""What a training goes on from, beside the weights: the most in the words of Lightning."""
 
 
 def run(config: dict, folder: Path) -> dict | None:
@@ -71,9 +76,8 @@ def run(config: dict, folder: Path) -> dict | None:
             metrics = json.loads(finished.read_text())
         else:
             metrics = train_and_test(config, folder)
-            part = finished.with_suffix(".part")
-            part.write_text(json.dumps(metrics, indent=2) + "\n")
-            part.replace(finished)
+            with whole(finished) as part:
+                part.write_text(json.dumps(metrics, indent=2) + "\n")
     console = Console()
     console.print(metrics_table(metrics))
     console.print(verdict(metrics))
@@ -95,7 +99,8 @@ def claim(folder: Path, config: dict) -> None:
             "folder with hydra.run.dir=DIR"
         )
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
-        OmegaConf.save(OmegaConf.create(config), file)
+        with whole(file) as part:
+            OmegaConf.save(OmegaConf.create(config), part)
         return
     differing = differences(OmegaConf.to_container(OmegaConf.load(file)), config)
     if differing:
@@ -228,7 +233,7 @@ def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) ->
     resume = None
     if last.is_file():
         resume = last
-        content = checkpoint.read(last)
+        content = resumable(last, best)
         check_same_links(content[checkpoint.KEY], identity, last)
         log.info("going on after step %d", content["global_step"])
     # Before weights come from a checkpoint: Lightning converts behind that, which would round them.
@@ -252,6 +257,26 @@ def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) ->
     log.info("trained %d steps of %d places in %.0f s: %.1f steps/s", steps, size, seconds, steps / seconds)
     module.load_state_dict(checkpoint.trained_weights(checkpoint.read(best)))
     return model.eval().to(trainer.strategy.root_device), seconds
+
+
+def resumable(last: Path, best: Path) -> dict:
+    """The checkpoint to go on from, where it and the best one so far are whole; changes neither.
+
+    Raises:
+        ValueError: One of them is not.
+    """
+    try:
+        content = checkpoint.read(last)
+        if lacking := [key for key in RESUMED if key not in content | content[checkpoint.KEY]]:
+            raise ValueError(f"{last} must hold the state of a training, and lacks {', '.join(lacking)}")
+        if best.is_file():
+            checkpoint.read(best)
+    except ValueError as error:
+        raise ValueError(
+            f"the training cannot go on: {error}; move {last} elsewhere to train anew in this folder, which overwrites "
+            "best.ckpt, or choose another folder with hydra.run.dir=DIR"
+        ) from error
+    return content
 
 
 def check_trainer(trainer: lightning.Trainer) -> None:

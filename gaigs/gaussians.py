@@ -10,6 +10,7 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor, nn
 
+from gaigs.files import whole
 from gaigs.geometry import from_spherical, semi_axes, unit_quaternions
 from gaigs.scene import Scene
 
@@ -202,7 +203,8 @@ def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> N
             filled[:] = _to_columns(own) if name == "signal" else own.reshape(n, -1)
         columns |= zip(properties, filled.numpy().T, strict=True)
     vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
-    PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(path))
+    with whole(path) as part:
+        PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(part))
 
 
 def _to_columns(signal: Float[Tensor, "n c k"]) -> Float[Tensor, "n columns"]:

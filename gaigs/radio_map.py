@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from gaigs.files import whole
+
 PITCH = 0.1
 """Distance between the points of a map [m], unless the room is large."""
 
@@ -47,12 +49,15 @@ class RadioMap:
 
         ``values_<unit>`` has the unit in lower case, e.g. ``values_dbm``; it is ``values`` where the unit is not of
         plain letters alone. ``frequency`` [Hz] is there where it is known.
+
+        Raises:
+            OSError: It cannot be written, e.g. as the disk is full; what was there before stands.
         """
         arrays = {_key(self.unit): self.values, "x": self.x, "y": self.y, "height": self.height}
         arrays |= {"receivers": self.receivers, "quantity": self.quantity, "unit": self.unit}
         if self.frequency is not None:
             arrays["frequency"] = self.frequency
-        with open(path, "wb") as file:  # given a name, numpy would append .npz where it is missing
+        with whole(path) as part, open(part, "wb") as file:  # given a name, numpy would append .npz where it is missing
             np.savez_compressed(file, **arrays)
 
     @classmethod

@@ -1,8 +1,11 @@
+import errno
 import os
 import shutil
 import subprocess
 import sys
+import traceback
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import pytest
@@ -77,7 +80,7 @@ torch.save(model.predict(torch.load(sys.argv[2])), sys.argv[3])
 
 def test_a_checkpoint_holds_all_that_a_run_is(folder, content):
     identity = content[checkpoint.KEY]
-    assert identity["version"] == checkpoint.VERSION == 1
+    assert identity["version"] == checkpoint.VERSION == 2
     assert identity["config"] == OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
     assert identity["model"] == identity["config"]["model"]
     split = identity["split"]
@@ -110,6 +113,15 @@ class Foreign:
     """Something that only its own code can unpickle."""
 
 
+def pack(path):
+    """The archive anew with its parts deflated, one of which unpacks to more than all of the file."""
+    with ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    with ZipFile(path, "w", ZIP_DEFLATED) as archive:
+        for name, part in (parts | {"archive/data/0": bytes(10**7)}).items():
+            archive.writestr(name, part)
+
+
 @pytest.mark.parametrize(
     "spoil",
     {
@@ -117,9 +129,10 @@ class Foreign:
         "empty": lambda path, content: path.write_bytes(b""),
         "text": lambda path, content: path.write_text("means, quats\n"),
         "another program's": lambda path, content: torch.save({"state_dict": content["state_dict"]}, path),
-        "of another meaning": lambda path, content: torch.save(content | {checkpoint.KEY: 3}, path),
+        "of another meaning": lambda path, content: checkpoint.write(content | {checkpoint.KEY: 3}, path),
         "a tensor": lambda path, content: torch.save(torch.zeros(3), path),
-        "code": lambda path, content: torch.save(content | {"callback": Foreign()}, path),
+        "code": lambda path, content: checkpoint.write(content | {"callback": Foreign()}, path),
+        "packed": lambda path, content: pack(path),
     }.items(),
     ids=lambda item: item[0],
 )
@@ -130,12 +143,14 @@ def test_a_damaged_or_foreign_file_gives_one_line(spoil, folder, content, tmp_pa
     with pytest.raises(ValueError, match=r"best\.ckpt must be a checkpoint of gaigs, and (is damaged|lacks)") as error:
         gaigs.load(path)
     assert "\n" not in str(error.value)
+    told = "".join(traceback.format_exception(error.value))
+    assert "weights_only" not in told, "torch's advice runs the code of a hostile file"
 
 
 def test_weights_that_do_not_fit_give_one_line(content, tmp_path):
     content[checkpoint.KEY]["model"]["deformation"]["width"] = 32
-    torch.save(content, tmp_path / "best.ckpt")
-    message = r"must hold the weights of its configuration, and does not: .*size mismatch for deformation"
+    checkpoint.write(content, tmp_path / "best.ckpt")
+    message = r"and does not: its weights are not those of its configuration: .*size mismatch for deformation"
     with pytest.raises(ValueError, match=message) as error:
         gaigs.load(tmp_path / "best.ckpt")
     assert "\n" not in str(error.value)
@@ -143,24 +158,125 @@ def test_weights_that_do_not_fit_give_one_line(content, tmp_path):
 
 def test_a_component_that_is_not_installed_is_named(content, tmp_path):
     content[checkpoint.KEY]["model"]["tokenizer"]["name"] = "fourier"
-    torch.save(content, tmp_path / "best.ckpt")
+    checkpoint.write(content, tmp_path / "best.ckpt")
     with pytest.raises(ValueError, match="unknown tokenizer 'fourier'"):
         gaigs.load(tmp_path / "best.ckpt")
 
 
-@pytest.mark.parametrize("version", [2, 10])
+@pytest.mark.parametrize("version", [3, 10])
 def test_a_later_version_is_refused(content, tmp_path, version):
     content[checkpoint.KEY]["version"] = version
-    torch.save(content, tmp_path / "best.ckpt")
-    with pytest.raises(ValueError, match=rf"best\.ckpt must be of version 1 or earlier, got {version}; update gaigs"):
+    checkpoint.write(content, tmp_path / "best.ckpt")
+    with pytest.raises(ValueError, match=rf"best\.ckpt must be of version 2 or earlier, got {version}; update gaigs"):
         gaigs.load(tmp_path / "best.ckpt")
 
 
 def test_a_scene_of_a_later_version_is_refused(content, tmp_path):
     content[checkpoint.KEY]["scene"]["version"] = 9
-    torch.save(content, tmp_path / "best.ckpt")
+    checkpoint.write(content, tmp_path / "best.ckpt")
     with pytest.raises(ValueError, match="a scene must be of version 1 or earlier, got 9; update gaigs"):
         gaigs.load(tmp_path / "best.ckpt")
+
+
+def change(content, *place):
+    """The mapping or tensor at a place of a checkpoint's content."""
+    for key in place:
+        content = content[key]
+    return content
+
+
+MODEL, SCENE, WEIGHTS = (checkpoint.KEY, "model"), (checkpoint.KEY, "scene"), ("state_dict",)
+MEANS = "model.gaussians.means"
+DEFECTS = {
+    "no weights": (lambda content: content.pop("state_dict"), "lacks state_dict"),
+    "no model": (lambda content: change(content, checkpoint.KEY).pop("model"), "lacks model"),
+    "neither model nor scene": (
+        lambda content: content.update({checkpoint.KEY: {"version": 2, "scene": 3}}),
+        "lacks model, scene",
+    ),
+    "a version that is none": (
+        lambda content: change(content, checkpoint.KEY).update(version="2"),
+        "be of a version from 0 to 2, got '2'",
+    ),
+    "no receivers": (lambda content: change(content, *SCENE).pop("receivers"), "KeyError: 'receivers'"),
+    "a receiver without a place": (
+        lambda content: change(content, *SCENE, "receivers", 0).pop("position"),
+        "KeyError: 'position'",
+    ),
+    "an option too few": (lambda content: change(content, *MODEL).pop("pooling"), "needs option pooling"),
+    "a weight too few": (lambda content: change(content, *WEIGHTS).pop(MEANS), "Missing key.*gaussians.means"),
+    "a weight that is a word": (lambda content: change(content, *WEIGHTS).update({MEANS: "means"}), "means"),
+    "NaN": (
+        lambda content: change(content, *WEIGHTS, MEANS)[3].fill_(torch.nan),
+        "weights gaussians.means must be finite",
+    ),
+    "infinity": (
+        lambda content: change(content, *WEIGHTS, "model.gaussians.signal")[0].fill_(-torch.inf),
+        "weights gaussians.signal must be finite",
+    ),
+    "a box of NaN": (lambda content: change(content, *SCENE, "lower").fill_(torch.nan), "scene lower must be finite"),
+    "a billion Gaussians in the options": (
+        lambda content: change(content, *MODEL, "gaussians").update(count=10**9),
+        "asks for more than .* bytes",
+    ),
+    "a billion Gaussians in a shape": (
+        lambda content: change(content, *WEIGHTS).update({MEANS: torch.zeros(1, 3).expand(10**9, 3)}),
+        "of weights model.gaussians.means it holds less than its shape says",
+    ),
+    "a billion neurons": (
+        lambda content: change(content, *MODEL, "deformation").update(width=10**9),
+        "asks for more than .* bytes",
+    ),
+    "layers without end": (
+        lambda content: change(content, *MODEL, "deformation").update(attenuation_layers=10**9),
+        "asks for more than .* bytes",
+    ),
+    "a sparse weight": (
+        lambda content: change(content, *WEIGHTS).update({MEANS: torch.zeros(45, 3).to_sparse()}),
+        "hold its tensors whole",
+    ),
+    "a weight of no device": (
+        lambda content: change(content, *WEIGHTS).update({MEANS: torch.zeros(45, 3, device="meta")}),
+        "hold its tensors whole",
+    ),
+}
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_a_file_that_says_what_cannot_be_is_refused_in_one_line(defect, content, tmp_path, monkeypatch):
+    spoil, message = DEFECTS[defect]
+    monkeypatch.setattr(checkpoint, "ROOM", 2**28)  # a quarter of the bound, so that layers without end end soon
+    spoil(content)
+    checkpoint.write(content, tmp_path / "best.ckpt")
+    with pytest.raises(ValueError, match=rf"best\.ckpt must .*{message}") as error:
+        gaigs.load(tmp_path / "best.ckpt")
+    assert "\n" not in str(error.value)
+
+
+def test_a_checkpoint_stays_an_archive_that_torch_reads(folder, content):
+    assert torch.load(folder / "best.ckpt", weights_only=True).keys() == content.keys()
+    with ZipFile(folder / "best.ckpt") as archive:
+        assert archive.testzip() is None
+        assert archive.comment.startswith(checkpoint.SEAL)
+
+
+def test_a_full_disk_leaves_the_checkpoint_that_was_there(folder, content, tmp_path, monkeypatch):
+    path = tmp_path / "best.ckpt"
+    shutil.copy(folder / "best.ckpt", path)
+    before = path.read_bytes()
+
+    def fill(content, file):
+        file.write(b"ha")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(torch, "save", fill)
+    with pytest.raises(
+        OSError, match=r"best\.ckpt could not be written \(No space left on device\); see that"
+    ) as error:
+        checkpoint.write(content, path)
+    assert error.value.errno == errno.ENOSPC
+    assert path.read_bytes() == before
+    assert [*tmp_path.iterdir()] == [path]
 
 
 # --- version 0 ---

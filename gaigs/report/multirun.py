@@ -11,6 +11,7 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
+from gaigs.files import whole
 from gaigs.report.curves import speed_against_error
 from gaigs.report.runs import Run, Spread, read_runs, train_seconds
 from gaigs.report.style import DPI
@@ -133,7 +134,7 @@ def report(folder: Path) -> Group:
     caption = ", ".join(f"{key}={value}" for key, value in shared.items())
 
     written_rows = rows + [_flat(row) for row in groups]
-    with open(folder / "ablation.csv", "w", newline="") as file:
+    with whole(folder / "ablation.csv") as part, open(part, "w", newline="") as file:
         writer = csv.DictWriter(file, _columns(written_rows))
         writer.writeheader()
         writer.writerows(written_rows)
@@ -141,9 +142,11 @@ def report(folder: Path) -> Group:
     markdown = f"{_markdown(rows, titles)}\n{caption}\n" + "".join(f"- without a result: {why}\n" for why in failures)
     if groups:
         markdown += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
-    (folder / "ablation.md").write_text(markdown)
+    with whole(folder / "ablation.md") as part:
+        part.write_text(markdown)
     if any(run.metrics is not None for run in runs):
-        _speed(runs, rows, shared, titles).savefig(folder / "speed_against_error.png", dpi=DPI)
+        with whole(folder / "speed_against_error.png") as part:
+            _speed(runs, rows, shared, titles).savefig(part, dpi=DPI)
 
     hidden = {name for name, metric in known.items() if not metric.is_brief} | {WRITTEN_ONLY}
     if not any(row["status"] == "unfinished" for row in rows):

@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gaigs.configuration import conf_dir, plugin_conf_dirs
+from gaigs.files import whole
 from gaigs.registry import registry
 from gaigs.report.curves import learning_curves, read_curves
 from gaigs.report.runs import Run, Spread, as_baseline, train_seconds
@@ -216,7 +217,7 @@ def _tex(rows: Sequence[System], columns: Sequence[Column]) -> str:
 
 
 def _csv(file: Path, rows: Sequence[System], columns: Sequence[Column]) -> None:
-    with open(file, "w", newline="") as opened:
+    with whole(file) as part, open(part, "w", newline="") as opened:
         writer = csv.writer(opened)
         spread = [any(isinstance(value, Spread) for value in column.values) for column in columns]
         head = ([c.title, f"{c.title}, sd"] if wide else [c.title] for c, wide in zip(columns, spread, strict=True))
@@ -268,10 +269,13 @@ def write_systems(
     ]
     notes += [f"- without a result: {failure}" for failure in failed]
     markdown = [*(_markdown(rows, table) for table in tables), "\n".join(notes) + "\n"]
-    (folder / "systems.md").write_text("\n".join(markdown))
-    (folder / "systems.tex").write_text("\n".join(_tex(rows, table) for table in tables))
+    texts = {"systems.md": markdown, "systems.tex": [_tex(rows, table) for table in tables]}
+    for name, parts in texts.items():
+        with whole(folder / name) as part:
+            part.write_text("\n".join(parts))
     for name, figure in _figures(done, task, known).items():
-        figure.savefig(folder / f"systems_{name}.png", dpi=DPI)
+        with whole(folder / f"systems_{name}.png") as part:
+            figure.savefig(part, dpi=DPI)
 
     brief = [column for column in scores if any(column.title == m.title for m in known.values() if m.is_brief)]
     brief += [column for column in costs if column.title in {COSTS[key] for key in BRIEF}]

@@ -5,6 +5,7 @@ due, by each process's own clock, and knows no stop at a signal: a training coul
 Its progress bars count the batches of an epoch, and a run counts steps.
 """
 
+import contextlib
 import math
 import signal
 import threading
@@ -16,7 +17,8 @@ import torch
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from rich.progress import BarColumn, Progress, TimeRemainingColumn
 
-from gaigs import density
+from gaigs import checkpoint, density
+from gaigs.files import whole
 from gaigs.processes import STOPPING
 from gaigs.training import MeanScores, seeded
 from gaigs.training.budget import share_done
@@ -264,10 +266,10 @@ def save(trainer: lightning.Trainer, path: Path) -> None:
     """Writes a checkpoint, whole or not at all, behind the log of the steps before it; every process has to call it."""
     for logger in trainer.loggers:
         logger.save()
-    part = path.with_suffix(".part")
-    trainer.save_checkpoint(part, weights_only=False)
-    if trainer.is_global_zero:
-        part.replace(path)
+    with whole(path) if trainer.is_global_zero else contextlib.nullcontext(path.with_suffix(".part")) as part:
+        trainer.save_checkpoint(part, weights_only=False)  # which only the first process writes
+        if trainer.is_global_zero:
+            checkpoint.seal(part)
     trainer.strategy.barrier()
 
 

@@ -1,3 +1,4 @@
+import errno
 import math
 import os
 import re
@@ -10,6 +11,7 @@ import pytest
 import torch
 from fitting import make_links
 
+from gaigs import checkpoint
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Pose
 from gaigs.processes import STOPPING
@@ -27,6 +29,12 @@ def handlers():
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture(autouse=True)
+def unsealed(monkeypatch):
+    """The checkpoints here are words, no archives that a seal could end."""
+    monkeypatch.setattr(checkpoint, "seal", lambda path: None)
 
 
 @pytest.fixture(scope="module")
@@ -319,13 +327,16 @@ def test_a_checkpoint_is_written_whole_or_not_at_all(tmp_path):
         def save_checkpoint(self, path, weights_only):
             events.append("checkpoint")
             path.write_text("ha")
-            raise OSError("no space left")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     path = tmp_path / "last.ckpt"
     path.write_text("whole")
-    with pytest.raises(OSError, match="no space left"):
+    message = r"last\.ckpt could not be written \(No space left on device\); see that its folder is there"
+    with pytest.raises(OSError, match=message) as error:
         save(Full(loggers=[SimpleNamespace(save=lambda: events.append("log"))]), path)
+    assert error.value.errno == errno.ENOSPC
     assert path.read_text() == "whole"
+    assert [*tmp_path.iterdir()] == [path], "nothing of the new one is left"
     assert events == ["log", "checkpoint"], "else a kill in between loses rows of the log"
 
 
