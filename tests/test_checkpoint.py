@@ -1,5 +1,6 @@
 import errno
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -102,6 +103,20 @@ def test_a_loaded_model_is_ready_to_predict(folder):
     spectra = model.predict([[1.0, 2.0, 1.5], [2.0, 2.0, 1.0]])
     assert spectra.shape == (2, 90, 360)
     assert not spectra.requires_grad
+
+
+def test_many_spectra_go_to_a_file_as_the_page_shows(folder, tmp_path, monkeypatch):
+    page = (Path(__file__).parents[1] / "docs/start.md").read_text()
+    (code,) = [
+        block for block in re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S) if "predict_batches" in block
+    ]
+    (tmp_path / "runs/room").mkdir(parents=True)
+    shutil.copy(folder / "best.ckpt", tmp_path / "runs/room")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(code.replace("100_000", "5").replace("batch_size=16", "batch_size=2"), names)
+    stored = np.load("spectra.npy", mmap_mode="r")
+    assert torch.equal(torch.tensor(stored), names["model"].predict(names["positions"], batch_size=2))
 
 
 def test_a_missing_checkpoint(tmp_path):

@@ -1,6 +1,7 @@
 """Models predict a task's value from who sends, who hears, at which frequency and, for spectra, in which directions."""
 
-from collections.abc import Callable
+import reprlib
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -10,11 +11,16 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Links
+from gaigs.data._files import FAR, NEAR
 from gaigs.directions import Directions
 from gaigs.gaussians import Gaussians
 from gaigs.query import Batch, Query
+from gaigs.registry import check_type
 from gaigs.report.shapes import LearntRoom
 from gaigs.scene import Scene
+
+INDICES = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
+"""What an index of a receiver may be."""
 
 
 class Prediction(NamedTuple):
@@ -130,7 +136,6 @@ class Model(nn.Module):
             values.append(value.unflatten(1, batch.directions.shape))
         return torch.cat(values) if values else self(batch).value
 
-    @torch.no_grad()
     def predict(
         self,
         transmitters: Query | Float[Tensor, "*points 3"],
@@ -142,7 +147,8 @@ class Model(nn.Module):
         """Values for transmitters anywhere: a query, or a point, a list of them, or a grid.
 
         Args:
-            transmitters: Positions, world frame [m], anything that becomes a float tensor; or a whole query.
+            transmitters: Positions, world frame [m], anything that becomes a float tensor, nearer than 1e5 m to the
+                origin on each axis as positions of data sets are; or a whole query.
             receiver: Name, or index into the scene's receivers; or the index of each position's receiver.
             frequency: Carrier, one for all or one for each position [Hz]; None is the training links' own where they
                 have one carrier or none.
@@ -154,42 +160,84 @@ class Model(nn.Module):
             (``model.scene.task.normalisation``); on the device of the model.
 
         Raises:
-            ValueError: The positions are not (..., 3) or not finite; there is no such receiver; a frequency is not
-                positive, is another than the training links' only one, or is missing where they have several; or a
-                query is given with a receiver or a frequency beside it.
+            TypeError: The batch size is no whole number, or the directions are none.
+            ValueError: The positions are not (..., 3) real numbers, or one is not finite or too far away; there is no
+                such receiver; a frequency is not positive, is another than the training links' only one, or is missing
+                where they have several; the batch size is less than 1; directions are asked for where the label has
+                none; or a query is given with a receiver or a frequency beside it.
         """
-        device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
+        query, shape, directions = self._ask(transmitters, receiver, frequency, batch_size, directions)
+        parts = [*query.parts(batch_size)] or [query]
+        values = torch.cat([self._answer(part, directions) for part in parts])
+        return values.reshape(shape + values.shape[1:])
+
+    def predict_batches(
+        self,
+        transmitters: Query | Float[Tensor, "*points 3"],
+        receiver: int | str | Int[Tensor, "*points"] = 0,
+        frequency: float | Float[Tensor, "*points"] | None = None,
+        batch_size: int = 16,
+        directions: Directions | None = None,
+    ) -> Iterator[Tensor]:
+        """What ``predict`` gives, a batch at a time, for more positions than memory holds values of.
+
+        Args:
+            transmitters, receiver, frequency, batch_size, directions: As for ``predict``.
+
+        Returns:
+            Values (b, *shape) of one batch of positions after the other, those of a grid in the order of
+            ``reshape(-1, 3)``; the last batch may be smaller. Each is computed when it is asked for.
+
+        Raises:
+            TypeError, ValueError: As of ``predict``, at once.
+        """
+        query, _, directions = self._ask(transmitters, receiver, frequency, batch_size, directions)
+        return (self._answer(part, directions) for part in query.parts(batch_size))
+
+    @torch.no_grad()
+    def _answer(self, query: Query, directions: Directions | None) -> Tensor:
+        """Values of a query in evaluation mode; the mode stays what it was."""
+        training = self.training
+        self.eval()
+        try:
+            return self.evaluate(Batch(query, directions))
+        finally:
+            self.train(training)
+
+    def _ask(
+        self, transmitters, receiver, frequency, batch_size, directions
+    ) -> tuple[Query, tuple[int, ...], Directions | None]:
+        """The query that positions stand for, their shape, and the directions asked for; on the model's device."""
+        check_type("batch_size", batch_size, int)
+        if batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
         if isinstance(transmitters, Query):
             if frequency is not None or not isinstance(receiver, int) or receiver:
                 raise ValueError("a query says itself who hears at which frequency; leave receiver and frequency out")
-            transmitters, receiver, frequency = (
-                transmitters.transmitters,
-                transmitters.receivers,
-                transmitters.frequencies,
+            query = transmitters
+            transmitters, receiver, frequency = query.transmitters, query.receivers, query.frequencies
+        own = self.scene.task.directions
+        if directions is not None and not isinstance(directions, Directions):
+            raise TypeError(
+                "directions must be a gaigs.directions.Grid or gaigs.directions.Rays, or None for the label's own, got "
+                f"{type(directions).__name__}"
             )
-        query, shape = self._ask(transmitters, receiver, frequency)
-        query = query.to(device)
-        directions = self.scene.task.directions if directions is None else directions
-        directions = None if directions is None else directions.to(device)
-        training = self.training
-        self.eval()
-        parts = [*query.parts(batch_size)] or [query]
-        values = torch.cat([self.evaluate(Batch(part, directions)) for part in parts])
-        self.train(training)
-        return values.reshape(shape + values.shape[1:])
-
-    def _ask(self, transmitters, receiver, frequency) -> tuple[Query, tuple[int, ...]]:
-        """The query that positions stand for, and their shape."""
-        transmitters = torch.as_tensor(transmitters, dtype=torch.float32)
+        if directions is not None and own is None:
+            raise ValueError(f"labels of task {self.scene.task.name!r} have no directions; leave directions out")
+        transmitters = as_numbers("transmitters", transmitters, "(..., 3) positions [m]")
         if not transmitters.ndim or transmitters.shape[-1] != 3:
             raise ValueError(f"transmitters must be (..., 3) positions [m], got shape {tuple(transmitters.shape)}")
         shape = transmitters.shape[:-1]
         points = transmitters.reshape(-1, 3)
-        if not torch.isfinite(points).all():
-            row = int((~torch.isfinite(points)).any(1).nonzero()[0])
-            raise ValueError(f"transmitters must be finite, got {points[row].tolist()} in row {row}")
-        receivers = self._index(receiver, shape)
-        return Query(points, receivers.to(points.device), self._frequencies(frequency, shape)), shape
+        for holds, expected in ((points.isfinite(), "finite"), (points.abs() < FAR, NEAR)):
+            if not holds.all():
+                row = int((~holds).any(1).nonzero()[0])
+                raise ValueError(f"transmitters must be {expected}, got {points[row].tolist()} in row {row}")
+        receivers = self._index(receiver, shape).to(points.device)
+        query = Query(points, receivers, self._frequencies(frequency, shape))
+        device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
+        directions = own if directions is None else directions
+        return query.to(device), shape, None if directions is None else directions.to(device)
 
     def _frequencies(self, frequency, shape: tuple[int, ...]) -> Float[Tensor, "b"] | None:
         """The carrier of each position [Hz]."""
@@ -203,9 +251,10 @@ class Model(nn.Module):
             frequency = known[0] if len(known) else None
         if frequency is None:
             return None
-        frequency = torch.as_tensor(frequency, dtype=torch.float32)
-        if not (torch.isfinite(frequency) & (frequency > 0)).all():
-            raise ValueError(f"a frequency must be positive and finite [Hz], got {frequency.tolist()}")
+        frequency = as_numbers("a frequency", frequency, "positive and finite [Hz]")
+        wrong = frequency[~(frequency.isfinite() & (frequency > 0))]
+        if len(wrong):
+            raise ValueError(f"a frequency must be positive and finite [Hz], got {wrong[0]:g}")
         if frequency.ndim and frequency.shape != shape:
             raise ValueError(
                 f"frequencies must be one, or one for each of the {tuple(shape)} positions, got "
@@ -219,15 +268,35 @@ class Model(nn.Module):
     def _index(self, receiver: int | str | Tensor, shape: tuple[int, ...]) -> Int[Tensor, "n"]:
         """The index of each position's receiver."""
         names = [receiver.name for receiver in self.scene.receivers]
-        listed = ", ".join(f"{i} = {name}" for i, name in enumerate(names))
+        expected = f"receiver must be one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
         try:
             index = torch.as_tensor(names.index(receiver) if isinstance(receiver, str) else receiver)
-        except (ValueError, TypeError):  # no such name, or names where numbers must be
-            index = torch.tensor(-1)
-        if index.dtype not in (torch.int64, torch.int32) or ((index < 0) | (index >= len(names))).any():
-            raise ValueError(f"receiver must be one of {listed}, got {receiver!r}")
+        except (ValueError, TypeError, RuntimeError, OverflowError):  # no such name, or what is no index
+            raise ValueError(f"{expected}, got {reprlib.repr(receiver)}") from None
+        if index.dtype not in INDICES:
+            given = repr(receiver) if not index.ndim else f"{tuple(index.shape)} of {index.dtype}"
+            raise ValueError(f"{expected}, got {given}")
+        index = index.long()
+        wrong = index[(index < 0) | (index >= len(names))]
+        if len(wrong):
+            raise ValueError(f"{expected}, got {wrong[0]}")
         if index.ndim and index.shape != shape:
             raise ValueError(
                 f"receivers must be one, or one for each of the {tuple(shape)} positions, got {tuple(index.shape)}"
             )
         return index.expand(shape).reshape(-1)
+
+
+def as_numbers(what: str, values: object, expected: str) -> Tensor:
+    """Real numbers of any kind as a float tensor.
+
+    Raises:
+        ValueError: They are none.
+    """
+    try:
+        tensor = torch.as_tensor(values)
+        if tensor.is_complex() or tensor.dtype == torch.bool:
+            raise TypeError(str(tensor.dtype))
+    except (TypeError, ValueError, RuntimeError, OverflowError):  # whatever torch meets in words, or in ragged lists
+        raise ValueError(f"{what} must be {expected} in real numbers, got {reprlib.repr(values)}") from None
+    return tensor.to(torch.float32)

@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from pipeline import NONE, PARTS, watch
 
 from gaigs.directions import Rays
+from gaigs.model.path_loss import PathLoss
 from gaigs.query import Batch, Query
+from gaigs.testing import example_links
 
 PROJECTIONS = pytest.mark.parametrize("projection", ["mercator", "equirectangular", "direction_cosine"])
 
@@ -122,11 +125,92 @@ def test_predict_takes_directions(build, links):
         ([[1.0, 2, 3]], True, "must be one of 0 = gateway0, 1 = gateway1, got True"),
         ([[1.0, 2, 3]], ["gateway0"], r"must be one of 0 = gateway0, 1 = gateway1, got \['gateway0'\]"),
         ([[1.0, 2, 3]], torch.tensor([0, 1]), r"one for each of the \(1,\) positions, got \(2,\)"),
+        ([[1.0, 2, 3], [0, -1e5, 0]], 0, r"within 1e5 m of the origin .*, got \[0.0, -100000.0, 0.0\] in row 1"),
+        ([[1e30, 2, 3]], 0, "positions within 1e5 m of the origin on each axis"),
+        (torch.ones(1, 3, dtype=torch.complex64), 0, r"must be \(..., 3\) positions \[m\] in real numbers"),
+        (
+            [[1.0, 2, 3], [1.0, 2]],
+            0,
+            r"must be \(..., 3\) positions \[m\] in real numbers, got \[\[1.0, 2, 3\], \[1.0, 2\]\]",
+        ),
+        ("west", 0, "in real numbers, got 'west'"),
+        (None, 0, "in real numbers, got None"),
+        (np.ones((1, 3), dtype=bool), 0, "in real numbers"),
+        (3.0, 0, r"got shape \(\)"),
+        ([[1.0, 2, 3]], 1.0, "must be one of 0 = gateway0, 1 = gateway1, got 1.0"),
+        ([[1.0, 2, 3]], 10**30, "must be one of 0 = gateway0, 1 = gateway1, got 1000"),
+        ([[1.0, 2, 3]], torch.tensor([0.0]), r"must be one of .*, got \(1,\) of torch.float32"),
+        ([[1.0, 2, 3]] * 3, np.array([0, 7, 1]), "must be one of 0 = gateway0, 1 = gateway1, got 7"),
+        ([[1.0, 2, 3]], torch.tensor([[0]]), r"one for each of the \(1,\) positions, got \(1, 1\)"),
     ],
 )
-def test_impossible_questions_are_refused(build, transmitters, receiver, message):
-    with pytest.raises(ValueError, match=message):
-        build([]).predict(transmitters, receiver)
+@pytest.mark.parametrize("method", ["predict", "predict_batches"])
+def test_impossible_questions_are_refused(build, transmitters, receiver, message, method):
+    with pytest.raises(ValueError, match=message) as error:
+        getattr(build([]), method)(transmitters, receiver)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"batch_size": 0}, ValueError, "batch_size must be at least 1 link, got 0"),
+        ({"batch_size": -3}, ValueError, "batch_size must be at least 1 link, got -3"),
+        ({"batch_size": 2.5}, TypeError, "batch_size must be a whole number, got 2.5"),
+        ({"batch_size": None}, TypeError, "batch_size must be a whole number, got None"),
+        ({"directions": 30}, TypeError, r"must be a gaigs\.directions\.Grid or gaigs\.directions\.Rays, .* got int"),
+    ],
+)
+def test_options_of_predict_that_cannot_be_are_refused(build, options, error, message):
+    model = build([])
+    for method in (model.predict, model.predict_batches):
+        with pytest.raises(error, match=message):
+            method([[1.0, 2, 3]], **options)
+
+
+def test_labels_without_directions_are_predicted_in_none():
+    links = example_links("rssi")
+    model = PathLoss(links.scene)
+    model.fit(links)
+    with pytest.raises(ValueError, match="labels of task 'rssi' have no directions; leave directions out"):
+        model.predict([[1.0, 2, 3]], directions=Rays(torch.zeros(2), torch.zeros(2)))
+
+
+def test_far_positions_are_predicted(build):
+    assert build().predict([[9.9e4, -9.9e4, 9.9e4], [-9.9e4, 0.0, 0.0]]).isfinite().all()
+
+
+def test_indices_of_any_whole_type_name_a_receiver(build):
+    model, place = build(), [[1.0, 2, 3]]
+    for index in (np.array([1], dtype=np.uint8), np.int16(1), torch.tensor(1, dtype=torch.int32)):
+        assert torch.equal(model.predict(place, index), model.predict(place, 1))
+
+
+# --- predict_batches ---
+
+
+def test_batches_are_the_prediction_in_parts(build, links):
+    model, places = build().train(), links.query.transmitters.reshape(4, 6, 3)
+    receivers = links.query.receivers.reshape(4, 6)
+    whole = model.predict(places, receivers, batch_size=5)
+    parts = model.predict_batches(places, receivers, batch_size=5)
+    first = next(parts)
+    assert model.training, "between two batches the mode is what it was"
+    assert not first.requires_grad
+    rest = [*parts]
+    assert [len(part) for part in (first, *rest)] == [5, 5, 5, 5, 4]
+    assert torch.equal(torch.cat((first, *rest)).reshape(whole.shape), whole)
+    assert [*model.predict_batches(torch.zeros(0, 3))] == []
+
+
+def test_batches_are_computed_one_after_the_other(build, monkeypatch):
+    model, asked = build([]), []
+    evaluate = model.evaluate
+    monkeypatch.setattr(model, "evaluate", lambda batch: asked.append(len(batch)) or evaluate(batch))
+    parts = model.predict_batches(torch.rand(100_000, 3), batch_size=2)
+    assert asked == []
+    next(parts)
+    assert asked == [2]
 
 
 @pytest.mark.parametrize(
@@ -135,6 +219,8 @@ def test_impossible_questions_are_refused(build, transmitters, receiver, message
         (0.0, r"positive and finite \[Hz\], got 0"),
         (-1e9, "positive and finite"),
         (float("nan"), "positive and finite"),
+        ("2 GHz", r"must be positive and finite \[Hz\] in real numbers, got '2 GHz'"),
+        (1e9 + 1j, r"must be positive and finite \[Hz\] in real numbers, got"),
         (torch.tensor([1e9, 2e9]), r"one for each of the \(1,\) positions, got \(2,\)"),
         (1e9, "the training links have no carrier that is known, which says nothing of others; leave frequency out"),
     ],
