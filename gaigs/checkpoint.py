@@ -52,8 +52,9 @@ def write(content: dict, path: Path) -> None:
         OSError: It cannot be written, e.g. as the disk is full; what was there before stands.
     """
     with whole(path) as part:
-        with open(part, "wb") as file:  # given a name, torch would hide the number of the cause
-            torch.save(content, file)
+        file = io.BytesIO()  # given a real one, torch would hide that its disk is full
+        torch.save(content, file)
+        part.write_bytes(file.getvalue())
         seal(part)
 
 

@@ -28,6 +28,7 @@ from gaigs.loss import Loss
 from gaigs.model import Model
 from gaigs.processes import STOPPING, Stopped, is_first, only_run
 from gaigs.registry import call, registry
+from gaigs.report.runs import read_metrics
 from gaigs.report.table import metrics_table, verdict
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS, make_budget
@@ -58,8 +59,9 @@ def run(config: dict, folder: Path) -> dict | None:
         The contents of ``metrics.json``; None in all but the first of several processes.
 
     Raises:
-        ValueError: A configuration that does not fit the data, or another run's folder.
+        ValueError: A configuration that does not fit the data, another run's folder, or a damaged file in this one.
         FileNotFoundError: Data that are not there.
+        OSError: A file cannot be written, e.g. as the disk is full; nothing half-written is left of it.
         KeyboardInterrupt: Ctrl-C, or ``gaigs.processes.Stopped`` for it and SIGTERM.
     """
     check_keys(config)
@@ -73,7 +75,7 @@ def run(config: dict, folder: Path) -> dict | None:
         finished = folder / "metrics.json"
         if finished.is_file():
             log.info("finished already: %s", finished)
-            metrics = json.loads(finished.read_text())
+            metrics = read_metrics(finished)
         else:
             metrics = train_and_test(config, folder)
             with whole(finished) as part:
@@ -92,7 +94,7 @@ def claim(folder: Path, config: dict) -> None:
         ValueError: It has, and it was a run of another configuration; or files of that name are not a run's.
     """
     file = folder / "config.yaml"
-    there = [name for name in WRITTEN if (folder / name).exists()]
+    there = [name for name in (*WRITTEN, "last.ckpt", "metrics.json") if (folder / name).exists()]
     if there and not is_configuration(file):
         raise ValueError(
             f"{folder} must be free or hold a run, and it holds {', '.join(there)} of something else; choose another "

@@ -1,3 +1,4 @@
+import errno
 import hashlib
 import json
 import os
@@ -15,7 +16,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 import gaigs
-from gaigs import evaluation, experiment
+from gaigs import checkpoint, evaluation, experiment
 from gaigs.configuration import conf_dir
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
@@ -254,6 +255,97 @@ def test_a_finished_run_started_again_ends_at_once(finished, monkeypatch):
     monkeypatch.setattr(experiment, "train_and_test", None)
     assert experiment.run(config, folder) == metrics
     assert digest(folder) == before
+
+
+@pytest.mark.parametrize("text", ["", '{"task": "spectrum", "mod', "{}"])
+def test_damaged_metrics_of_a_finished_run_are_named(finished, tmp_path, text):
+    config, folder, metrics = finished
+    copy = shutil.copytree(folder, tmp_path / "run")
+    (copy / "metrics.json").write_text(text)
+    before = digest(copy)
+    with pytest.raises(
+        ValueError, match=r"run/metrics\.json must hold what a run writes, .* move the file elsewhere"
+    ) as error:
+        experiment.run(config, copy)
+    assert "\n" not in str(error.value)
+    assert digest(copy) == before
+    (copy / "metrics.json").unlink()
+    assert experiment.run(config, copy)["models"] == metrics["models"], "the remedy"
+
+
+def lose(*keys):
+    """Leaves parts out of a checkpoint."""
+
+    def spoil(path):
+        content = checkpoint.read(path)
+        for key in keys:
+            (content if key in content else content[checkpoint.KEY]).pop(key)
+        checkpoint.write(content, path)
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "message"),
+    [
+        (
+            "last.ckpt",
+            lambda path: path.write_bytes(path.read_bytes()[:-999]),
+            "last.ckpt must be a checkpoint of gaigs",
+        ),
+        ("last.ckpt", lambda path: path.write_bytes(b""), "last.ckpt must be a checkpoint of gaigs, and is damaged"),
+        ("last.ckpt", lose("loops", "split"), "last.ckpt must hold the state of a training, and lacks loops, split"),
+        (
+            "best.ckpt",
+            lambda path: path.write_bytes(path.read_bytes()[:-999]),
+            "best.ckpt must be a checkpoint of gaigs",
+        ),
+    ],
+)
+def test_a_damaged_checkpoint_to_go_on_from_destroys_nothing(finished, tmp_path, name, spoil, message):
+    config, folder, metrics = finished
+    copy = shutil.copytree(folder, tmp_path / "run")
+    (copy / "metrics.json").unlink()
+    spoil(copy / name)
+    before = digest(copy)
+    with pytest.raises(
+        ValueError, match=rf"the training cannot go on: .*{message}.*; move .*last\.ckpt elsewhere"
+    ) as error:
+        experiment.run(config, copy)
+    assert "\n" not in str(error.value)
+    assert digest(copy) == before
+    (copy / "last.ckpt").unlink()
+    assert experiment.run(config, copy)["models"] == metrics["models"], "the remedy"
+
+
+def test_a_folder_that_lost_its_configuration_is_refused(finished, tmp_path):
+    config, folder, _ = finished
+    shutil.copy(folder / "metrics.json", tmp_path)
+    with pytest.raises(ValueError, match=r"must be free or hold a run, and it holds metrics\.json of something else"):
+        experiment.run(config, tmp_path)
+
+
+def test_a_full_disk_ends_a_run_that_goes_on_later(finished, tmp_path, monkeypatch):
+    """One on which the predictions find no room any more."""
+    config, folder, metrics = finished
+    copy = shutil.copytree(folder, tmp_path / "run")
+    for name in ("metrics.json", "predictions.npz"):
+        (copy / name).unlink()
+    names = {path.name for path in copy.iterdir()}
+
+    def fill(path, **arrays):
+        path.write_bytes(b"ha")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez_compressed", fill)
+        with pytest.raises(
+            OSError, match=r"predictions\.npz could not be written \(No space left on device\)"
+        ) as error:
+            experiment.run(config, copy)
+    assert error.value.errno == errno.ENOSPC
+    assert {path.name for path in copy.iterdir()} == names
+    assert experiment.run(config, copy)["models"] == metrics["models"]
 
 
 def test_a_run_killed_behind_its_training_only_tests_anew(finished, tmp_path, monkeypatch):

@@ -104,8 +104,8 @@ def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
             row["split"] = splits.pop() if len(splits) == 1 else f"{len(splits)} splits"
         row["runs"] = len(group)
         for name in scores[0]:
-            values = [score[name] for score in scores]
-            row[name] = Spread.of(values)
+            if all(name in score for score in scores):
+                row[name] = Spread.of([score[name] for score in scores])
         rows.append(row)
     return rows
 

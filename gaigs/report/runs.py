@@ -9,8 +9,16 @@ from typing import NamedTuple
 
 import yaml
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from gaigs.configuration import differences
+from gaigs.registry import check_type
+from gaigs.report.table import metrics_of
+
+NEEDED = {"task": str, "split": str, "seed": int, "device": str} | dict.fromkeys(
+    ("train_seconds", "inference_ms", "render_ms", "num_gaussians", "num_parameters", "checkpoint_bytes"), float | None
+)
+"""What tables need of ``metrics.json``, beside scores; of costs there may be none."""
 
 FAILED = "gaigs: "
 """How the line of a job's log begins that says why it failed."""
@@ -58,29 +66,85 @@ class Spread(NamedTuple):
         return cls(statistics.mean(values), statistics.stdev(values), min(values))
 
 
+def read_metrics(file: Path) -> dict:
+    """What a run has left in its ``metrics.json``, with all that tables need.
+
+    Raises:
+        ValueError: It is damaged, lacks something, or is of a task that is not installed here.
+    """
+    try:
+        metrics = json.loads(file.read_text())
+        if not isinstance(metrics, dict):
+            raise TypeError(f"it must be a mapping, got {metrics!r:.60}")
+        first, *_ = metrics_of(metrics)
+        for key, kind in NEEDED.items():
+            check_type(repr(key), metrics.get(key), kind)
+        _check_scores("models", metrics.get("models"), first)
+        if metrics.get("validation"):
+            _check_scores("validation", metrics["validation"], first)
+        for receiver, models in (metrics.get("receivers") or {}).items():
+            _check_scores(f"receiver {receiver}", models, first)
+    except (AttributeError, TypeError, ValueError, RecursionError) as error:  # JSON and encodings raise a ValueError
+        raise ValueError(
+            f"{file} must hold what a run writes, and does not: {error}; move the file elsewhere, and the run's "
+            "command writes it anew without another training"
+        ) from error
+    return metrics
+
+
+def _check_scores(place: str, models: object, first: str) -> None:
+    """Sees to it that models have scores, all of them the one that runs are compared by."""
+    if not isinstance(models, dict) or not models:
+        raise TypeError(f"{place!r} must be the scores of models, got {models!r:.60}")
+    for model, scores in models.items():
+        for name in {first: None, **scores}:
+            check_type(f"{name!r} of {model!r} in {place!r}", scores.get(name), float)
+
+
+def _read_yaml(file: Path, kind: type) -> object:
+    """What one of a job's configuration files holds.
+
+    Raises:
+        ValueError: It is damaged.
+    """
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(file), resolve=kind is dict)
+    except (OmegaConfBaseException, yaml.YAMLError, ValueError, OSError) as error:
+        raise ValueError(
+            f"{file} must be YAML that Hydra wrote, and is damaged: {' '.join(str(error).split())}"
+        ) from error
+    if not isinstance(content, kind):
+        raise ValueError(f"{file} must be YAML that Hydra wrote, a {kind.__name__}, got {content!r:.60}")
+    return content
+
+
 def read_runs(folder: Path) -> list[Run]:
     """The runs at any depth of a folder, in the order of their names, the numbers in these by their size.
 
     Raises:
         FileNotFoundError: The folder holds no run.
-        ValueError: One was started anew with another configuration, or they are of several tasks.
+        ValueError: One was started anew with another configuration, they are of several tasks, or a file is damaged.
     """
     runs = []
     for path in folder.glob("**/.hydra/overrides.yaml"):
         run_config, started = path.parents[1] / "config.yaml", path.parent / "config.yaml"
-        if run_config.is_file() and started.is_file() and differences(_resolved(run_config), _resolved(started)):
+        if (
+            run_config.is_file()
+            and started.is_file()
+            and differences(_read_yaml(run_config, dict), _read_yaml(started, dict))
+        ):
             raise ValueError(
                 f"{run_config.parent} holds a run of another configuration than the one last started there, which was "
                 "refused, and Hydra has rewritten its overrides; start the multirun once more as it was at first"
             )
-        overrides = (override.partition("=") for override in yaml.safe_load(path.read_text()))
+        overrides = (override.partition("=") for override in _read_yaml(path, list))
         own = path.parents[1]
         metrics = own / "metrics.json"
         runs.append(
             Run(
                 own.relative_to(folder).as_posix(),
                 {key.lstrip("+"): re.sub(r"\\(.)", r"\1", value) for key, _, value in overrides},  # as it was typed
-                json.loads(metrics.read_text()) if metrics.is_file() else None,
+                read_metrics(metrics) if metrics.is_file() else None,
                 None if metrics.is_file() else _failure(own),
                 own,
             )
@@ -103,9 +167,5 @@ def read_runs(folder: Path) -> list[Run]:
 def _failure(folder: Path) -> str | None:
     """What a job said last, if that was why it failed."""
     logs = [log for log in folder.glob("*.log") if not log.name.startswith("train_ddp")]
-    last = "".join(log.read_text() for log in logs).rstrip().rpartition("\n")[2]
+    last = "".join(log.read_text(errors="replace") for log in logs).rstrip().rpartition("\n")[2]
     return last.removeprefix(FAILED) if last.startswith(FAILED) else None
-
-
-def _resolved(path: Path) -> dict:
-    return OmegaConf.to_container(OmegaConf.load(path), resolve=True)

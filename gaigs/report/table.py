@@ -52,7 +52,8 @@ def metrics_table(metrics: Mapping) -> Group:
             first metric is shown too; where there are several receivers, ``receivers`` has ``models`` for each of them.
     """
     known, models, validation = metrics_of(metrics), metrics["models"], metrics.get("validation") or {}
-    names = [name for name, metric in known.items() if metric.is_brief or len(known) <= FITTING]
+    has = lambda name: all(name in scores for scores in models.values())
+    names = [name for name, metric in known.items() if has(name) and (metric.is_brief or len(known) <= FITTING)]
     # A split's name may end with a seed of its own.
     caption = escape(f"split {metrics['split']}\nrun with seed {metrics['seed']} on {metrics['device']}")
     table = Table(title="Test scores", caption=caption)

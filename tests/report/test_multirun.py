@@ -1,7 +1,9 @@
 """Folders that Hydra itself makes, and what the report makes of them."""
 
 import csv
+import errno
 import json
+import os
 import re
 import subprocess
 import sys
@@ -15,6 +17,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from gaigs.report import multirun
+from gaigs.report.__main__ import main
 from gaigs.report.multirun import ablation, read_runs, report
 from gaigs.task.csi import Csi
 
@@ -286,6 +289,93 @@ def test_none_has_ended(tmp_path):
 def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=f"{re.escape(str(tmp_path))} must hold runs"):
         report(tmp_path)
+
+
+def without(*keys):
+    """Spoils a file of metrics by leaving a key out, at any depth."""
+
+    def spoil(file):
+        metrics = part = json.loads(file.read_text())
+        for key in keys[:-1]:
+            part = part[key]
+        del part[keys[-1]]
+        file.write_text(json.dumps(metrics))
+
+    return spoil
+
+
+DAMAGED = {
+    "truncated": (lambda file: file.write_text(file.read_text()[:-20]), "Expecting"),
+    "empty": (lambda file: file.write_text(""), "Expecting value"),
+    "of another program": (lambda file: file.write_bytes(b"\xff\xfe\x00"), "can't decode byte 0xff"),
+    "a list": (lambda file: file.write_text("[1, 2]"), r"it must be a mapping, got \[1, 2\]"),
+    "brackets": (lambda file: file.write_text("[" * 10**5), "recursion depth"),
+    "without a task": (without("task"), "must have the key 'task'"),
+    "without a split": (without("split"), "'split' must be a string, got None"),
+    "without models": (without("models"), "'models' must be the scores of models, got None"),
+    "without a score": (
+        without("models", "mean", "ssim_median"),
+        "'ssim_median' of 'mean' in 'models' must be a number",
+    ),
+    "with a word for a time": (
+        lambda file: file.write_text(file.read_text().replace("60.5", '"long"')),
+        "'train_seconds' must be a number or null, got 'long'",
+    ),
+    "with an unknown task": (
+        lambda file: file.write_text(file.read_text().replace('"spectrum"', '"spectra"')),
+        r"unknown task 'spectra' \(did you mean 'spectrum'\?\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_damaged_metrics_are_named_in_one_line(damage, tmp_path, monkeypatch, capsys):
+    spoil, message = DAMAGED[damage]
+    for name in ("0", "1"):
+        write_run(tmp_path, name, [f"seed={name}"], seed=int(name), models=scores(0.9))
+    spoil(tmp_path / "1" / "metrics.json")
+    with pytest.raises(ValueError, match=rf"/1/metrics\.json must hold what a run writes, .*{message}") as error:
+        report(tmp_path)
+    assert "\n" not in str(error.value)
+    assert str(error.value).endswith(
+        "move the file elsewhere, and the run's command writes it anew without another training"
+    )
+    monkeypatch.setattr(sys, "argv", ["report", str(tmp_path)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert not [*tmp_path.glob("ablation.*")]
+
+
+@pytest.mark.parametrize("text", ["", "{a: 1", "seed=1", "a: 1"])
+def test_damaged_overrides_are_named_in_one_line(text, tmp_path):
+    write_run(tmp_path, "0", ["seed=1"], models=scores(0.9))
+    (tmp_path / "0" / ".hydra" / "overrides.yaml").write_text(text)
+    with pytest.raises(ValueError, match=r"overrides\.yaml must be YAML that Hydra wrote") as error:
+        report(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_score_that_one_seed_lacks_has_no_spread(tmp_path):
+    for seed in (1, 2):
+        write_run(tmp_path, str(seed), [f"seed={seed}"], seed=seed, models=scores(0.9))
+    without("models", "gaigs", "mae")(tmp_path / "2" / "metrics.json")
+    report(tmp_path)
+    assert "mae_sd" not in read_csv(tmp_path)[-1]
+
+
+def test_a_full_disk_leaves_no_part_of_a_figure(tmp_path, monkeypatch):
+    write_run(tmp_path, "0", ["seed=1"], models=scores(0.9))
+
+    def fill(figure, file, **options):
+        file.write_text("ha")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Figure, "savefig", fill)
+    with pytest.raises(OSError, match=r"speed_against_error\.png could not be written \(No space left on device\)"):
+        report(tmp_path)
+    assert {file.name for file in tmp_path.iterdir()} == {"0", "ablation.csv", "ablation.md"}
 
 
 def test_overrides_of_a_refused_start_are_not_taken_for_the_runs(tmp_path):

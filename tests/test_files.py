@@ -1,0 +1,104 @@
+"""Files are written whole or not at all."""
+
+import errno
+import os
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+
+from gaigs import checkpoint
+from gaigs.files import whole
+from gaigs.gaussians import write_ply
+from gaigs.radio_map import RadioMap
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_file_takes_its_place_once_it_is_whole(tmp_path):
+    path = tmp_path / "scores.npz"
+    path.write_text("old")
+    with whole(path) as part:
+        part.write_text("new")
+        assert path.read_text() == "old"
+        assert part.suffix == ".npz", "many writers choose the format by it"
+    assert path.read_text() == "new"
+    assert [*tmp_path.iterdir()] == [path]
+
+
+@pytest.mark.parametrize("error", [FULL, ValueError("no"), KeyboardInterrupt()], ids=["disk", "value", "ctrl-c"])
+@pytest.mark.parametrize("begun", [True, False])
+def test_where_writing_fails_all_is_as_before(error, begun, tmp_path):
+    path = tmp_path / "scores.npz"
+    path.write_text("old")
+
+    def write():
+        with whole(path) as part:
+            if begun:
+                part.write_text("ne")
+            raise error
+
+    with pytest.raises(type(error)):
+        write()
+    assert path.read_text() == "old"
+    assert [*tmp_path.iterdir()] == [path]
+
+
+@pytest.mark.parametrize(
+    ("error", "number", "cause"),
+    [(FULL, errno.ENOSPC, "No space left on device"), (OSError("7 requested and 3 written"), None, "7 requested")],
+)
+def test_the_error_names_file_cause_and_remedy(error, number, cause, tmp_path):
+    def write():
+        with whole(tmp_path / "scores.npz"):
+            raise error
+
+    with pytest.raises(
+        OSError, match=rf"scores\.npz could not be written \({cause}.*\); see that .* and try again"
+    ) as told:
+        write()
+    assert told.value.errno == number
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    values = RadioMap(np.zeros((1, 2, 2)), np.arange(2.0), np.arange(2.0), 1.0, ("west",))
+    with pytest.raises(
+        FileNotFoundError, match=r"nowhere/floor\.npz could not be written \(No such file or directory\)"
+    ):
+        values.save(tmp_path / "nowhere" / "floor.npz")
+
+
+@pytest.fixture
+def full(tmp_path):
+    """A file system of 64 kB, where one may be mounted."""
+    folder = tmp_path / "full"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("no file system can be mounted here")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+WRITERS = {
+    "best.ckpt": lambda path: checkpoint.write({"weights": torch.rand(10**5)}, path),
+    "floor.npz": lambda path: RadioMap(
+        np.random.default_rng(0).random((1, 200, 200)), np.arange(200.0), np.arange(200.0), 1.0, ("west",)
+    ).save(path),
+    "gaussians.ply": lambda path: write_ply(
+        path,
+        {"means": torch.rand(9999, 3), "quats": torch.rand(9999, 4), "log_scales": torch.rand(9999, 3)}
+        | {"opacity_logits": torch.rand(9999), "signal": torch.rand(9999, 1, 1)},
+        "many",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_disk_that_is_really_full(name, full):
+    (full / name).write_text("old")
+    with pytest.raises(OSError, match="could not be written"):
+        WRITERS[name](full / name)
+    assert (full / name).read_text() == "old"
+    assert [*full.iterdir()] == [full / name]
