@@ -62,4 +62,7 @@ def sphere(option: str, shape: list[int]) -> Grid:
     """
     if not isinstance(shape, list | tuple) or len(shape) != 2 or not all(type(size) is int for size in shape):
         raise ValueError(f"{option} must be [rows, columns], two whole numbers, got {shape}")
-    return Grid.sphere(*shape)
+    try:
+        return Grid.sphere(*shape)
+    except ValueError as error:
+        raise ValueError(f"{option} must be of a sphere: {error}") from None

@@ -6,6 +6,8 @@ import lightning
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from gaigs.registry import check_type
+
 ENDLESS = 2**40
 """A number of steps that no training comes to. Without one Lightning fetches batches ahead of the steps, and a training
 that goes on would miss those."""
@@ -88,7 +90,9 @@ def make_budget(options: Mapping, timer: Timer) -> tuple[dict, Budget | None]:
         None in place of a budget where steps alone count.
 
     Raises:
-        ValueError: A time is not written as Lightning reads it, or is less than a second; or nothing ends the training.
+        TypeError: What counts steps is no whole number.
+        ValueError: A time is not written as Lightning reads it, or is less than a second; nothing ends the training; or
+            an option has steps or epochs at which nothing can happen.
     """
     options = dict(options)
     max_time, every = options.pop("max_time", None), options.get("val_check_interval")
@@ -100,6 +104,15 @@ def make_budget(options: Mapping, timer: Timer) -> tuple[dict, Budget | None]:
         every, options["val_check_interval"] = seconds("trainer.val_check_interval", every), ENDLESS
     else:
         every = None
+    for option in ("val_check_interval", "log_every_n_steps"):
+        steps = options.get(option, 1)
+        check_type(f"trainer.{option}", steps, int)
+        if steps < 1:
+            raise ValueError(f"trainer.{option} must be at least 1 step, got {steps}")
+    for option, only in (("max_epochs", -1), ("check_val_every_n_epoch", None)):
+        epochs = options.get(option)
+        if epochs not in (only, None):
+            raise ValueError(f"trainer.{option} must be {only or 'null'}, as steps or time count, got {epochs}")
     return options, None if max_time is None and every is None else Budget(timer, max_time, every)
 
 

@@ -41,7 +41,7 @@ class DensityControl(Callback):
         seed: Of the halves' random places.
 
     Raises:
-        ValueError: ``every`` is less than one step, or the model has no Gaussians.
+        ValueError: An option is out of range, or the model has no Gaussians.
 
     Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2; thresholds in docs/methods.md.
     """
@@ -59,6 +59,15 @@ class DensityControl(Callback):
     ):
         if every < 1:
             raise ValueError(f"density.every must be at least 1 step, got {every}")
+        if not 0 <= start <= stop:
+            raise ValueError(f"density.start and stop must satisfy 0 <= start <= stop, got {start} and {stop}")
+        for option, bound in (("gradient", gradient), ("split_angle", split_angle)):
+            if not bound >= 0:
+                raise ValueError(f"density.{option} must be at least 0, got {bound}")
+        if not 0 <= opacity < 1:
+            raise ValueError(f"density.opacity must be in [0, 1), got {opacity}")
+        if max_count < 1:
+            raise ValueError(f"density.max_count must be at least 1, got {max_count}")
         self.every, self.start, self.stop = every, start, stop
         self.gradient, self.split_angle, self.opacity = gradient, split_angle, opacity
         self.max_count, self.seed = max_count, seed

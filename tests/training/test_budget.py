@@ -237,6 +237,23 @@ def test_a_time_that_cannot_be_read_is_refused(option, time):
         make_budget({"max_steps": 10, option: time}, Timer())
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "error", "message"),
+    [
+        ("val_check_interval", 0, ValueError, "at least 1 step, got 0"),
+        ("val_check_interval", None, TypeError, "a whole number, got None"),
+        ("val_check_interval", 0.5, TypeError, "a whole number, got 0.5"),
+        ("log_every_n_steps", 0, ValueError, "at least 1 step, got 0"),
+        ("log_every_n_steps", None, TypeError, "a whole number, got None"),
+        ("max_epochs", 3, ValueError, "-1, as steps or time count, got 3"),
+        ("check_val_every_n_epoch", 1, ValueError, "null, as steps or time count, got 1"),
+    ],
+)
+def test_steps_count_and_are_whole(option, value, error, message):
+    with pytest.raises(error, match=rf"^trainer\.{option} must be {message}$"):
+        make_budget({"max_steps": 10, option: value}, Timer())
+
+
 @pytest.mark.parametrize("options", [{"max_steps": -1}, {}])
 def test_something_must_end_it(options):
     with pytest.raises(ValueError, match=r"max_steps must be at least 1, got -1; time alone ends it with trainer\.max"):

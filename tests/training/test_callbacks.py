@@ -117,9 +117,26 @@ def test_density_control_goes_on_from_its_state(module):
     assert step(second, module, 2, [0.0]) == 6, "half of 9 is above the bound: one cloned, one pruned"
 
 
-def test_density_control_refuses():
-    with pytest.raises(ValueError, match=r"density\.every must be at least 1 step, got 0"):
-        control(every=0)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"every": 0}, r"every must be at least 1 step, got 0"),
+        ({"start": -1}, r"start and stop must satisfy 0 <= start <= stop, got -1 and \d+"),
+        ({"start": 9, "stop": 8}, r"start and stop must satisfy 0 <= start <= stop, got 9 and 8"),
+        ({"gradient": math.nan}, r"gradient must be at least 0, got nan"),
+        ({"gradient": -1.0}, r"gradient must be at least 0, got -1\.0"),
+        ({"split_angle": -0.1}, r"split_angle must be at least 0, got -0\.1"),
+        ({"opacity": 1.0}, r"opacity must be in \[0, 1\), got 1\.0"),
+        ({"opacity": math.nan}, r"opacity must be in \[0, 1\), got nan"),
+        ({"max_count": 0}, r"max_count must be at least 1, got 0"),
+    ],
+)
+def test_density_control_refuses(options, message):
+    with pytest.raises(ValueError, match=rf"^density\.{message}$"):
+        control(**options)
+
+
+def test_density_control_needs_gaussians():
     with pytest.raises(ValueError, match="density needs a model with Gaussians"):
         control().on_fit_start(None, SimpleNamespace(model=SimpleNamespace(primitives=None)))
 

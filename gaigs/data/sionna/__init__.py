@@ -59,6 +59,8 @@ def traced_room(
         check_type("frequency", carrier, float)
     if not carriers or len(set(carriers)) < len(carriers):
         raise ValueError(f"frequency must be a carrier or several different ones [Hz], got {frequency}")
+    if not min(carriers) > 0:
+        raise ValueError(f"frequency must be positive [Hz], got {frequency}")
     if spectrum not in ("band", "carrier"):
         raise ValueError(f"spectrum must be 'band' or 'carrier', got {spectrum!r}")
     walls = find_room(room)

@@ -77,6 +77,8 @@ def furnished_room(
         check_type("frequency", carrier, float)
     if not carriers or len(set(carriers)) < len(carriers):
         raise ValueError(f"frequency must be a carrier or several different ones [Hz], got {frequency}")
+    if not min(carriers) > 0:
+        raise ValueError(f"frequency must be positive [Hz], got {frequency}")
     positions = place(transmitters, seed)
     receiver = patch_array(max(carriers))
     grid = Grid.degrees()
