@@ -15,7 +15,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gaigs import configuration, processes
 from gaigs.processes import Stopped, forward_to_children, limit_threads, stopping
-from gaigs.registry import check_type
 from gaigs.report import at_end
 
 log = logging.getLogger("gaigs")
@@ -67,14 +66,7 @@ def train(config: DictConfig) -> float | None:
         raise CompactHydraException("gaigs: not started, as the multirun has been stopped")
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        types = {"seed": int, "save_every": float, "tensorboard": bool, "threads": int | None}
-        types |= {"kriging": bool, "kriging_folds": int}
-        for key, annotation in types.items():
-            check_type(key, plain.get(key), annotation)
-        if not 0 <= plain["seed"] < 2**32:
-            raise ValueError(f"seed must be in 0..{2**32 - 1}, got {plain['seed']}")
-        if not isinstance(plain.get("baselines"), list):
-            raise TypeError(f"baselines must be a list, [] for none, got {plain.get('baselines')!r}")
+        configuration.check(plain)
         is_sweep = settings.mode is RunMode.MULTIRUN
         limit_threads(plain["threads"], settings.launcher.get("n_jobs", 1) if is_sweep else 1)
     except OmegaConfBaseException as error:  # whose message Hydra adds

@@ -1,6 +1,5 @@
 """Where Hydra finds gaigs's configuration files and those of plug-ins, and how two configurations differ."""
 
-import difflib
 import hashlib
 import logging
 from importlib import metadata
@@ -12,7 +11,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
-from gaigs.registry import KINDS, find_holders
+from gaigs.registry import KINDS, check_type, find_holders, suggest
 
 log = logging.getLogger(__name__)
 
@@ -22,10 +21,11 @@ HARMLESS = (
 """Keys that change nothing of what a run finds: one that goes on may have others."""
 
 KEYS = {
-    *KINDS, "gaussians", "density", "kriging", "kriging_folds", "baselines", "trainer", "command", "seed", "save_every",
-    "tensorboard", "threads"
+    **dict.fromkeys((*KINDS, "trainer"), dict), **dict.fromkeys(("gaussians", "density"), dict | None),
+    "kriging": bool, "kriging_folds": int, "baselines": list[dict], "command": str, "seed": int, "save_every": float,
+    "tensorboard": bool, "threads": int | None,
 }  # fmt: skip
-"""What stands at the top of a configuration."""
+"""What stands at the top of a configuration, and of which type it is."""
 
 
 LONGEST = 200
@@ -70,18 +70,27 @@ def differences(there: dict, here: dict) -> dict[str, tuple]:
     return {key: (there.get(key), here.get(key)) for key in keys if there.get(key) != here.get(key)}
 
 
-def check_keys(config: dict) -> None:
-    """Sees to it that a configuration has the keys that there are, and no others.
+def check(config: dict) -> None:
+    """Sees to it that a configuration has the keys that there are, and no others, with values that suit them.
 
     Raises:
-        ValueError: One is unknown or missing.
+        TypeError: A value is not of its key's type.
+        ValueError: A key is unknown or missing, or its value out of range.
     """
-    if unknown := sorted(set(config) - KEYS):
-        near = difflib.get_close_matches(unknown[0], KEYS, n=1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
-        raise ValueError(f"the configuration has no key {unknown[0]!r}{hint}; there are: {', '.join(sorted(KEYS))}")
-    if missing := sorted(KEYS - {"density", "gaussians"} - set(config)):  # which may be null
+    if unknown := [key for key in config if key not in KEYS]:
+        listed = ", ".join(sorted(KEYS))
+        raise ValueError(f"the configuration has no key {suggest(unknown[0], KEYS)}; there are: {listed}")
+    if missing := sorted(KEYS.keys() - {"density", "gaussians"} - config.keys()):  # which may be null
         raise ValueError(f"the configuration needs the key {missing[0]!r}; conf/config.yaml has them all")
+    for key, annotation in KEYS.items():
+        check_type(key, config.get(key), annotation)
+    for kind in KINDS:
+        check_type(f"{kind}.name", config[kind].get("name"), str)
+    check_type("task.baselines", config["task"].get("baselines", []), list[dict])
+    if not 0 <= config["seed"] < 2**32:
+        raise ValueError(f"seed must be in 0..{2**32 - 1}, got {config['seed']}")
+    if config["save_every"] < 0:
+        raise ValueError(f"save_every must be at least 0 s, got {config['save_every']}")
 
 
 def _flat(config: dict, prefix: str = "") -> dict:

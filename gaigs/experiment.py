@@ -21,7 +21,7 @@ from rich.console import Console
 from torch import Tensor, distributed
 
 from gaigs import checkpoint, evaluation
-from gaigs.configuration import check_keys, differences
+from gaigs.configuration import check, differences
 from gaigs.data import Links, load
 from gaigs.files import whole
 from gaigs.loss import Loss
@@ -59,12 +59,13 @@ def run(config: dict, folder: Path) -> dict | None:
         The contents of ``metrics.json``; None in all but the first of several processes.
 
     Raises:
+        TypeError: A value of the configuration that is not of its key's type.
         ValueError: A configuration that does not fit the data, another run's folder, or a damaged file in this one.
         FileNotFoundError: Data that are not there.
         OSError: A file cannot be written, e.g. as the disk is full; nothing half-written is left of it.
         KeyboardInterrupt: Ctrl-C, or ``gaigs.processes.Stopped`` for it and SIGTERM.
     """
-    check_keys(config)
+    check(config)
     if not is_first():
         logging.getLogger("gaigs").setLevel(logging.WARNING)  # one of them tells it all
         train_and_test(config, folder)

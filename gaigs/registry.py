@@ -8,12 +8,13 @@ import difflib
 import functools
 import importlib
 import inspect
+import math
 import numbers
 import re
 import sys
 import tomllib
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -31,10 +32,16 @@ PLAIN = {
     int: (numbers.Integral, "a whole number"),
     float: (numbers.Real, "a number"),
     str: (str, "a string"),
+    Path: (str | Path, "a path"),
     bool: (bool, "true or false"),
     NoneType: (NoneType, "null"),
+    **dict.fromkeys((list, tuple, Sequence), (list | tuple, "a list")),
+    **dict.fromkeys((dict, Mapping), (Mapping, "a mapping")),
 }
 """Annotations that options are checked against: what suits them, and what errors call it. Numbers are no bool."""
+
+LARGEST = {int: 2**63 - 1, float: sys.float_info.max}
+"""Magnitudes beyond which numbers suit no option: torch counts in 64 bits, and what is not finite is no setting."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +128,7 @@ class Registry:
             return component
         names = self.names()
         causes = "".join(f"; cannot read {cause}" for cause in unreadable)
-        raise ValueError(f"unknown {self.kind} {_suggest(name, names)}; there are: {_listed(names)}{causes}")
+        raise ValueError(f"unknown {self.kind} {suggest(name, names)}; there are: {_listed(names)}{causes}")
 
     def build(self, config: Mapping, **context):
         """The component that a configuration names, made with its options.
@@ -142,6 +149,7 @@ class Registry:
                 f"a {self.kind} configuration needs the key 'name', got {options}; there are: {_listed(self.names())}"
             )
         name = options.pop("name")
+        check_type(f"{self.kind}.name", name, str)
         return call(f"{self.kind} {name!r}", self.get(name), options, **context)
 
     def _load(self, holder: Holder) -> Callable:
@@ -157,7 +165,10 @@ class Registry:
             if attribute:
                 return functools.reduce(getattr, attribute.strip().split("."), module)
             return self._registered[holder.name]
-        except Exception as error:  # whatever a stranger's module raises: say whose it is, and why
+        except KeyboardInterrupt as error:  # Ctrl-C, or of the module's own
+            error.args = error.args or (f"stopped while {self.kind} {holder.name!r} of {holder.where} was loaded",)
+            raise
+        except BaseException as error:  # whatever a stranger's module raises, or its end: say whose it is, and why
             cause = f"{type(error).__name__}: {error}"
             raise ImportError(f"{self.kind} {holder.name!r} of {holder.where} cannot be loaded: {cause}") from error
 
@@ -176,7 +187,7 @@ def registry(kind: str) -> Registry:
         ValueError: There is no such kind.
     """
     if kind not in registries:
-        raise ValueError(f"unknown kind {_suggest(kind, KINDS)}; there are: {_listed(KINDS)}")
+        raise ValueError(f"unknown kind {suggest(kind, KINDS)}; there are: {_listed(KINDS)}")
     return registries[kind]
 
 
@@ -202,9 +213,9 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
         context: What the caller knows and no configuration says; passed where the function has such a parameter.
 
     Raises:
-        TypeError: The options are no mapping, or one is not what its parameter is annotated as; only annotations in
-            ``PLAIN`` and unions of them are checked.
-        ValueError: An option is missing or unknown.
+        TypeError: The options are no mapping, or one is not what its parameter is annotated as, see ``check_type``.
+        ValueError: An option is missing or unknown; or with such options the function overflows, wants more memory than
+            there is, ends the process or, where it is of torch or Lightning, fails at all.
     """
     if not isinstance(options, Mapping):
         raise TypeError(f"{what} must be a mapping of options, got {options!r}")
@@ -216,7 +227,7 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
     has = [key for key in named if key not in context]
     unknown = [key for key in options if key in context or not (takes_all or key in named)]
     if unknown:
-        words = " or ".join(_suggest(key, has) for key in unknown)
+        words = " or ".join(suggest(key, has) for key in unknown)
         raise ValueError(f"{what} has no option {words}; it has: {_listed(has)}")
     arguments = {**options, **{key: value for key, value in context.items() if takes_all or key in named}}
     missing = [key for key, p in named.items() if p.default is p.empty and key not in arguments]
@@ -225,7 +236,15 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
     for key in options.keys() & named.keys():
         if options[key] is not named[key].default:  # `width: int = None` is a common shorthand
             check_type(f"{what} option {key!r}", options[key], named[key].annotation)
-    return function(**arguments)
+    try:
+        return function(**arguments)
+    except (Exception, SystemExit) as error:
+        # What says nothing of the options, and neither do these packages.
+        is_bare = isinstance(error, ArithmeticError | MemoryError | SystemExit)
+        is_bare = is_bare or (isinstance(error, RuntimeError) and "tried to allocate" in str(error))
+        if not is_bare and function.__module__.partition(".")[0] not in ("lightning", "torch"):
+            raise
+        raise ValueError(f"{what} cannot be made with {dict(options)}: {type(error).__name__}: {error}") from error
 
 
 def check_type(what: str, value: object, annotation: object) -> None:
@@ -236,13 +255,41 @@ def check_type(what: str, value: object, annotation: object) -> None:
     """
     is_union = typing.get_origin(annotation) in (typing.Union, UnionType)
     allowed = typing.get_args(annotation) if is_union else (annotation,)
-    if not all(isinstance(kind, type) and kind in PLAIN for kind in allowed):
-        return
-    if any(isinstance(value, PLAIN[kind][0]) and (kind is bool or not isinstance(value, bool)) for kind in allowed):
-        return
-    words = " or ".join(PLAIN[kind][1] for kind in allowed)
-    whole = int in allowed and isinstance(value, float) and value.is_integer()
-    raise TypeError(f"{what} must be {words}, got {value!r}" + (f"; write {int(value)}" if whole else ""))
+    kinds = [typing.get_origin(kind) or kind for kind in allowed]
+    if not all(isinstance(kind, type) and kind in PLAIN for kind in kinds):
+        if not isinstance(value, float):
+            return
+        allowed = kinds = [float]  # whatever it may be, it is finite
+    if fitting := [whole for whole, kind in zip(allowed, kinds, strict=True) if _suits(value, kind)]:
+        return _check_entries(what, value, typing.get_args(fitting[0]))
+    words = " or ".join(PLAIN[kind][1] for kind in kinds)
+    if isinstance(value, float) and not math.isfinite(value):
+        words = words.replace("a number", "a finite number")
+    elif type(value) is int and LARGEST.keys() & kinds:
+        words += f" up to {LARGEST[float if float in kinds else int]:.2g}"
+    is_whole = int in kinds and isinstance(value, float) and value.is_integer() and _suits(int(value), int)
+    raise TypeError(f"{what} must be {words}, got {value!r}" + (f"; write {int(value)}" if is_whole else ""))
+
+
+def _suits(value: object, kind: type) -> bool:
+    """Whether a value is of a type of ``PLAIN``, whatever its entries."""
+    if kind in LARGEST and isinstance(value, numbers.Integral):
+        return not isinstance(value, bool) and abs(int(value)) <= LARGEST[kind]
+    return isinstance(value, PLAIN[kind][0]) and (kind not in LARGEST or math.isfinite(value))
+
+
+def _check_entries(what: str, value: object, kinds: tuple) -> None:
+    """Checks the entries of a list or mapping whose annotation has these arguments."""
+    if isinstance(value, Mapping) and kinds:
+        for key, entry in value.items():
+            check_type(f"a key of {what}", key, kinds[0])
+            check_type(f"{what}, entry {key!r},", entry, kinds[1])
+    elif isinstance(value, list | tuple) and kinds:
+        kinds = kinds[:1] * len(value) if kinds[1:] in ((), (...,)) else kinds
+        if len(value) != len(kinds):
+            raise TypeError(f"{what} must be a list of {len(kinds)}, got {value!r}")
+        for number, (entry, kind) in enumerate(zip(value, kinds, strict=True)):
+            check_type(f"{what}, entry {number},", entry, kind)
 
 
 def _signature(function: Callable) -> inspect.Signature:
@@ -339,7 +386,8 @@ def _plain(config: Mapping, kind: str) -> dict:
     return {k: OmegaConf.to_container(v, resolve=True) if OmegaConf.is_config(v) else v for k, v in config.items()}
 
 
-def _suggest(word: str, known: Iterable[str]) -> str:
+def suggest(word: str, known: Iterable[str]) -> str:
+    """A word in quotes, and the known one that it may stand for."""
     near = difflib.get_close_matches(str(word), known, n=1)
     return f"{word!r} (did you mean {near[0]!r}?)" if near else repr(word)
 

@@ -1,12 +1,16 @@
 import math
+import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, Optional, Union
 
 import numpy as np
 import pytest
+import torch
 from lightning import Trainer
 from omegaconf import OmegaConf
+from torch.optim.lr_scheduler import StepLR
 
 import gaigs
 from gaigs.registry import KINDS, Registry, call, find_holders, register, registries, registry
@@ -164,6 +168,12 @@ def test_build_refuses(models, config, message):
         models.build(config, scene="room")
 
 
+@pytest.mark.parametrize("name", [None, 3, ["horn"], True])
+def test_a_name_is_a_string(models, name):
+    with pytest.raises(TypeError, match=rf"^model\.name must be a string, got {re.escape(repr(name))}$"):
+        models.build({"name": name}, scene="room")
+
+
 @pytest.mark.parametrize("config", ["horn", ["horn"], OmegaConf.create(["horn"]), None])
 def test_build_needs_a_mapping(models, config):
     with pytest.raises(TypeError, match="must be a mapping with the key 'name', got"):
@@ -186,6 +196,11 @@ def tuned(
     root: str | Path = "",
     octaves: tuple[int, int] | None = None,
     heads: list[str] = (),
+    weights: dict[str, float] | None = None,
+    sizes: tuple[int, ...] = (),
+    parts: dict = {},  # noqa: B006
+    devices: Union[list[int], str, int] = 1,  # noqa: UP007
+    bands: Sequence[float] = (),
     precision: Literal[16, 32] = 32,
     tagged: Annotated[int, []] = 0,
     free=None,
@@ -215,11 +230,63 @@ def tuned(
         ("every", True, "a whole number or a number, got True"),
         ("tests", 1.0, "a whole number or true or false, got 1.0; write 1"),
         ("shorthand", 1.5, "a whole number, got 1.5"),
+        ("count", 1e300, r"a whole number, got 1e\+300"),
+        ("count", 10**19, r"a whole number up to 9\.2e\+18, got 10000000000000000000"),
+        ("width", math.nan, "a finite number, got nan"),
+        ("width", -math.inf, "a finite number, got -inf"),
+        ("width", 10**309, r"a number up to 1\.8e\+308, got 10{309}"),
+        ("rate", math.nan, "a finite number or null, got nan"),
+        ("tagged", math.nan, "a finite number, got nan"),
+        ("root", 3, "a string or a path, got 3"),
+        ("parts", [], r"a mapping, got \[\]"),
+        ("heads", "signal", "a list, got 'signal'"),
+        ("heads", 3, "a list, got 3"),
+        ("devices", 1.5, "a list or a string or a whole number, got 1.5"),
+        ("octaves", {}, r"a list or null, got {}"),
+        ("octaves", [1], r"a list of 2, got \[1\]"),
     ],
 )
 def test_an_option_of_another_type_is_refused(option, value, message):
     with pytest.raises(TypeError, match=f"^horn option '{option}' must be {message}$"):
         call("horn", tuned, {option: value})
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("octaves", [0.5, 2], "horn option 'octaves', entry 0, must be a whole number, got 0.5"),
+        ("heads", ["signal", 3], "horn option 'heads', entry 1, must be a string, got 3"),
+        ("weights", {"opacity": "high"}, "horn option 'weights', entry 'opacity', must be a number, got 'high'"),
+        ("weights", {3: 1.0}, "a key of horn option 'weights' must be a string, got 3"),
+        ("sizes", [8, 16.0], "horn option 'sizes', entry 1, must be a whole number, got 16.0; write 16"),
+        ("devices", [0, None], "horn option 'devices', entry 1, must be a whole number, got None"),
+        ("bands", [math.nan], "horn option 'bands', entry 0, must be a finite number, got nan"),
+    ],
+)
+def test_an_entry_of_another_type_is_refused(option, value, message):
+    with pytest.raises(TypeError, match=f"^{message}$"):
+        call("horn", tuned, {option: value})
+
+
+def exits():
+    sys.exit(0)
+
+
+@pytest.mark.parametrize(
+    ("function", "options", "cause"),
+    [
+        (lambda steps: 1 / steps, {"steps": 0}, "ZeroDivisionError: division by zero"),
+        (lambda order: 10.0**order, {"order": 999}, "OverflowError: "),
+        (lambda count: bytes(count), {"count": 2**62}, "MemoryError: "),
+        (lambda count: torch.empty(count), {"count": 2**58}, "RuntimeError: "),
+        (exits, {}, "SystemExit: 0"),
+        (StepLR, {"optimizer": 3, "step_size": 1}, "TypeError: int is not an Optimizer"),
+    ],
+)
+def test_what_says_nothing_of_its_options_is_told_with_them(function, options, cause):
+    told = f"horn cannot be made with {options}: {cause}"
+    with pytest.raises(ValueError, match=f"^{re.escape(told)}"):
+        call("horn", function, options)
 
 
 @pytest.mark.parametrize(
@@ -237,9 +304,16 @@ def test_an_option_of_another_type_is_refused(option, value, message):
         ("tests", True),
         ("shorthand", None),
         ("root", Path("here")),
-        ("root", 3),
-        ("octaves", [0.5, "2"]),
-        ("heads", 3),
+        ("root", "here"),
+        ("octaves", [-3, 2]),
+        ("octaves", None),
+        ("heads", ("signal",)),
+        ("weights", {"opacity": 1}),
+        ("sizes", []),
+        ("parts", {3: None}),
+        ("devices", "auto"),
+        ("devices", [0, 1]),
+        ("bands", [1, 2.5]),
         ("precision", "16"),
         ("tagged", 0.5),
         ("free", object()),
@@ -321,6 +395,8 @@ def test_names_in_comments_strings_and_functions_are_no_names(plugins):
     [
         ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
         ("value = 1 / 0", "ZeroDivisionError: division by zero"),
+        ("import sys; sys.exit(0)", "SystemExit: 0"),
+        ("class Halt(BaseException): ...\n    raise Halt('at once')", "Halt: at once"),
     ],
 )
 def test_a_plugin_that_fails_hurts_only_who_asks_for_it(plugins, body, cause):
@@ -329,6 +405,12 @@ def test_a_plugin_that_fails_hurts_only_who_asks_for_it(plugins, body, cause):
     assert registry("model").build({"name": "sound"}).value == 1
     with pytest.raises(ImportError, match=rf"model 'broken' of plugins.broken\.py cannot be loaded: {cause}"):
         registry("model").get("broken")
+
+
+def test_ctrl_c_within_a_plugin_stays_one_and_says_where(plugins):
+    plugins("slow.py", component("model", "slow", "raise KeyboardInterrupt"))
+    with pytest.raises(KeyboardInterrupt, match=r"^stopped while model 'slow' of plugins.slow\.py was loaded$"):
+        registry("model").get("slow")
 
 
 def test_files_that_cannot_be_read_hurt_only_who_finds_no_name(plugins):

@@ -149,7 +149,7 @@ def test_options_out_of_range_are_refused(options, message):
 
 
 def test_frequencies_are_numbers():
-    with pytest.raises(TypeError, match="frequency must be a number, got '5e9'"):
+    with pytest.raises(TypeError, match="'frequency' must be a number or a list, got '5e9'"):
         traced_room(frequency="5e9")
 
 

@@ -164,9 +164,9 @@ def test_the_command_refuses(tmp_path, monkeypatch, capsys, arguments, message):
         ({"transmitters": 1}, "transmitters must be at least 2"),
         ({"frequency": []}, r"frequency must be a carrier or several different ones \[Hz\], got \[\]"),
         ({"frequency": [5e9, 5e9]}, "frequency must be a carrier or several different ones"),
+        ({"frequency": [5e9, -1.0]}, "frequency must be positive"),
         ({"frequency": [5e9, 50e9]}, r"frequency must lie in 1e9\.\.40e9 Hz"),
         ({"frequency": -5e9}, "frequency must be positive"),
-        ({"frequency": float("nan")}, "frequency must be positive"),
     ],
 )
 def test_options_out_of_range_are_refused(options, message):
@@ -174,9 +174,9 @@ def test_options_out_of_range_are_refused(options, message):
         furnished_room(**{"transmitters": 4, **options})
 
 
-@pytest.mark.parametrize("frequency", ["6e9", [6e9, "5e9"], None])
+@pytest.mark.parametrize("frequency", ["6e9", [6e9, "5e9"], None, float("nan")])
 def test_frequencies_are_numbers(frequency):
-    with pytest.raises(TypeError, match="frequency must be a number, got"):
+    with pytest.raises(TypeError, match=r"frequency'.* must be a (finite )?number"):
         furnished_room(transmitters=4, frequency=frequency)
 
 

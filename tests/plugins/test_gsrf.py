@@ -319,7 +319,6 @@ def test_single_directions_have_no_window():
         ({"count": 0}, "model.count must be at least 1, got 0"),
         ({"count": 1}, "a point for each of the 2 receivers"),
         ({"margin": 0.0}, "model.margin must be positive"),
-        ({"pitch": math.inf}, "model.pitch must be positive"),
         ({"pooling": {"name": "spectrum", "channels": 1}}, "pooling 'spectrum' takes 1 real channel"),
     ],
 )

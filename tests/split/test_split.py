@@ -188,23 +188,8 @@ def test_names_say_the_numbers(links, options, name):
         ({"name": "official", "length": N}, "takes two groups of them or more, got 1"),
         ({"name": "runs", "length": 0}, "split.length must be a whole number of rows"),
         ({"name": "blocks", "edge": 0}, r"split.edge must be from 1e-06 to 1e\+06 m, got 0"),
-        *(
-            ({"name": "blocks", "edge": edge}, "split.edge must be from")
-            for edge in (1e-300, 1e300, -0.5, float("nan"), float("inf"), 10**400)
-        ),
-        *(
-            ({"name": "random", option: value}, f"split.{option} must be in")
-            for option in ("test", "validation")
-            for value in (float("nan"), float("inf"), -float("inf"), 10**400)
-        ),
-        ({"name": "sparse", "train": 10**400}, r"split.train must be in 1\.\.320"),
-        ({"name": "runs", "length": 10**400}, "takes two groups of them or more, got 1"),
-        ({"name": "official", "length": 2**64}, "takes two groups of them or more, got 1"),
-        *(
-            (options | {"seed": seed}, "split.seed must be a whole number from 0 to")
-            for options in SPLITS
-            for seed in (-1, 2**63, 10**400)
-        ),
+        *(({"name": "blocks", "edge": edge}, "split.edge must be from") for edge in (1e-300, 1e300, -0.5)),
+        *((options | {"seed": -1}, "split.seed must be a whole number from 0 to") for options in SPLITS),
         ({"name": "sparse", "train": 321}, r"split.train must be in 1\.\.320"),
         ({"name": "blocks", "edge": 50.0}, "takes two groups of them or more, got 1"),
         ({"name": "runs", "length": 250, "validation": 0.1}, "takes two groups"),

@@ -82,7 +82,9 @@ def test_an_optimizer_needs_a_target(groups):
         ({"lr": 0.1}, ValueError, r"takes no lr, as each group has its own; set training\.learning_rates"),
         ({"params": []}, ValueError, "training.optimizer has no option 'params'"),
         ({"nesterov": "yes"}, TypeError, r"training\.optimizer option 'nesterov' must be true or false, got 'yes'"),
-        ({"momentum": -1.0}, ValueError, "momentum"),
+        ({"momentum": -1.0}, ValueError, r"training\.optimizer cannot be made with .* Invalid momentum value: -1\.0"),
+        ({"weight_decay": -1.0}, ValueError, r"training\.optimizer cannot be made with .* Invalid weight_decay value"),
+        ({"weight_decay": float("nan")}, TypeError, r"option 'weight_decay' must be a finite number, got nan"),
     ],
 )
 def test_options_of_the_optimizer_are_its_own(groups, options, error, message):
