@@ -11,9 +11,10 @@ from gaigs.gaussians import Gaussians
 from gaigs.loss import Loss
 from gaigs.model import Model
 from gaigs.query import Batch
-from gaigs.registry import call, check_type, register
+from gaigs.registry import call, register, suggest
 from gaigs.training import MeanScores, seeded
 from gaigs.training.budget import share_done
+from gaigs.training.finite import find_broken, is_finite
 from gaigs.training.schedule import make_optimizer, make_schedule
 
 RATES = {*Gaussians.PARAMETERS, "network", "planes", "paths", "obstacles"}
@@ -44,7 +45,6 @@ class Descent(lightning.LightningModule):
         density: Options of ``gaigs.training.callbacks.DensityControl``; None for none.
 
     Raises:
-        TypeError: A learning rate or the weight of a penalty is no number.
         ValueError: An option is out of range, or the learning rates are not those of the model's groups.
 
     Source: optimiser and schedules after the released configuration.
@@ -75,7 +75,6 @@ class Descent(lightning.LightningModule):
             raise ValueError(f"training.jitter must be at least 0 m, got {jitter}")
         check_rates(model, learning_rates)
         for key, weight in penalties.items():
-            check_type(f"training.penalties.{key}", weight, float)
             if not weight >= 0:
                 raise ValueError(f"training.penalties.{key} must be at least 0, got {weight}")
         self.model, self.loss, self.identity, self.seed = model, loss, identity, seed
@@ -112,15 +111,14 @@ class Descent(lightning.LightningModule):
         links, places = batch.shares
         total = links * loss
         if unknown := self.penalties.keys() - penalties.keys() - PENALTIES:
-            raise ValueError(f"training.penalties has {', '.join(sorted(unknown))}, and the model has no such penalty")
+            words = " and ".join(suggest(name, PENALTIES | penalties.keys()) for name in sorted(unknown))
+            raise ValueError(f"training.penalties has {words}, and the model has no such penalty; leave it out")
         for name, penalty in penalties.items():
             if name not in self.penalties:
                 raise ValueError(f"training.penalties must give a weight for {name}; 0 for none")
             total = total + self.penalties[name] * places * penalty
         if not torch.isfinite(total):
-            raise ValueError(
-                f"the loss must stay finite, got {total:g} at step {self.global_step}; lower training.learning_rates"
-            )
+            raise self._diverged(total, terms, batch)
         self.log("train/loss", total, prog_bar=True, logger=False)
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
             # Now: Lightning would log behind the step's callbacks, and a checkpoint written there would lack the row.
@@ -132,6 +130,18 @@ class Descent(lightning.LightningModule):
             for logger in self.loggers:
                 logger.log_metrics(values, step=self.global_step)
         return total
+
+    def _diverged(self, total: Tensor, terms: dict[str, Tensor], batch: Batch) -> ValueError:
+        """Says what it is that is not finite in a step, and what to do."""
+        what, remedy = "the data's labels", "check the files"
+        if is_finite(batch.labels):
+            what, remedy = find_broken(self.model, batch, terms), "lower training.learning_rates"
+            if self.global_step == 0:
+                remedy = "no rate has acted yet, so check the options of that part"
+        return ValueError(
+            f"the loss must stay finite, got {total:g} at step {self.global_step}, and what is not finite there is "
+            f"{what}; {remedy}"
+        )
 
     def on_validation_epoch_start(self) -> None:
         self.scores = MeanScores(self.task)
@@ -154,7 +164,6 @@ def check_rates(model: Model, rates: dict[str, float]) -> None:
     """Sees to it that each of a model's parameter groups has a learning rate, and that no rate is for nothing.
 
     Raises:
-        TypeError: A rate is no number.
         ValueError: A group has none, or a rate has no group; the groups of the splatting pipeline may stay. A rate is
             negative.
     """
@@ -162,11 +171,8 @@ def check_rates(model: Model, rates: dict[str, float]) -> None:
     if unset := groups - set(rates):
         raise ValueError(f"training.learning_rates must give a rate for {', '.join(sorted(unset))}")
     if unknown := set(rates) - groups - RATES:
-        raise ValueError(
-            f"training.learning_rates has {', '.join(sorted(unknown))}, and the model's groups are "
-            f"{', '.join(sorted(groups))}"
-        )
+        words = " and ".join(suggest(name, groups | RATES) for name in sorted(unknown))
+        raise ValueError(f"training.learning_rates has {words}, and the model's groups are {', '.join(sorted(groups))}")
     for name, rate in rates.items():
-        check_type(f"training.learning_rates.{name}", rate, float)
         if not rate >= 0:
             raise ValueError(f"training.learning_rates.{name} must be at least 0, got {rate}")

@@ -1,8 +1,9 @@
 from dataclasses import replace
+from typing import NamedTuple
 
 import pytest
 import torch
-from fitting import Plane, fit, make_links, make_module
+from fitting import OPTIONS, Plane, fit, make_links, make_module
 from lightning.pytorch.callbacks import Callback
 from skimage.metrics import structural_similarity
 from torch import nn
@@ -14,9 +15,11 @@ from gaigs.loss.huber import Huber
 from gaigs.loss.nmse import Nmse
 from gaigs.loss.squared import Squared
 from gaigs.model import Model, Prediction
+from gaigs.registry import registry
 from gaigs.report.curves import read_curves
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
+from gaigs.training.finite import find_broken
 
 GROUPS = {"slope": 0.01, "network": 0.02}
 
@@ -183,10 +186,13 @@ def test_twice_the_digits(links, tmp_path):
     ("rates", "error", "message"),
     [
         ({"network": 0.1}, ValueError, r"training\.learning_rates must give a rate for slope"),
-        (GROUPS | {"slop": 0.1}, ValueError, r"learning_rates has slop, and the model's groups are network, slope"),
+        (
+            GROUPS | {"slop": 0.1, "zzz": 1.0},
+            ValueError,
+            r"rates has 'slop' \(did you mean 'slope'\?\) and 'zzz', and the model's groups are network, slope",
+        ),
         (GROUPS | {"slope": -0.1}, ValueError, r"training\.learning_rates\.slope must be at least 0, got -0\.1"),
         (GROUPS | {"slope": float("nan")}, ValueError, r"learning_rates\.slope must be at least 0, got nan"),
-        (GROUPS | {"slope": None}, TypeError, r"training\.learning_rates\.slope must be a number, got None"),
     ],
 )
 def test_rates_are_those_of_the_models_groups(links, rates, error, message):
@@ -203,7 +209,8 @@ def test_rates_of_the_splatting_pipeline_may_stay(links):
     ("penalties", "message"),
     [
         ({"opacity": 1.0}, r"training\.penalties must give a weight for gain; 0 for none"),
-        ({"gain": 1.0, "gian": 0.5}, r"training\.penalties has gian, and the model has no such penalty"),
+        ({"gain": 1.0, "gian": 0.5}, r"training\.penalties has 'gian' \(did you mean 'gain'\?\), and the model has no"),
+        ({"gain": 1.0, "opacty": 0.5}, r"training\.penalties has 'opacty' \(did you mean 'opacity'\?\), and the model"),
     ],
 )
 def test_penalties_are_those_of_the_model(links, tmp_path, penalties, message):
@@ -211,23 +218,109 @@ def test_penalties_are_those_of_the_model(links, tmp_path, penalties, message):
         fit(make_module(links, penalties=penalties), links, tmp_path, 3)
 
 
-@pytest.mark.parametrize(
-    ("weight", "error", "message"),
-    [(-1.0, ValueError, "at least 0, got -1.0"), ("1", TypeError, "a number, got '1'"), (None, TypeError, "a number")],
-)
-def test_weights_of_penalties_are_not_negative(links, weight, error, message):
-    with pytest.raises(error, match=rf"training\.penalties\.gain must be {message}"):
+@pytest.mark.parametrize("weight", [-1.0, float("nan")])
+def test_weights_of_penalties_are_not_negative(links, weight):
+    with pytest.raises(ValueError, match=rf"training\.penalties\.gain must be at least 0, got {weight}"):
         make_module(links, penalties={"gain": weight})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"learning_rates": GROUPS | {"slope": None}}, "'learning_rates', entry 'slope', must be a number, got None"),
+        ({"learning_rates": GROUPS | {"slope": "abc"}}, "'learning_rates', entry 'slope', must be a number, got 'abc'"),
+        ({"learning_rates": [0.1]}, r"'learning_rates' must be a mapping, got \[0\.1\]"),
+        ({"penalties": {"gain": "1"}}, "'penalties', entry 'gain', must be a number, got '1'"),
+        ({"penalties": {"gain": float("nan")}}, "'penalties', entry 'gain', must be a finite number, got nan"),
+        ({"penalties": None}, "'penalties' must be a mapping, got None"),
+        ({"thinning": None}, "'thinning' must be a mapping, got None"),
+        ({"optimizer": None}, "'optimizer' must be a mapping, got None"),
+        ({"density": 3}, "'density' must be a mapping or null, got 3"),
+    ],
+)
+def test_options_are_of_their_types(links, options, message):
+    context = {"model": Plane(links.scene), "loss": None, "identity": {}, "seed": 0}
+    with pytest.raises(TypeError, match=f"^training 'descent' option {message}$"):
+        registry("training").build({"name": "descent", **OPTIONS, **options}, **context)
 
 
 def test_the_default_penalty_may_stay(links, tmp_path):
     fit(make_module(links, penalties={"gain": 0.0, "opacity": 1.0}), links, tmp_path, 2)
 
 
-def test_a_loss_that_is_not_finite_ends_the_training(module, links, tmp_path):
-    module.model.network.bias.data[0] = float("nan")
-    with pytest.raises(ValueError, match=r"loss must stay finite, got nan at step 0; lower training\.learning_rates"):
-        fit(module, links, tmp_path, 3)
+class Breaks(Callback):
+    """Makes something NaN before a step."""
+
+    def __init__(self, at, breaks):
+        self.at, self.breaks = at, breaks
+
+    def on_train_batch_start(self, trainer, module, batch, _):
+        if trainer.global_step == self.at:
+            self.breaks(module, batch)
+
+
+def poison(module, name):
+    """Has a part, or the model itself, give NaN."""
+    part = module.model.get_submodule(name)
+    forward = part.forward
+
+    def poisoned(*arguments):
+        output = forward(*arguments)
+        return output._replace(value=output.value * torch.nan) if isinstance(output, Prediction) else output * torch.nan
+
+    part.forward = poisoned
+
+
+def poison_penalty(module, batch):
+    forward = module.model.forward
+    module.model.forward = lambda batch: forward(batch)._replace(penalties={"gain": torch.tensor(torch.nan)})
+
+
+def poison_loss(module, batch):
+    loss = module.loss
+    module.loss = lambda value, batch: (loss(value, batch)[0] * torch.nan, {"l1": torch.tensor(torch.nan)})
+
+
+RATES_DID_IT = r"lower training\.learning_rates"
+NO_RATE_DID = "no rate has acted yet, so check the options of that part"
+
+
+@pytest.mark.parametrize(
+    ("at", "breaks", "what", "remedy"),
+    [
+        (0, lambda module, _: module.model.slope.data.mul_(torch.nan), "the parameter slope", NO_RATE_DID),
+        (2, lambda module, _: module.model.slope.data.mul_(torch.nan), "the parameter slope", RATES_DID_IT),
+        (0, lambda module, _: poison(module, "network"), "the output of network", NO_RATE_DID),
+        (0, lambda module, _: poison(module, ""), "the prediction", NO_RATE_DID),
+        (0, poison_penalty, "the penalty gain", NO_RATE_DID),
+        (1, poison_loss, "the term l1", RATES_DID_IT),
+        (0, lambda _, batch: batch.query.transmitters.mul_(torch.nan), "the places as training.jitter", NO_RATE_DID),
+        (1, lambda _, batch: batch.labels.mul_(torch.nan), "the data's labels", "check the files"),
+    ],
+)
+def test_a_loss_that_is_not_finite_ends_the_training(module, links, tmp_path, at, breaks, what, remedy):
+    links = replace(links, labels=links.labels.clone())
+    told = f"^the loss must stay finite, got nan at step {at}, and what is not finite there is {what}.*; {remedy}$"
+    with pytest.raises(ValueError, match=told):
+        fit(module, links, tmp_path, 3, Breaks(at, breaks))
+
+
+def test_of_several_outputs_the_broken_one_is_told(module, links):
+    class Told(NamedTuple):
+        tokens: torch.Tensor | None
+        residuals: torch.Tensor
+
+    class Network(nn.Linear):
+        def forward(self, x):
+            return Told(None, super().forward(x) / 0)
+
+    class Reads(Plane):
+        def forward(self, batch):
+            return Prediction(self.network(batch.query.transmitters).residuals, {})
+
+    model = Reads(links.scene)
+    model.network = Network(3, 1)
+    assert find_broken(model, links.batch(torch.arange(3)), {}) == "residuals of network"
 
 
 @pytest.mark.parametrize("jitter", [-0.1, float("nan")])
