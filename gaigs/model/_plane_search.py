@@ -162,7 +162,7 @@ def _with_one_more(model, batch: Batch, lags, own, receiver: int, normals, offse
     gains = ((1 - level) * te + level * tm) * placement.pattern(receiver, directions) * (sides > 0) / lengths
     gains = gains * placement.receiver_gains[receiver].exp()
     flat = lambda values: values.flatten(0, 1)[:, None]
-    splats = Splats(flat(directions[..., :2]), normals.new_zeros(1, 1, 2, 2), flat(lengths), flat(sides > 0))
+    splats = Splats(flat(directions[..., :2]), normals.new_zeros(1, 1, 3), flat(lengths), flat(sides > 0))
     links = own.repeat_interleave(count)
     query = batch.query[links]
     more = model.rasterizer.lags(
