@@ -29,7 +29,9 @@ from omegaconf import OmegaConf
 from gaigs import configuration
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("plugins/*/*.md")])
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/results/*.md"), *ROOT.glob("plugins/*/*.md")]
+)
 OURS = tuple(f"{folder}/" for folder in ("gaigs", "conf", "plugins", "tests", "docs", "benchmarks"))
 FILES = {".ply", ".log"}
 """What a file's name ends in that would pass for a key or a name."""

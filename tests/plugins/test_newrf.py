@@ -7,6 +7,7 @@ import math
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from splatting import build, composed, run
@@ -98,6 +99,33 @@ def test_all_fields_have_gradients_whoever_hears():
     model(LINKS.batch((LINKS.query.receivers == 0).nonzero()[:3, 0])).value.abs().sum().backward()
     assert all(parameter.grad is not None for parameter in model.parameters())
     assert not any(parameter.grad.any() for parameter in model.fields[1].parameters())
+
+
+def test_the_field_is_the_published_network(package):
+    torch.manual_seed(0)
+    field = package.Field((9, 5), width=8, layers=6, elements=2).double()
+    places, views = torch.randn(3, 9).double(), torch.randn(3, 5).double()
+    weights = {name: values.numpy() for name, values in field.state_dict().items()}
+    apply = lambda name, x: weights[f"{name}.weight"] @ x + weights[f"{name}.bias"]
+    densities, sent = field(places, views)
+    for i in range(3):
+        place, view = places[i].numpy(), views[i].numpy()
+        hidden = place
+        for layer in range(6):
+            hidden = apply(f"layers.{layer}", np.concatenate((place, hidden)) if layer == 4 else hidden).clip(0)
+        out = np.tanh(apply("send.2", apply("send.0", np.concatenate((hidden, view))).clip(0)))
+        np.testing.assert_allclose(densities[i].item(), np.log1p(np.exp(apply("density", hidden)[0])))
+        np.testing.assert_allclose(sent[i].detach().numpy(), out[:2] + 1j * out[2:])
+
+
+def test_published_sizes():
+    options = composed("data=synthetic_csi", "model=newrf")["model"]
+    assert (options["width"], options["layers"], options["octaves"], options["view_octaves"]) == (128, 6, 10, 4)
+    field = build("model", options | {"samples": 2, "arrivals": 1}, scene=LINKS.scene).fields[0]
+    inputs = [63, 128, 128, 128, 63 + 128, 128]
+    network = sum(128 * (size + 1) for size in inputs) + 129
+    sending = 128 * (128 + 27 + 1) + 2 * LINKS.task.elements * 129
+    assert sum(parameter.numel() for parameter in field.parameters()) == network + sending
 
 
 # --- arrivals ---
