@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.data._files import refuse
+from gaigs.data._files import FAR, NEAR, read_lines, refuse
 from gaigs.data.nerf2_rssi import read_walls
 
 SAME_TURN, SAME_PLACE = 0.02, 0.02
@@ -54,8 +54,10 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
 
 def _faces(file: Path) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f"]]:
     """Normals, a point and area of each triangle of a mesh."""
-    vertices, triangles = [], []
-    for number, line in enumerate(file.read_text().splitlines(), 1):
+    vertices, triangles, defects = [], [], []
+    lines = read_lines(file, "a mesh of 'v x y z' and 'f i j k'", defects)
+    refuse(file.parent, defects)
+    for number, line in enumerate(lines, 1):
         word, *rest = line.split("#")[0].split() or [""]
         try:
             if word == "v":
@@ -69,6 +71,8 @@ def _faces(file: Path) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Floa
     count = len(vertices)
     if any(len(vertex) < 3 for vertex in vertices) or any(not 0 <= k < count for face in triangles for k in face):
         raise ValueError(f"{file} must hold faces of vertices x y z, and a face or a vertex lacks some")
+    if not all(abs(value) < FAR for vertex in vertices for value in vertex):
+        raise ValueError(f"{file} must hold {NEAR}, and a vertex is farther away or none")
     if not triangles:
         return torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0)
     corners = torch.tensor(vertices)[torch.tensor(triangles)]

@@ -120,6 +120,8 @@ def test_faces_in_all_their_ways_of_writing(tmp_path, text):
         ("walls.csv", "", "empty"),
         ("walls.obj", "v 0 0 0\nv 1 0 zero\n", "line 2, must hold numbers, got 'v 1 0 zero'"),
         ("walls.obj", "v 0 0 0\nv 1 0 0\nf 1 2 3\n", "must hold faces of vertices x y z"),
+        ("walls.obj", "v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", "must hold positions within 1e5 m"),
+        ("walls.obj", "v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "must hold positions within 1e5 m"),
         ("walls.obj", "v 0 0 0\nv 1 0 0\nv 1 1\nf 1 2 3\n", "must hold faces of vertices x y z"),
         ("walls.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\n", "must hold walls"),
         ("walls.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "must hold walls"),
@@ -186,3 +188,9 @@ def test_fixed_walls_stay_while_all_else_is_learnt(tmp_path, links, fixed):
     assert torch.equal(placement.normals, before[0]) == fixed
     assert torch.equal(placement.offsets, before[1]) == fixed
     assert not torch.equal(placement.plane_gains, before[2])
+
+
+def test_a_mesh_in_another_encoding_is_refused(tmp_path):
+    (tmp_path / "walls.obj").write_bytes(b"v 0 0 0\n# \xff\xfe\n")
+    with pytest.raises(ValueError, match=r"walls\.obj: unreadable"):
+        read_planes(tmp_path / "walls.obj", LOWER, UPPER)
