@@ -178,6 +178,13 @@ def test_spectra_are_clamped_to_the_range_of_labels():
     torch.testing.assert_close(pooling(image, LINKS.query[:1])[0, 0], torch.tensor([0.5, 0.0, 1.0]))
 
 
+def test_a_map_that_is_silent_everywhere_is_led_back():
+    pooling = build("pooling", {"name": "clamped", "channels": 1})
+    image = torch.tensor([-0.5, -0.5, 0.25, 3.0, 3.0]).expand(1, 1, 1, 5).clone().requires_grad_()
+    pooling(image, LINKS.query[:1]).backward(torch.tensor([-1.0, 1.0, 1.0, 1.0, -1.0]).expand(1, 1, 5))
+    assert image.grad.flatten().tolist() == [-1, 0, 1, 1, 0]
+
+
 # --- how it is chosen ---
 
 

@@ -1,5 +1,6 @@
 """Spectra as WRF-GS reads them: the map within the range of a label."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -8,8 +9,26 @@ from gaigs.pooling.spectrum import Spectrum
 from gaigs.query import Query
 
 
+class _Clamp(torch.autograd.Function):
+    """Values within 0..1; beyond, a gradient counts where a step down it leads back.
+
+    With none beyond, a map that starts below 0 everywhere would be 0 for good.
+    """
+
+    @staticmethod
+    def forward(ctx, values: Tensor) -> Tensor:
+        ctx.save_for_backward(values)
+        return values.clamp(0, 1)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> Tensor:
+        (values,) = ctx.saved_tensors
+        outwards = ((values < 0) & (gradient > 0)) | ((values > 1) & (gradient < 0))
+        return gradient.masked_fill(outwards, 0)
+
+
 class Clamped(Spectrum):
-    """C_0, or |C_0 + j C_1|, clamped to 0..1; where it is beyond, the gradient is 0.
+    """C_0, or |C_0 + j C_1|, clamped to 0..1; beyond, gradients that lead back count.
 
     Args:
         channels: 1 (real) or 2 (complex).
@@ -22,4 +41,4 @@ class Clamped(Spectrum):
     ) -> Float[Tensor, "b rows columns"]:
         """The predicted spectrum."""
         spectrum = image[:, 0] if self.channels == 1 else super().forward(image, query, directions)
-        return spectrum.clamp(0, 1)
+        return _Clamp.apply(spectrum)
