@@ -124,7 +124,7 @@ def lay(placement, *planes):
 
 MAPS = {
     "silent": lambda shape: torch.zeros(shape),
-    "tiny": lambda shape: torch.full(shape, 1e-30),
+    "tiny": lambda shape: torch.full(shape, 1e-15),
     "constant": lambda shape: torch.full(shape, 0.7),
     "of 1e4": lambda shape: 1e4 * torch.linspace(-1, 1, math.prod(shape)).reshape(shape),
     "a single bright pixel": lambda shape: torch.cat(

@@ -67,8 +67,7 @@ def test_harmonics_are_of_the_direction_in_which_a_transmitter_sees_a_gaussian(b
     value.sum().backward()
     assert all(parameter.grad.isfinite().all() for parameter in gaussians.parameters())
     seen = gaussians.means.detach() - places[:, None]
-    x, y, z = (seen / seen.norm(dim=-1, keepdim=True)).nan_to_num().movedim(-1, 0).clone()
-    x[0, 3] = 1
+    x, y, z = (seen / seen.norm(dim=-1, keepdim=True)).nan_to_num().movedim(-1, 0)
     dc, *bands = gaussians.signal.detach().clone().unbind(-1)
     # 3 ** 0.5 is the first degree's factor over that of the constant harmonic.
     sent = dc + 3**0.5 * sum(part[..., None] * band for part, band in zip((-y, z, -x), bands, strict=True))

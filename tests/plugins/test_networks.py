@@ -439,11 +439,8 @@ def test_the_discriminator_takes_labels_however_thin(stride):
     [
         ("mlp", {"octaves": [2, 1]}, r"model\.octaves must be \[lowest, highest\], got \[2, 1\]"),
         ("mlp", {"pixel": 0.0}, r"model\.pixel must be positive and finite \[deg\], got 0\.0"),
-        ("mlp", {"pixel": math.inf}, r"model\.pixel must be positive"),
         ("mlp", {"widths": []}, r"model\.widths must be of at least 1, got \[\]"),
-        ("mlp", {"widths": [4, 2.5]}, r"model\.widths must be of at least 1, got \[4, 2\.5\]"),
         ("mlp", {"dropout": 1.0}, r"model\.dropout must be in \[0, 1\), got 1\.0"),
-        ("mlp", {"dropout": math.nan}, r"model\.dropout must be in"),
         ("fire", {"widths": [4, 0, 4]}, r"model\.widths must be of at least 1"),
         ("fire", {"latent": 0}, r"model\.latent must be of at least 1, got 0"),
         ("dcgan", {"width": 0}, r"model\.width must be of at least 1"),

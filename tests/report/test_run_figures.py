@@ -1,6 +1,7 @@
 """All figures of a run, as its task asks for them."""
 
 import csv
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,7 +102,7 @@ def test_examples_are_at_their_percentiles_of_the_own_model(spectrum_links, tmp_
 def test_what_was_learnt_of_the_room_is_drawn(spectrum_links, tmp_path, spy, monkeypatch):
     labels = spectrum_links.labels[spectrum_links.split.test].numpy().astype(np.float16)
     np.savez(tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_mirrored=np.ones(1))
-    monkeypatch.setattr(Figure, "savefig", lambda *_, **__: None)
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: Path(path).touch())
     seen, folded = spy(room, "room"), spy(room, "paths")
     route = shapes.Path(np.array([[1.0, 1, 1], [3, 0, 1]]), 0.0)
     learnt = shapes.LearntRoom([], None, [route])
@@ -162,7 +163,7 @@ def test_an_rssi_run_is_drawn_into_its_folder(rssi_run, monkeypatch):
 
 def test_figures_show_the_run(rssi_run, spy, monkeypatch):
     links, folder, errors = rssi_run
-    monkeypatch.setattr(Figure, "savefig", lambda *_, **__: None)
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: Path(path).touch())
     distributed, mapped, seen = spy(curves, "cdf"), spy(radio_map, "radio_maps"), spy(room, "room")
     evaluation.write_figures(folder, links, None)
     (absolute, *_), drawn = distributed[0]

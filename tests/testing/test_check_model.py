@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from gaigs.model import Model, Prediction
+from gaigs.query import Query
 from gaigs.testing import check_model, example_links
 
 
@@ -59,9 +60,10 @@ class Trusting(Grey):
 class Believing(Grey):
     """Asks no question about a position that it is given."""
 
-    def _ask(self, transmitters, receiver, frequency):
-        asked = super()._ask(torch.as_tensor(transmitters).nan_to_num(), receiver, frequency)
-        return asked
+    def _ask(self, transmitters, *others):
+        if not isinstance(transmitters, Query):
+            transmitters = torch.as_tensor(transmitters).nan_to_num()
+        return super()._ask(transmitters, *others)
 
 
 class Graded(Grey):
