@@ -2,9 +2,9 @@
 
 import csv
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,9 @@ from matplotlib.ticker import LogLocator, NullLocator
 from numpy import ndarray
 
 from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE
+
+LABEL = 48
+"""Characters for which an axis of a figure of one column has room; a longer label is broken into lines."""
 
 
 def cdf(
@@ -36,14 +39,15 @@ def cdf(
     """
     with rc_context(STYLE):
         ncols = 3 if max(map(len, values)) <= 12 else 2  # letters that fit a third of a column
-        figure = Figure(figsize=(COLUMN, 2.45 + 0.15 * ceil(len(values) / ncols)), layout="constrained")
+        figure = Figure(figsize=(COLUMN, 2.45 + 0.15 * math.ceil(len(values) / ncols)), layout="constrained")
         ax = figure.subplots()
         ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
         for (name, sample), (colour, dash) in zip(values.items(), cycle(LINES), strict=False):
             median = float(np.median(sample))
             ax.ecdf(sample, color=colour, linestyle=dash, label=f"{name} {median:#.3g}")
             ax.plot(median, 0.5, "o", color=colour, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
-        ax.set(xlabel=f"{quantity}, split {split}", ylabel=f"share of test {samples}", ylim=(0, 1.01))
+        label = textwrap.fill(f"{quantity}, split {split}", LABEL)
+        ax.set(xlabel=label, ylabel=f"share of test {samples}", ylim=(0, 1.01))
         ax.set_xlim(*limits)
         key = {"ncols": ncols, "handlelength": 2.4, "columnspacing": 1.2}
         figure.legend(loc="outside upper center", title=f"median {quantity}", **key)

@@ -122,3 +122,12 @@ def test_speed_against_error(longest, scale):
     assert points["c"].get_xydata().tolist() == [[longest, 0.9]]
     assert set(points["knn"].get_ydata()) == {0.85}
     assert (ax.get_xscale(), ax.get_ylabel()) == (scale, "median SSIM")
+
+
+def test_the_name_of_a_long_split_is_broken_into_lines():
+    figure = cdf(
+        {"gaigs": np.arange(3.0)}, "|error| [dB]", "readings", "official, validation 0.1 in runs of 100, seed 0", (0, 1)
+    )
+    label = figure.axes[0].get_xlabel()
+    assert label.split() == "|error| [dB], split official, validation 0.1 in runs of 100, seed 0".split()
+    assert max(map(len, label.splitlines())) <= 48
