@@ -1,5 +1,7 @@
 """What a receiver would report of a transmitter anywhere on a floor."""
 
+import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,12 @@ BATCH = 128
 
 POINTS = 128
 """About how many points the longer side of a map has at most, unless a pitch is asked for."""
+
+SECONDS = 60.0
+"""About how long a map takes at most, unless a pitch is asked for."""
+
+FEWEST = 200
+"""Points that a map has however slow the model is."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +100,8 @@ def radio_map(
     Args:
         model: A ``gaigs.model.Model`` of a task whose label is one real number, e.g. RSSI; fitted or loaded.
         pitch: Distance between neighbouring points [m]; the points are its multiples, so maps of one pitch share them.
-            None takes ``PITCH``, or as much more as keeps the longer side at about ``POINTS`` points.
+            None takes ``PITCH``, or as much more as keeps the longer side at about ``POINTS`` points; doubled until a
+            slow model takes about ``SECONDS`` at most.
         height: Of the transmitters, world frame [m]; None is half-way between the lowest and the highest of training.
         margin: By which the box is widened on each side [m].
         receivers: Names, or one name; None is all of them.
@@ -120,15 +129,31 @@ def radio_map(
         )
     corners = np.stack((lower, upper, *(receiver.pose.position.numpy() for receiver in scene.receivers)))[:, :2]
     lower, upper = corners.min(0) - margin, corners.max(0) + margin
-    if pitch is None:
-        pitch = max(PITCH, float((upper - lower).max()) / POINTS)
-    x, y = (pitch * np.arange(np.floor(a / pitch), np.floor(b / pitch) + 2) for a, b in zip(lower, upper, strict=True))
-    points = np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1)[..., None, :]
-    points = np.broadcast_to(points, (len(y), len(x), len(names), 3)).astype(np.float32)
     # All receivers of a point in one batch, so that what a transmitter there excites is computed once.
-    index = np.broadcast_to([known.index(name) for name in names], points.shape[:-1]).copy()
+    heard = np.array([known.index(name) for name in names])
     if frequency is None and len(scene.frequencies):
         frequency = float(scene.frequencies[len(scene.frequencies) // 2])
-    values = model.predict(points, index, frequency=frequency, batch_size=BATCH * len(names)).cpu().numpy()
+
+    def predict(points: ndarray) -> ndarray:
+        shape = (*points.shape[:-1], len(names))
+        links = np.broadcast_to(points[..., None, :], (*shape, 3)).astype(np.float32)
+        index = np.broadcast_to(heard, shape).copy()
+        return model.predict(links, index, frequency=frequency, batch_size=BATCH * len(names)).cpu().numpy()
+
+    if pitch is None:
+        pitch = max(PITCH, float((upper - lower).max()) / POINTS)
+        some = np.column_stack((np.linspace(lower, upper, BATCH), np.full(BATCH, height)))
+        start = time.perf_counter()
+        predict(some)
+        most = BATCH * SECONDS / (time.perf_counter() - start)  # points
+        while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, FEWEST):
+            pitch *= 2
+    x, y = _axes(lower, upper, pitch)
+    values = predict(np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1))
     values = np.ascontiguousarray(np.moveaxis(values, -1, 0))
     return RadioMap(values, x, y, height, names, scene.task.quantity, scene.task.unit, frequency)
+
+
+def _axes(lower: ndarray, upper: ndarray, pitch: float) -> list[ndarray]:
+    """Multiples of a pitch along x and along y, over a rectangle and as far as the next one beyond it."""
+    return [pitch * np.arange(np.floor(a / pitch), np.floor(b / pitch) + 2) for a, b in zip(lower, upper, strict=True)]

@@ -8,7 +8,7 @@ import gaigs
 from gaigs.directions import Grid
 from gaigs.geometry import Pose
 from gaigs.model import Model, Prediction
-from gaigs.radio_map import POINTS, RadioMap, radio_map
+from gaigs.radio_map import FEWEST, POINTS, RadioMap, radio_map
 from gaigs.scene import Receiver, Scene
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
@@ -49,6 +49,23 @@ def test_each_value_is_that_of_its_place_and_receiver():
     assert drawn.values.shape == (2, len(drawn.y), len(drawn.x))
     truth = drawn.x + 10 * drawn.y[:, None] + 100 * drawn.height - 1000 * np.arange(2)[:, None, None]
     np.testing.assert_allclose(drawn.values, truth, atol=1e-3)
+
+
+def test_a_slow_model_draws_a_coarser_map_of_the_same_points(monkeypatch):
+    fine = radio_map(Slope(scene()))
+    monkeypatch.setitem(radio_map.__globals__, "SECONDS", 0.0)  # any model is too slow
+    coarse = radio_map(Slope(scene()))
+    doublings = np.log2((coarse.x[1] - coarse.x[0]) / (fine.x[1] - fine.x[0]))
+    assert doublings >= 1
+    assert doublings == pytest.approx(round(doublings))
+    assert FEWEST / 5 < len(coarse.x) * len(coarse.y) <= FEWEST
+    rows, columns = (np.isclose(a[:, None], b, atol=1e-9).any(1) for a, b in ((fine.y, coarse.y), (fine.x, coarse.x)))
+    rows_there, columns_there = (
+        np.isclose(b[:, None], a, atol=1e-9).any(1) for a, b in ((fine.y, coarse.y), (fine.x, coarse.x))
+    )
+    np.testing.assert_allclose(
+        coarse.values[:, rows_there][..., columns_there], fine.values[:, rows][..., columns], atol=1e-3
+    )
 
 
 def test_map_covers_transmitters_gateways_and_the_margin_with_multiples_of_the_pitch():

@@ -138,7 +138,19 @@ class RayMarching(Model):
         return Prediction(torch.cat(values)[torch.cat(links).argsort()], {})
 
     def march(self, query: Query, receiver: int, rays: Rays) -> Complex[Tensor, "b r c"]:
-        """What arrives along rays at one receiver, for links to it."""
+        """What arrives along rays at one receiver, for links to it.
+
+        Without gradients at most ``chunk`` pairs of a link and a ray at a time. All links have in common what dims and
+        turns the waves along a ray, so rays are parted, not links.
+        """
+        if torch.is_grad_enabled() or not len(query):
+            return self.march_at_once(query, receiver, rays)
+        size = max(1, self.chunk // len(query))
+        parts = (rays[start : start + size] for start in range(0, len(rays.azimuths), size))
+        return torch.cat([self.march_at_once(query, receiver, part) for part in parts], 1)
+
+    def march_at_once(self, query: Query, receiver: int, rays: Rays) -> Complex[Tensor, "b r c"]:
+        """``march`` for all pairs of a link and a ray together."""
         pose = self.scene.receivers[receiver].pose.to(self.middle)
         views = rays.vectors() @ pose.rotation.mT
         points = pose.position - self.middle + self.distances[:, None] * views[:, None]
@@ -146,22 +158,9 @@ class RayMarching(Model):
 
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
-        """Values of a batch, at most ``chunk`` pairs of a link and a ray at a time.
-
-        All links have in common what dims and turns the waves along a ray, so rays are parted before links.
-        """
-        if self.chunk is None or not len(batch):
-            return self(batch).value
-        if self.grid is not None:
-            parts = batch.query.parts(max(1, self.chunk // math.prod(self.grid.shape)))
-            return torch.cat([self(Batch(part, batch.directions)).value for part in parts])
-        directions = batch.directions or self.scene.task.directions
-        rays, values = directions.flatten(), []
-        for query in batch.query.parts(self.chunk):
-            size = self.chunk // len(query)
-            parts = (rays[start : start + size] for start in range(0, len(rays.azimuths), size))
-            values.append(torch.cat([self(Batch(query, part)).value for part in parts], 1))
-        return torch.cat(values).unflatten(1, directions.shape)
+        """Values of a batch, of at most ``chunk`` links at a time; ``march`` parts what is left of them."""
+        parts = [*batch.query.parts(self.chunk)] or [batch.query]
+        return torch.cat([self(Batch(part, batch.directions)).value for part in parts])
 
 
 def farthest(scene: Scene) -> float:

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import torch
 from gaigs_nerf2 import RayMarching, Samples, amplitudes_and_phases
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
-from gaigs.directions import Directions, Grid
+from gaigs.directions import Directions, Grid, Rays
 from gaigs.model import Prediction
 from gaigs.query import Batch, Query
 from gaigs.scene import Scene
@@ -72,6 +72,13 @@ class NerfApt(RayMarching):
             return prediction
         directions = batch.directions or self.scene.task.directions
         return prediction._replace(value=interpolated(prediction.value, self.grid, directions))
+
+    def march(self, query: Query, receiver: int, rays: Rays) -> Complex[Tensor, "b r c"]:
+        """What arrives along rays at one receiver; they belong together, so links are parted."""
+        if torch.is_grad_enabled() or not len(query):
+            return self.march_at_once(query, receiver, rays)
+        parts = query.parts(max(1, self.chunk // len(rays.azimuths)))
+        return torch.cat([self.march_at_once(part, receiver, rays) for part in parts])
 
     def sample(self, query: Query, points: Float[Tensor, "r i 3"], views: Float[Tensor, "r 3"]) -> Samples:
         rows = self.grid.shape[0]
