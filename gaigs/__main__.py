@@ -1,9 +1,11 @@
 """The command line: ``python -m gaigs +experiment=spectrum``."""
 
+import contextlib
 import logging
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import hydra
@@ -46,8 +48,10 @@ def run(config: DictConfig) -> float | None:
                 raise
         case "devices":
             return list_devices()
+        case "agreement":
+            return compare_labels(config)
         case unknown:
-            raise CompactHydraException(f"gaigs: command must be train or devices, got {unknown!r}")
+            raise CompactHydraException(f"gaigs: command must be train, agreement or devices, got {unknown!r}")
 
 
 def train(config: DictConfig) -> float | None:
@@ -62,26 +66,13 @@ def train(config: DictConfig) -> float | None:
         SystemExit: A signal has stopped the run: 128 and the signal's number, as shells report it.
     """
     settings = HydraConfig.get()
-    if processes.received:
-        raise CompactHydraException("gaigs: not started, as the multirun has been stopped")
-    try:
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        configuration.check(plain)
-        is_sweep = settings.mode is RunMode.MULTIRUN
-        limit_threads(plain["threads"], settings.launcher.get("n_jobs", 1) if is_sweep else 1)
-    except OmegaConfBaseException as error:  # whose message Hydra adds
-        raise CompactHydraException("gaigs: the configuration is not complete") from error
-    except (TypeError, ValueError) as error:
-        raise CompactHydraException(f"gaigs: {error}") from error
-    # Slow to import: here, once the configuration has proved good.
-    from lightning.pytorch.utilities.exceptions import MisconfigurationException
-
-    from gaigs import experiment
+    plain, is_sweep = resolved(config), settings.mode is RunMode.MULTIRUN
+    from gaigs import experiment  # slow to import: here, once the configuration has proved good
 
     for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
         logging.getLogger(name).setLevel(logging.WARNING)
     try:
-        with stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
+        with mendable(), stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
             metrics = experiment.run(plain, Path(settings.runtime.output_dir))
     except KeyboardInterrupt as stop:
         mode = "sweep" if is_sweep else "run"
@@ -95,12 +86,59 @@ def train(config: DictConfig) -> float | None:
             raise SystemExit(0) from None
         print(told, file=sys.stderr)
         raise SystemExit(128 + number) from None
+    return None if metrics is None else metrics["validation_score"]
+
+
+def compare_labels(config: DictConfig) -> None:
+    """Writes how far the labels of a data set agree into Hydra's run folder.
+
+    Raises:
+        CompactHydraException: As for ``train``.
+    """
+    plain = resolved(config)
+    from gaigs import agreement  # slow to import
+
+    with mendable():
+        agreement.run(plain, Path(HydraConfig.get().runtime.output_dir))
+
+
+def resolved(config: DictConfig) -> dict:
+    """The configuration in plain dictionaries, checked; from here on so many threads are taken as it says.
+
+    Raises:
+        CompactHydraException: It is not complete, a value does not suit its key, or the multirun has been stopped.
+    """
+    settings = HydraConfig.get()
+    if processes.received:
+        raise CompactHydraException("gaigs: not started, as the multirun has been stopped")
+    try:
+        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        configuration.check(plain)
+        is_sweep = settings.mode is RunMode.MULTIRUN
+        limit_threads(plain["threads"], settings.launcher.get("n_jobs", 1) if is_sweep else 1)
+    except OmegaConfBaseException as error:  # whose message Hydra adds
+        raise CompactHydraException("gaigs: the configuration is not complete") from error
+    except (TypeError, ValueError) as error:
+        raise CompactHydraException(f"gaigs: {error}") from error
+    return plain
+
+
+@contextlib.contextmanager
+def mendable() -> Iterator[None]:
+    """Has what a user can mend end as one message; with ``hydra.verbose=true`` as the error itself.
+
+    Raises:
+        CompactHydraException: In its place.
+    """
+    from lightning.pytorch.utilities.exceptions import MisconfigurationException  # slow to import
+
+    try:
+        yield
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, MisconfigurationException) as error:
-        if settings.verbose:
+        if HydraConfig.get().verbose:
             os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra leaves most of the traceback out
             raise
         raise CompactHydraException(f"gaigs: {error}") from error
-    return None if metrics is None else metrics["validation_score"]
 
 
 def list_devices() -> None:
@@ -139,9 +177,9 @@ def main() -> None:
         if end.code == 1 and not signals:  # a job has failed, and the others have ended
             at_end.write()
         raise
-    except Stopped:
+    except KeyboardInterrupt as stop:
         print("gaigs: stopped", file=sys.stderr)
-        raise SystemExit(128 + signal.SIGTERM) from None
+        raise SystemExit(128 + getattr(stop, "number", signal.SIGINT)) from None
     finally:
         signal.signal(signal.SIGTERM, handler)
         if signals:

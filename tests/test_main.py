@@ -19,7 +19,8 @@ import yaml
 
 import gaigs
 from gaigs import __main__ as command_line
-from gaigs import evaluation, experiment
+from gaigs import agreement, evaluation, experiment
+from gaigs.processes import Stopped
 from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
 
@@ -189,8 +190,8 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         (["+thread=3"], "gaigs: the configuration has no key 'thread' (did you mean 'threads'?)"),
         (["tokenizer.name=null"], "gaigs: tokenizer.name must be a string, got None"),
         (["seed=1.5"], "gaigs: seed must be a whole number, got 1.5"),
-        (["command=trian"], "gaigs: command must be train or devices, got 'trian'"),
-        (["~command"], "gaigs: command must be train or devices, got None"),
+        (["command=trian"], "gaigs: command must be train, agreement or devices, got 'trian'"),
+        (["~command"], "gaigs: command must be train, agreement or devices, got None"),
     ],
 )
 def test_what_a_user_can_mend_is_told_without_a_traceback(overrides, message, run):
@@ -239,6 +240,27 @@ def test_of_devices_of_the_same_name_the_first_is_taken(run, devices):
     devices.append(devices[1])
     assert run("command=devices", *HERE) == (0, "")
     assert [line.endswith("takes this one") for line in run.out.splitlines()] == [False, True, False]
+
+
+def test_labels_are_compared(run, tmp_path):
+    data = ("data=synthetic_rssi", "data.order=1", "baselines=[]", *HERE)
+    assert run("command=agreement", "data.transmitters=30", *data) == (0, "")
+    assert run.out.startswith("data: synthetic_rssi, 1")
+    assert run.out.splitlines()[-1].endswith("run")
+    assert (tmp_path / "run" / "agreement.md").is_file()
+    code, err = run("command=agreement", "data.transmitters=1", *data)
+    assert code == 1
+    assert "gaigs: transmitters must be at least 2" in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(("stop", "code"), [(KeyboardInterrupt(), 130), (Stopped("stopped", signal.SIGTERM), 143)])
+def test_a_command_that_is_stopped_says_so(stop, code, run, monkeypatch):
+    def stopped(*_):
+        raise stop
+
+    monkeypatch.setattr(agreement, "run", stopped)
+    assert run("command=agreement", *HERE) == (code, "gaigs: stopped\n")
 
 
 def test_a_value_that_must_be_set_is_named(run):

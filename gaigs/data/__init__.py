@@ -87,23 +87,33 @@ class Links:
         train = training.transmitters.unique(dim=0)
         if len(train) < 2:
             raise ValueError(f"training takes transmitters at two points or more, got {len(train)}; check the split")
-        distances, _ = cKDTree(train.double().numpy()).query(train.double().numpy(), k=2)
-        spacing = float(np.median(distances[:, 1]))
         frequencies = torch.zeros(0) if training.frequencies is None else training.frequencies.unique()
-        box = train.amin(0), train.amax(0), spacing
+        box = train.amin(0), train.amax(0), median_spacing(train)
         return Scene(self.receivers, *box, self.task, frequencies, self.bandwidth)
 
 
-def load(data: Mapping, split: Mapping) -> Links:
+def median_spacing(places: Float[Tensor, "n 3"]) -> float:
+    """Median distance from a place to the nearest other one [m]; of two or more different places."""
+    distances, _ = cKDTree(places.double().numpy()).query(places.double().numpy(), k=2)
+    return float(np.median(distances[:, 1]))
+
+
+def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
     """A data set with its split.
 
     Args:
         data: Configuration of a registered data set.
         split: Configuration of a registered split.
+        task: Name of the task that the rest of the configuration is for; None for whatever the labels are.
 
     Raises:
         FileNotFoundError: Data that are not there.
-        ValueError: Something is wrong with the files, the options or the split.
+        ValueError: Something is wrong with the files, the options or the split, or the labels are of another task.
     """
     links = registry("data").build(data)
+    if task not in (None, links.task.name):
+        raise ValueError(
+            f"the labels of data {data['name']!r} are of task {links.task.name!r}, and the configuration is for "
+            f"{task!r}; add task={links.task.name}"
+        )
     return replace(links, split=registry("split").build(split, links=links))

@@ -63,6 +63,11 @@ class Task(ABC):
         """How labels were scaled, in words of docs/data.md; by default their unit."""
         return self.unit
 
+    @property
+    def pair_score(self) -> str:
+        """What a reader calls ``watched`` where it is of two labels, with its unit in brackets; by default its name."""
+        return self.watched
+
     @abstractmethod
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
         """Scores of every sample (k,) by name, float64 on the CPU; ``watched`` among them.
@@ -78,6 +83,13 @@ class Task(ABC):
         Raises:
             ValueError: There is no sample.
         """
+
+    def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
+        """What becomes of scores of one label as the prediction of another where the mean of many takes its place.
+
+        Where labels scatter alike and independently, half of the squared difference is left. By default None: unknown.
+        """
+        return None
 
     @classmethod
     @abstractmethod

@@ -1,5 +1,6 @@
 """Channel state information: a complex channel at each element of the receiver's array and each subcarrier."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -37,6 +38,7 @@ class Csi(Task):
 
     name, quantity = "csi", "channel"
     watched, larger_is_better = "snr_db", True
+    pair_score = "SNR [dB]"
     dtype = torch.complex64
     normalisation = "linear amplitude, in the data's own unit"
 
@@ -96,6 +98,10 @@ class Csi(Task):
             p10, median, p90 = torch.quantile(snr, snr.new_tensor([0.1, 0.5, 0.9])).tolist()
             numbers += [median, snr.mean().item(), p10, p90]
         return dict(zip(self.metrics(), numbers, strict=True))
+
+    def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
+        """3 dB more, as half of the difference's power is left."""
+        return {name: (score + 10 * math.log10(2)).clamp(max=HIGHEST) for name, score in scores.items()}
 
     def figures(self, folder: Path, links) -> dict:
         """Magnitude, phase and impulse response of the 10th, 50th and 90th percentile, and how SNR is distributed."""

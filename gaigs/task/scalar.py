@@ -1,5 +1,6 @@
 """What tasks share whose label is one real number a link."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gaigs.report.style import with_unit
 from gaigs.task import Metric, Task, check_values, need_samples, stored_scores
 
 
@@ -43,6 +45,14 @@ class Scalar(Task):
         """The absolute error of each prediction."""
         check_values(labels, values, (), "readings")
         return {self.watched: (values.detach().cpu().double() - labels.detach().cpu().double()).abs()}
+
+    @property
+    def pair_score(self) -> str:
+        return with_unit("|difference|", self.error_unit)
+
+    def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Errors less by the root of 2."""
+        return {name: score / math.sqrt(2) for name, score in scores.items()}
 
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
         """Mean, median and root of the mean square of the absolute error."""

@@ -1,5 +1,6 @@
 """Spatial spectra: an amplitude in each direction of a grid."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -35,6 +36,7 @@ class Spectrum(Task):
 
     name, quantity = "spectrum", "amplitude"
     watched, larger_is_better = "ssim", True
+    pair_score = "SSIM"
     normalisation = ""
 
     def __init__(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"], normalisation: str):
@@ -80,6 +82,15 @@ class Spectrum(Task):
         pairs = zip(labels.numpy(), values.numpy(), strict=True)
         ssim = [structural_similarity(label, value, data_range=1.0) for label, value in pairs]
         return {"ssim": torch.tensor(ssim, dtype=torch.float64), "mae": (labels - values).abs().mean((1, 2))}
+
+    def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
+        """SSIM s becomes 2 s / (1 + s), below 0 becomes 0; absolute errors are less by the root of 2.
+
+        Of two labels with the same mean that scatter about a pattern, SSIM is the pattern's share s of the variance; of
+        the pattern and one label it is 2 s / (1 + s). A mean over windows of unlike s is less, by Jensen's inequality.
+        """
+        shares = scores["ssim"].clamp(min=0)
+        return {"ssim": 2 * shares / (1 + shares), "mae": scores["mae"] / math.sqrt(2)}
 
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
         """Median, mean and percentiles of SSIM over the samples (linear interpolation), and the mean of MAE."""

@@ -38,7 +38,7 @@ def check_task(task: Task, *thinnings: Mapping) -> None:
 
 def _check_facts(task: Task) -> None:
     require(task.name in registry("task").names(), f"a task must bear its registered name, got {task.name!r}")
-    for name in ("quantity", "unit", "normalisation", "watched"):
+    for name in ("quantity", "unit", "normalisation", "watched", "pair_score"):
         require(isinstance(getattr(task, name), str), f"{name} must be a string, got {getattr(task, name)!r}")
     for name in ("larger_is_better", "is_noisy"):
         require(isinstance(getattr(task, name), bool), f"{name} must be true or false, got {getattr(task, name)!r}")
@@ -86,6 +86,10 @@ def _check_scores(task: Task, labels: Tensor, noise: Tensor) -> None:
     for name, metric in metrics.items():
         better = best[name] > second[name] if metric.larger_is_better else best[name] < second[name]
         require(better, f"what is right must have the best {name}, got {best[name]} and else {second[name]}")
+    if (averaged := task.averaged(worse)) is not None:
+        require([*averaged] == [*worse], f"averaged must give {', '.join(worse)}, got {', '.join(averaged)}")
+        gain = averaged[task.watched] - worse[task.watched]
+        require(bool((gain >= 0).all() if task.larger_is_better else (gain <= 0).all()), "averaged must be no worse")
     stored = task.stored(labels, values, worse)
     require(all(isinstance(array, np.ndarray) for array in stored.values()), "stored must give arrays of numpy")
     require(all(len(array) == SAMPLES for array in stored.values()), "stored must give a row for each sample")
