@@ -1,0 +1,83 @@
+"""The table and the figure of how far labels agree."""
+
+import csv
+import math
+
+import pytest
+from rich.console import Console
+
+from gaigs.report.agreement import Cell, figure, write
+
+CELLS = [
+    Cell((0.0, 0.0), (0, 3), 1, 1, (5.0, 5.0, 5.0)),
+    Cell((0.0, 0.01), (0, 3), 3466, 300, (0.5, 1.25, 2.0)),
+    Cell((0.0, 0.01), (31, math.inf), 113, 113, (-1.0, 2.5, 4.0)),
+    Cell((0.01, 0.02), (4, 30), 20, 20, (1.0, 2.0, 3.0)),
+]
+SCORE, TITLES = "|difference| [dB]", {"mae_db": "MAE [dB]", "share": "share of |h|"}
+ROWS = {"one label as near": {"mae_db": 1.0, "share": 0.5}}
+MARKDOWN = r"""Median |difference| [dB] of two labels, 10th to 90th percentile, and number of pairs, by the distance
+of their places and by how many measurements apart they are:
+
+| distance [m] | within 3 | 4 to 30 | over 30 |
+|---|---|---|---|
+| same place | 5.00 (5.00 to 5.00), 1 |  |  |
+| under 0.01 | 1.25 (0.50 to 2.00), 3,466 |  | 2.50 (-1.00 to 4.00), 113 |
+| 0.01 to 0.02 |  | 2.00 (1.00 to 3.00), 20 |  |
+
+What that lets expect on split made:
+
+| predicted by | MAE [dB] | share of \|h\| |
+|---|---|---|
+| one label as near | 1.00 | 0.500 |
+
+- a remark
+- of a cell with more, 300 random pairs are compared
+"""
+
+
+@pytest.fixture
+def written(tmp_path):
+    shown = write(tmp_path, SCORE, TITLES, CELLS, ROWS, "made", ["a remark"])
+    console = Console(width=80, record=True)
+    console.print(shown)
+    return tmp_path, console.export_text()
+
+
+def test_the_page(written):
+    assert (written[0] / "agreement.md").read_text() == MARKDOWN.replace("distance\nof", "distance of")
+
+
+def test_the_file_of_cells(written):
+    with open(written[0] / "agreement.csv", newline="") as file:
+        lines = [*csv.DictReader(file)]
+    assert lines[2] == {
+        "distance_from_m": "0.0", "distance_below_m": "0.01", "separation_from": "31", "separation_to": "",
+        "pairs": "113", "compared": "113", "p10": "-1", "median": "2.5", "p90": "4",
+    }  # fmt: skip
+    assert len(lines) == len(CELLS)
+
+
+def test_the_terminal_has_room(written):
+    said = written[1]
+    assert "…" not in said
+    for words in ("same place", "within 3", "over 30", "-1.00..4.00", "3,466", "one label as near", "a remark"):
+        assert words in said
+
+
+def test_a_page_without_a_split(tmp_path):
+    write(tmp_path, "SSIM", TITLES, CELLS[:1], {}, "made", [])
+    page = (tmp_path / "agreement.md").read_text()
+    assert "| same place | 5.000 (5.000 to 5.000), 1 |" in page
+    assert "expect" not in page
+
+
+def test_the_figure_has_a_line_for_each_separation():
+    drawn = figure(SCORE, CELLS)
+    (ax,) = drawn.axes
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("distance of the places [m]", "|difference| [dB] of two labels")
+    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["same place", "under 0.01", "0.01 to 0.02"]
+    lines = {entry.get_label(): entry.lines[0] for entry in ax.containers}
+    assert [*lines] == ["within 3", "4 to 30", "over 30"]
+    assert lines["within 3"].get_ydata().tolist() == [5.0, 1.25]
+    assert len({(line.get_linestyle(), line.get_marker()) for line in lines.values()}) == 3
