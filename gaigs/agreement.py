@@ -166,8 +166,7 @@ def measure(links: Links, random: np.random.Generator) -> Agreement:
     apart = np.linalg.norm(places[first] - places[other], axis=1)
     medians = [float(np.median(values)) if len(values) else 0.0 for values in (steps, apart)]
     empty = Agreement(np.array(edges), np.array(limits, int), np.zeros(shape, int), share, {}, *medians)
-    used = len(edges) * len(limits) + len(edges)
-    most = int(np.clip(NUMBERS / (used * max(1, math.prod(links.task.shape))), FEWEST, COMPARED))
+    most = int(np.clip(NUMBERS / math.prod((*shape, *links.task.shape)), FEWEST, COMPARED))
     pairs, drawn = _draw(empty, places, order, groups, most, random)
     scores = {cell: _compare(links, *ends) for cell, ends in drawn.items()}
     return Agreement(empty.distances, empty.separations, pairs.reshape(shape), share, scores, *medians)
@@ -291,7 +290,7 @@ def on_split(
             remarks.append("mean of many as near: the same with half of the squared difference")
     if not baselines:
         return rows, remarks
-    numbers = (len(known) + len(links.split.test)) * max(1, math.prod(links.task.shape))
+    numbers = (len(known) + len(links.split.test)) * math.prod(links.task.shape)
     if numbers > LOOKED_UP:
         remarks.append("the baselines are left out, as labels are large and many; command=train model=mean has them")
         return rows, remarks

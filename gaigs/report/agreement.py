@@ -63,8 +63,8 @@ def write(
     columns = sorted({cell.separation for cell in cells})
     at = {(cell.distance, cell.separation): cell for cell in cells}
     digits = 2 if score.endswith("]") else 3
-    interval = lambda cell: f"{cell.quantiles[0]:.{digits}f} to {cell.quantiles[2]:.{digits}f}"
-    median = lambda cell: f"{cell.quantiles[1]:.{digits}f}"
+    interval = lambda cell: f"{cell.quantiles[0]:z.{digits}f} to {cell.quantiles[2]:z.{digits}f}"
+    median = lambda cell: f"{cell.quantiles[1]:z.{digits}f}"
     filled = lambda tell: [["" if (c := at.get((d, s))) is None else tell(c) for s in columns] for d in distances]
 
     about = f"Median {score} of two labels, 10th to 90th percentile, and number of pairs"
@@ -156,7 +156,7 @@ def _markdown(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 def _number(value: float, title: str) -> str:
     """A metric as text: hundredths of what has a unit, else thousandths."""
-    return f"{value:.{2 if title.endswith(']') else 3}f}"
+    return f"{value:z.{2 if title.endswith(']') else 3}f}"
 
 
 def _distance(bounds: tuple[float, float]) -> str:

@@ -12,7 +12,7 @@ CELLS = [
     Cell((0.0, 0.0), (0, 3), 1, 1, (5.0, 5.0, 5.0)),
     Cell((0.0, 0.01), (0, 3), 3466, 300, (0.5, 1.25, 2.0)),
     Cell((0.0, 0.01), (31, math.inf), 113, 113, (-1.0, 2.5, 4.0)),
-    Cell((0.01, 0.02), (4, 30), 20, 20, (1.0, 2.0, 3.0)),
+    Cell((0.01, 0.02), (4, 30), 20, 20, (-0.001, 2.0, 3.0)),
 ]
 SCORE, TITLES = "|difference| [dB]", {"mae_db": "MAE [dB]", "share": "share of |h|"}
 ROWS = {"one label as near": {"mae_db": 1.0, "share": 0.5}}
@@ -23,7 +23,7 @@ of their places and by how many measurements apart they are:
 |---|---|---|---|
 | same place | 5.00 (5.00 to 5.00), 1 |  |  |
 | under 0.01 | 1.25 (0.50 to 2.00), 3,466 |  | 2.50 (-1.00 to 4.00), 113 |
-| 0.01 to 0.02 |  | 2.00 (1.00 to 3.00), 20 |  |
+| 0.01 to 0.02 |  | 2.00 (0.00 to 3.00), 20 |  |
 
 What that lets expect on split made:
 
