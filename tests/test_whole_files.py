@@ -3,13 +3,14 @@
 import errno
 import os
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from gaigs import checkpoint
-from gaigs.files import whole
+from gaigs.files import sentence, whole
 from gaigs.gaussians import write_ply
 from gaigs.radio_map import RadioMap
 
@@ -67,6 +68,49 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
         FileNotFoundError, match=r"nowhere/floor\.npz could not be written \(No such file or directory\)"
     ):
         values.save(tmp_path / "nowhere" / "floor.npz")
+
+
+def test_a_folder_that_was_removed_is_not_made_anew(tmp_path):
+    def write():
+        with whole(tmp_path / "removed" / "last.ckpt") as part:
+            part.parent.mkdir()  # as Lightning does
+            part.write_text("new")
+
+    with pytest.raises(FileNotFoundError, match=r"last\.ckpt could not be written \(No such file or directory\)"):
+        write()
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
+    path = tmp_path / "scores.npz"
+    path.write_text("old")
+
+    def fail(_):
+        assert path.read_text() == "old"
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    def write():
+        with whole(path) as part:
+            part.write_text("new")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match=r"scores\.npz could not be written \(Input/output error\)"):
+        write()
+    assert path.read_text() == "old"
+    assert [*tmp_path.iterdir()] == [path]
+
+
+@pytest.mark.parametrize(
+    ("error", "begins"),
+    [
+        (FULL, "a file in run could not be written (No space left on device); see that its folder"),
+        (OSError(errno.ENOENT, os.strerror(errno.ENOENT), "log/metrics.csv"), "log/metrics.csv could not be written"),
+        (OSError(errno.ENOSPC, "run/best.ckpt could not"), "run/best.ckpt could not"),
+        (FileNotFoundError("nowhere must be the folder of a data set"), "nowhere must be"),
+    ],
+)
+def test_an_error_of_the_system_becomes_a_sentence_and_others_stay(error, begins):
+    assert sentence(error, Path("run")).startswith(begins)
 
 
 @pytest.fixture

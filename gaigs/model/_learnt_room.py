@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from gaigs.data import Links
+from gaigs.files import whole
 from gaigs.gaussians import write_ply
 from gaigs.placement._words import fold, images
 from gaigs.placement.mirrored import Mirrored
@@ -327,7 +328,8 @@ def export(placement: Mirrored, query: Query, folder: Path) -> None:
         folder: To write into.
     """
     found = survey(placement, query)
-    (folder / "planes.obj").write_text(wavefront_obj(placement, found))
+    with whole(folder / "planes.obj") as part:
+        part.write_text(wavefront_obj(placement, found))
     if placement.obstacles is not None:
         save_obstacles(placement, folder / "obstacles.ply")
 

@@ -1,6 +1,9 @@
 """The room that mirrored Gaussians have learnt, against rooms put in by hand: tables, shapes, files."""
 
+import errno
+import os
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -295,6 +298,17 @@ def test_planes_are_written_as_wavefront_obj(links, build, tmp_path):
         assert newell(corners) @ plane.normal > 0  # counterclockwise as seen from outside
     assert "metres" in text
     assert "# normal 1.0000 0.0000 0.0000, offset 6.000 m, loss" in text
+
+
+def test_planes_are_written_whole_or_not_at_all(links, build, tmp_path, monkeypatch):
+    def fill(path, text):
+        path.write_bytes(text[:9].encode())
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_text", fill)
+    with pytest.raises(OSError, match=r"planes\.obj could not be written \(No space left on device\)"):
+        learnt_room.export(build(), training(links), tmp_path)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_obstacles_are_written_as_splats(links, build, tmp_path):
