@@ -58,6 +58,8 @@ def cdf(
 def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
     """Steps and values of every quantity in files of Lightning's CSVLogger, whose rows leave out what they lack.
 
+    A run that is killed may leave an empty file, or one whose last row is cut: that is left out, and done anew behind.
+
     Args:
         paths: One file for each time the run was started; a later file counts from its first step on.
 
@@ -68,8 +70,10 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
     curves: dict[str, dict[float, float]] = {}
     for path in paths:
         with open(path, newline="") as file:
-            reader = csv.DictReader(file)
-            if "step" not in (reader.fieldnames or ()):
+            reader = csv.DictReader(line for line in file if line.endswith("\n"))
+            if reader.fieldnames is None:
+                continue
+            if "step" not in reader.fieldnames:
                 raise ValueError(f"{path} must have a column 'step', got {reader.fieldnames}; is it of a CSVLogger?")
             rows = list(reader)
             begin = min((float(row["step"]) for row in rows), default=math.inf)

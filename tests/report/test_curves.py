@@ -15,6 +15,17 @@ def rng():
     return np.random.default_rng(5)
 
 
+def test_what_a_killed_run_leaves_of_its_log_is_read(tmp_path):
+    """Nothing in one file, and a last row that is cut in another: it is done anew behind."""
+    texts = ["step,train/loss\n1,0.5\n2,0.25\n3,0.1", "", "step,train/loss\n3,0.125\n"]
+    paths = [tmp_path / f"{number}.csv" for number in range(len(texts))]
+    for path, text in zip(paths, texts, strict=True):
+        path.write_text(text)
+    steps, losses = read_curves(paths)["train/loss"]
+    assert (steps.tolist(), losses.tolist()) == ([1, 2, 3], [0.5, 0.25, 0.125])
+    assert read_curves(paths[1:2]) == {}
+
+
 def lines(ax):
     return {line.get_label(): line for line in ax.lines if not line.get_label().startswith("_")}
 
