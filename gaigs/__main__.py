@@ -5,18 +5,19 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hydra
+from hydra._internal import utils
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gaigs import configuration, processes
-from gaigs.processes import Stopped, forward_to_children, limit_threads, stopping
+from gaigs import configuration, files, processes
+from gaigs.processes import Stopped, forward_to_children, lacks_memory, limit_threads, stopping
 from gaigs.report import at_end
 
 log = logging.getLogger("gaigs")
@@ -67,16 +68,18 @@ def train(config: DictConfig) -> float | None:
     """
     settings = HydraConfig.get()
     plain, is_sweep = resolved(config), settings.mode is RunMode.MULTIRUN
-    from gaigs import experiment  # slow to import: here, once the configuration has proved good
-
-    for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
-        logging.getLogger(name).setLevel(logging.WARNING)
+    mode = "sweep" if is_sweep else "run"
+    goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
     try:
-        with mendable(), stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
-            metrics = experiment.run(plain, Path(settings.runtime.output_dir))
+        with mendable(goes_on):
+            from gaigs import experiment  # slow to import: here, once the configuration has proved good
+
+            for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
+                logging.getLogger(name).setLevel(logging.WARNING)
+            with stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
+                metrics = experiment.run(plain, Path(settings.runtime.output_dir))
     except KeyboardInterrupt as stop:
-        mode = "sweep" if is_sweep else "run"
-        told = f"gaigs: {str(stop) or 'stopped'}; the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
+        told = f"gaigs: {str(stop) or 'stopped'}; {goes_on}"
         number = getattr(stop, "number", signal.SIGINT)
         if is_sweep and settings.launcher["_target_"] != BASIC_LAUNCHER:
             # Only this job ends: a launcher that sees a process exit kills its other jobs before they have saved.
@@ -96,9 +99,9 @@ def compare_labels(config: DictConfig) -> None:
         CompactHydraException: As for ``train``.
     """
     plain = resolved(config)
-    from gaigs import agreement  # slow to import
+    with mendable("the same command does it anew"):
+        from gaigs import agreement  # slow to import
 
-    with mendable():
         agreement.run(plain, Path(HydraConfig.get().runtime.output_dir))
 
 
@@ -124,21 +127,48 @@ def resolved(config: DictConfig) -> dict:
 
 
 @contextlib.contextmanager
-def mendable() -> Iterator[None]:
+def mendable(goes_on: str) -> Iterator[None]:
     """Has what a user can mend end as one message; with ``hydra.verbose=true`` as the error itself.
+
+    Args:
+        goes_on: How to go on with what is done here.
 
     Raises:
         CompactHydraException: In its place.
     """
-    from lightning.pytorch.utilities.exceptions import MisconfigurationException  # slow to import
-
+    settings = HydraConfig.get()
     try:
         yield
-    except (ValueError, TypeError, OSError, ImportError, RuntimeError, MisconfigurationException) as error:
-        if HydraConfig.get().verbose:
+    except Exception as error:
+        told = advice(error, Path(settings.runtime.output_dir), goes_on)
+        if settings.verbose:
             os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra leaves most of the traceback out
+        if settings.verbose or told is None:
             raise
-        raise CompactHydraException(f"gaigs: {error}") from error
+        raise CompactHydraException(f"gaigs: {told}") from error
+
+
+def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
+    """What a user can do about an error, in one message; None where only a developer can.
+
+    Args:
+        error: Of a run.
+        folder: Of that run.
+        goes_on: How to go on with it.
+    """
+    if lacks_memory(error):
+        cause = " ".join(str(error).split()) or type(error).__name__
+        return (
+            f"there must be enough memory, and there is not ({cause}); end other programs or give the run more, and "
+            f"{goes_on}; or take a smaller training.batch_size in another folder"
+        )
+    if isinstance(error, OSError):
+        return files.sentence(error, folder)
+    if isinstance(error, ValueError | TypeError | ImportError | RuntimeError):
+        return str(error)
+    from lightning.pytorch.utilities.exceptions import MisconfigurationException  # slow to import
+
+    return str(error) if isinstance(error, MisconfigurationException) else None
 
 
 def list_devices() -> None:
@@ -157,9 +187,23 @@ def list_devices() -> None:
         print(f"{name}  <- rasterizer=opencl takes this one" if number == names.index(default) else name)
 
 
+def in_one_line(work: Callable) -> object:
+    """Does what Hydra is about to do, and what it gives.
+
+    Raises:
+        CompactHydraException: One of Hydra's own files cannot be written, or there is no memory.
+    """
+    try:
+        return work()
+    except (OSError, MemoryError) as error:
+        told = advice(error, Path.cwd(), "the same command goes on")
+        raise CompactHydraException(f"gaigs: {told}") from error
+
+
 def main() -> None:
     """The console script ``gaigs``."""
     configuration.install()
+    logging.raiseExceptions = False  # a log that finds no room tells nothing that the run's own files do not
     signals = []
 
     def stop(number: int, _) -> None:
@@ -169,7 +213,8 @@ def main() -> None:
         if not any(arg in ("-m", "--multirun") for arg in sys.argv):
             raise Stopped("stopped", number)
 
-    handler = signal.signal(signal.SIGTERM, stop)
+    handler, report = signal.signal(signal.SIGTERM, stop), utils.run_and_report
+    utils.run_and_report = lambda work: report(lambda: in_one_line(work))
     try:
         hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
         at_end.write()
@@ -182,6 +227,7 @@ def main() -> None:
         raise SystemExit(128 + getattr(stop, "number", signal.SIGINT)) from None
     finally:
         signal.signal(signal.SIGTERM, handler)
+        utils.run_and_report = report
         if signals:
             sys.exit(128 + signals[0])
 

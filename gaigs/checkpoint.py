@@ -15,6 +15,7 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 
 from gaigs.files import whole
 from gaigs.model import Model
+from gaigs.processes import lacks_memory
 from gaigs.registry import registry
 from gaigs.scene import Scene
 
@@ -75,7 +76,9 @@ def read(path: str | Path) -> dict:
     try:
         is_sealed = _is_sealed(data)
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception:  # whatever archive readers and unpicklers meet; torch's own words advise to run a file's code
+    except Exception as error:  # whatever archive readers and unpicklers meet; torch's own words advise to run its code
+        if lacks_memory(error):  # which says nothing of the file
+            raise
         raise ValueError(
             f"{path} must be a checkpoint of gaigs, and is damaged or another file; take another copy of it, or do the "
             "run anew"
@@ -219,6 +222,8 @@ def _blaming(path: str | Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # whatever constructors make of what they were not written for
+        if lacks_memory(error):
+            raise
         cause = str(error) if isinstance(error, ValueError | ImportError) else f"{type(error).__name__}: {error}"
         told = f"{path} must hold a model that can be made here, and does not: {' '.join(cause.split())}"
         raise (ImportError if isinstance(error, ImportError) else ValueError)(told) from error

@@ -1,4 +1,4 @@
-"""What a run shares a machine with: its threads, the signals that stop it, other runs, and its own other processes."""
+"""What a run shares a machine with: threads, memory, the signals that stop it, other runs, its own other processes."""
 
 import contextlib
 import os
@@ -13,6 +13,9 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 POCL_THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 """Environment variables that limit the threads of OpenCL on the processor: PoCL up to version 3, and later ones."""
 
+OUT_OF_MEMORY = ("allocate memory", "unable to allocate", "not enough memory", "out of memory", "bad_alloc")
+OUT_OF_MEMORY += ("bad allocation", "failed to map segment", "can't start new thread", "mem_object_allocation_failure")
+"""Words of torch, C++, the loader of libraries, Python and OpenCL for it, in small letters."""
 
 received: list[int] = []
 """Signals at which runs of this process have stopped: a launcher's worker starts no other then."""
@@ -53,6 +56,15 @@ def limit_threads(count: int | None, jobs: int = 1) -> None:
     for name in ("OMP_NUM_THREADS", *POCL_THREADS):
         os.environ[name] = str(count)
     torch.set_num_threads(count)
+
+
+def lacks_memory(error: BaseException | None) -> bool:
+    """Whether an error, or what caused it, is that there was no more memory, of the processor or of a GPU."""
+    while error is not None:
+        if isinstance(error, MemoryError) or any(words in str(error).lower() for words in OUT_OF_MEMORY):
+            return True
+        error = error.__cause__
+    return False
 
 
 def is_first() -> bool:

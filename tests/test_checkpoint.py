@@ -20,6 +20,7 @@ from gaigs.configuration import conf_dir
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.registry import registry
+from gaigs.scene import Scene
 
 OVERRIDES = (
     "data.transmitters=20",
@@ -160,6 +161,21 @@ def test_a_damaged_or_foreign_file_gives_one_line(spoil, folder, content, tmp_pa
     assert "\n" not in str(error.value)
     told = "".join(traceback.format_exception(error.value))
     assert "weights_only" not in told, "torch's advice runs the code of a hostile file"
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+def test_a_lack_of_memory_is_not_called_a_damaged_file(error, folder, monkeypatch):
+    """The advice to take another file would lose a good one."""
+
+    def fail(*_, **__):
+        raise error
+
+    for module, name, work in ((torch, "load", checkpoint.read), (Scene, "from_state", gaigs.load)):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, fail)
+            with pytest.raises(type(error)) as told:
+                work(folder / "best.ckpt")
+        assert told.value is error
 
 
 def test_weights_that_do_not_fit_give_one_line(content, tmp_path):

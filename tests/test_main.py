@@ -1,6 +1,7 @@
 """The command line as a user meets it; what a run computes is in test_experiment.py."""
 
 import csv
+import errno
 import json
 import logging
 import os
@@ -283,6 +284,41 @@ def test_what_only_a_developer_can_mend_has_a_traceback(run, monkeypatch):
     assert code == 1
     assert "KeyError: 'lost'" in err
     assert "Traceback" in err
+
+
+TORCH = "[enforce fail at alloc_cpu.cpp:124] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes."
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError(), "there must be enough memory, and there is not (MemoryError)"),
+        (RuntimeError(TORCH), f"there must be enough memory, and there is not ({TORCH})"),
+        (ValueError("no model"), "there must be enough memory, and there is not (no model)"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), "run could not be written (No space left on device); see"),
+        (OSError(errno.ENOSPC, "run/best.ckpt could not be written"), "run/best.ckpt could not be written\n"),
+    ],
+    ids=["python", "torch", "cause", "disk", "told already"],
+)
+def test_faults_of_the_machine_are_told_in_one_line(error, told, run, monkeypatch):
+    def fail(*_):
+        raise error from (MemoryError() if isinstance(error, ValueError) else None)
+
+    monkeypatch.setattr(experiment, "train_and_test", fail)
+    code, err = run(*SMALL, *HERE)
+    assert code == 1
+    assert err.count("gaigs: ") == 1
+    assert "Traceback" not in err
+    assert told in err
+    assert "memory" not in told or "the same command with hydra.run.dir=run goes on" in err
+
+
+def test_a_run_folder_that_hydra_cannot_make_is_told_in_one_line(run, tmp_path):
+    (tmp_path / "taken").write_text("mine")
+    code, err = run(*SMALL, "hydra.run.dir=taken/run")
+    assert code == 1
+    assert "Traceback" not in err
+    assert re.match(r"gaigs: .*taken/run could not be written \(Not a directory\); see that its folder is there", err)
 
 
 def test_another_configuration_in_the_same_folder(run):
