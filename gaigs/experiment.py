@@ -245,12 +245,18 @@ def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) ->
             trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     except Interrupted as stop:
         raise Stopped(str(stop), stop.number) from None
+    except SystemExit as end:  # Lightning's for a signal that came before its handler was ours
+        if isinstance(end.__context__, KeyboardInterrupt):
+            raise Stopped("stopped", getattr(end.__context__, "number", signal.SIGINT)) from None
+        raise
     finally:
         if threading.current_thread() is threading.main_thread():
             for number, handler in handlers.items():
                 signal.signal(number, handler)
         if distributed.is_available() and distributed.is_initialized():
             distributed.destroy_process_group()
+    if keep_last.received is not None:  # behind the last step
+        raise Stopped(f"stopped after step {trainer.global_step}", keep_last.received)
     seconds, steps, size = timer.time_elapsed("train"), trainer.global_step, module.batch_size
     log.info("trained %d steps of %d places in %.0f s: %.1f steps/s", steps, size, seconds, steps / seconds)
     module.load_state_dict(checkpoint.trained_weights(checkpoint.read(best)))

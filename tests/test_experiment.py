@@ -21,6 +21,7 @@ from gaigs.configuration import conf_dir
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.geometry import Pose
+from gaigs.processes import Stopped, stopping
 from gaigs.radio_map import RadioMap
 from gaigs.report.curves import read_curves
 from gaigs.testing import example_links
@@ -185,6 +186,22 @@ def test_a_second_ctrl_c_stops_within_the_step(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt, match="stopped within a step"):
         experiment.run(configure(), tmp_path)
     assert not (tmp_path / "last.ckpt").exists()
+
+
+@pytest.mark.parametrize(
+    ("hook", "message", "left"),
+    [("on_fit_start", "stopped", False), ("on_train_end", "stopped after step 14", True)],
+    ids=["before the first step", "behind the last one"],
+)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_around_the_steps_stops_a_run_too(hook, message, left, number, tmp_path, monkeypatch):
+    """Lightning would exit with 1 and no word before them; behind them no step comes that could look at it."""
+    monkeypatch.setattr(Descent, hook, lambda *_: signal.raise_signal(number), raising=False)
+    with stopping(), pytest.raises(Stopped, match=f"{message}$") as stop:
+        experiment.run(configure(), tmp_path)
+    assert stop.value.number == number
+    assert (tmp_path / "last.ckpt").exists() == left
+    assert not (tmp_path / "metrics.json").exists()
 
 
 # --- the run folder ---
