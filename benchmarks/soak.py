@@ -1,0 +1,387 @@
+"""Kills, starves and robs a run, has the same command go on, and compares its end with that of an undisturbed run.
+
+    python benchmarks/soak.py
+    python benchmarks/soak.py --faults kill --repeats 40 --seed 1
+    python benchmarks/soak.py +experiment=mirrored data.transmitters=30 trainer.max_steps=60 --faults kill
+    python benchmarks/soak.py --markdown docs/results/faults.md
+
+Overrides are those of ``python -m gaigs``; without any it is a short run of GAI-GS with kriging. Each run is the
+command line in a process of its own, forked once the packages are imported, so that random moments fall into the work.
+Moments are in processor time, so that other work on the machine does not move them. Linux only. Disks are filled in a
+small file system, which needs root. The page is written anew after each fault. The exit code is 1 where anything was
+lost.
+"""
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import random
+import resource
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from forked import Process
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from gaigs import checkpoint, experiment  # noqa: F401, what a run imports
+from gaigs.evaluation import device_name
+from gaigs.files import whole
+from gaigs.report import curves, room, spectra, style  # noqa: F401, likewise
+
+RUN = (
+    "+experiment=spectrum",
+    "kriging=true",
+    "tokenizer=euclidean",
+    "rasterizer=torch",
+    "data.transmitters=30",
+    "gaussians.count=30",
+    "training.thinning.stride=16",
+    "training.batch_size=8",
+    "trainer.max_steps=24",
+    "trainer.val_check_interval=8",
+    "trainer.log_every_n_steps=2",
+    "baselines=[{name: mean}, {name: knn, k: 3, power: 2.0}]",
+)
+
+ALWAYS = ("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "threads=1", "save_every=0.5")
+
+TIMED = ("train_seconds", "inference_ms", "render_ms", "checkpoint_bytes", "seconds")
+"""Keys of metrics.json that differ between two runs of the same command."""
+
+PHASES = {
+    "metrics.json": "ended",
+    "figures": "figures",
+    "predictions.npz": "testing",
+    "last.ckpt": "training, kriging",
+    "log": "before the first save",
+}
+"""What a run is at, by the first of these that is in its folder; before there is any, it is at its start."""
+
+NAMES = {"kill": "", "disk": "disk full", "files": "files limited in size", "folder": "run folder removed"}
+NAMES |= {"memory": "memory limited", "multirun": "two jobs of `joblib`, "}
+"""Faults in the words of the table."""
+
+PAGE = """# Faults
+
+Here you see what became of runs that were killed, or left without disk, folder or memory: {verdict}. Written by
+
+```
+{command}
+```
+
+A short training with kriging, tests and figures was disturbed at random moments (seed {seed}). Then the same command
+went on in the same folder, once there was room, folder or memory again. It lost nothing where
+
+- it ended with the scores, predictions, weights and loss curves of an undisturbed run, to the bit;
+- checkpoints in between were whole, and no half-written file was left;
+- what ended it was told in one sentence.
+
+Undisturbed it took {work:.1f} s of one core, and {seconds:.0f} s on a machine shared by others: {device}.
+
+{table}
+
+- A run that ended well was disturbed too late, or needed no more room or memory than there was.
+- Training lost: seconds from the last save to the fault. `save_every` was 0.5 s; a save waits for the end of a step.
+- SIGKILL and SIGTERM came one after the other in the same folder, in turn.
+{wrong}"""
+
+
+@dataclass
+class Trial:
+    """One disturbance: at which phase it came, how the run ended, training lost [s], and what went wrong."""
+
+    fault: str
+    phase: str
+    end: str
+    lost: float | None
+    wrong: list[str] = field(default_factory=list)
+
+
+class Soak:
+    """All trials of one command.
+
+    Args:
+        overrides: Of the command.
+        top: For run folders.
+        draw: Random moments and sizes.
+    """
+
+    def __init__(self, overrides: Sequence[str], top: Path, draw: random.Random):
+        self.overrides, self.top, self.draw = [*overrides, *ALWAYS], top, draw
+        self.trials: list[Trial] = []
+        self.count, self.fault = 0, ""
+        self.reference = top / "undisturbed"
+        start, process = time.monotonic(), self.start(self.reference)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+        process.wait()
+        self.seconds = time.monotonic() - start
+        self.work = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+        if process.code:
+            raise SystemExit(f"the undisturbed run must end well, and says {process.told}")
+        self.sizes = sorted(path.stat().st_size for path in self.reference.rglob("*") if path.is_file())
+
+    def start(self, folder: Path, before: Callable = lambda: None) -> Process:
+        """The command, in a run folder."""
+        self.began = time.time()
+        return Process([*self.overrides, f"hydra.run.dir={folder}"], self.top / folder.name, before)
+
+    def new_folder(self) -> Path:
+        self.count += 1
+        return self.top / f"run{self.count}"
+
+    def disturbed(self, folder: Path, act: Callable[[Process], None], after: float = 0) -> tuple[Process, str, float]:
+        """A run to which something is done at a random moment; at which phase; how much training is not saved then."""
+        process, moment = self.start(folder), self.draw.uniform(0, max(0.1, self.work - after))
+        self.moment = after + moment
+        phase, lost = "ended", None
+        if not process.wait(lambda: process.seconds >= moment):
+            phase, lost = self.phase(folder), self.unsaved(folder)
+            act(process)
+            process.wait()
+        return process, phase, lost
+
+    def judge(self, process: Process, phase: str, lost: float | None = None, codes: tuple = (0, 1)) -> Trial:
+        """Looks at how a disturbed run has ended."""
+        trial = Trial(self.fault, phase, process.end, lost)
+        is_clear = all(line.startswith("gaigs: ") for line in process.told) and len(process.told) == (process.code > 0)
+        if process.code not in codes or not is_clear or "no message" in process.end:
+            trial.wrong.append(f"exit code {process.code}, {process.told}")
+        self.trials.append(trial)
+        return trial
+
+    def go_on(self, folder: Path, trial: Trial) -> None:
+        """Looks at what is left, has the same command go on, and looks at its end."""
+        for path in folder.rglob("*.ckpt"):
+            with contextlib.suppress(FileNotFoundError):
+                if ".part" not in path.name:
+                    try:
+                        checkpoint.read(path)
+                    except ValueError as error:
+                        trial.wrong.append(str(error))
+        process = self.start(folder)
+        process.wait()
+        if process.code:
+            trial.wrong.append(f"going on: exit code {process.code}, {process.told}")
+        else:
+            trial.wrong += self.differences(folder)
+        print(trial, flush=True)
+        if not trial.wrong:
+            shutil.rmtree(folder)
+
+    def phase(self, folder: Path) -> str:
+        return next((phase for name, phase in PHASES.items() if (folder / name).exists()), "start")
+
+    def unsaved(self, folder: Path) -> float | None:
+        """Seconds of training since the last save; None outside of the training."""
+        now, log = time.time(), folder / "gaigs.log"
+        started = max((path.stat().st_mtime for path in folder.glob("log/version_*")), default=0)
+        if started < self.began or "\ntrained " in log.read_text().rpartition("\nmodel: ")[2]:
+            return None
+        last = folder / "last.ckpt"
+        return max(0.0, now - max(started, last.stat().st_mtime if last.exists() else 0))
+
+    def differences(self, folder: Path) -> list[str]:
+        """How a run folder differs from that of the undisturbed run, to the bit."""
+        tops = (self.reference, folder)
+        mine, other = (
+            {str(path.relative_to(top)) for path in top.rglob("*") if not {"log", ".hydra"} & {*path.parts}}
+            for top in tops
+        )
+        wrong = [f"lacks {name}" for name in mine - other] + [f"has {name}" for name in other - mine]
+        mine, other = (untimed(json.loads((top / "metrics.json").read_text())) for top in tops)
+        wrong += [f"metrics.json: {key}" for key in mine if mine[key] != other.get(key)]
+        predictions = [dict(np.load(top / "predictions.npz")) for top in tops]
+        weights = [checkpoint.read(top / "best.ckpt")["state_dict"] for top in tops]
+        logs = [curves.read_curves(sorted(top.glob("log/*/metrics.csv"))) for top in tops]
+        for what, (mine, other) in {"predictions": predictions, "weights": weights, "curves": logs}.items():
+            same = lambda name, a=mine, b=other: np.array_equal(a[name], b[name], equal_nan=True)
+            if mine.keys() != other.keys() or not all(map(same, mine)):
+                wrong.append(f"other {what}")
+        return wrong
+
+    # --- faults ---
+
+    def kill(self) -> None:
+        """SIGKILL and SIGTERM, or the other way round, one after the other in a folder."""
+        folder, numbers, self.moment = self.new_folder(), [signal.SIGKILL, signal.SIGTERM], 0.0
+        for number in numbers if self.count % 2 else reversed(numbers):
+            process, phase, lost = self.disturbed(folder, lambda p, n=number: os.kill(p.id, n), self.moment)
+            saved = any("after step" in line for line in process.told)
+            self.fault = number.name
+            trial = self.judge(process, phase, 0.0 if saved else lost, (0, 143, -number))
+        self.go_on(folder, trial)
+
+    def fill_disk(self) -> None:
+        """A file system of random size; then it has room."""
+        top = self.new_folder()
+        top.mkdir()
+        size = int(2**12 + 1.2 * sum(self.sizes) * self.draw.random() ** 2)
+        mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", top]
+        if subprocess.run(mount, capture_output=True).returncode:
+            print("no file system can be mounted here, so no disk is filled: root alone may")
+            return
+        try:
+            process = self.start(top / f"run{self.count}")
+            process.wait()
+            trial = self.judge(process, self.phase(top / f"run{self.count}"))
+            trial.wrong += [f"left {path.name}" for path in top.rglob("*.part*")]
+            subprocess.run(["mount", "-o", "remount,size=1g", top], check=True)
+            self.go_on(top / f"run{self.count}", trial)
+        finally:
+            subprocess.run(["umount", top], check=True)
+
+    def limit_files(self) -> None:
+        """No file may grow beyond some size; then any may."""
+        size, folder = self.draw.choice(self.sizes) - 1, self.new_folder()
+        limit = (size, resource.RLIM_INFINITY)
+        process = self.start(folder, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit))
+        process.wait()
+        trial = self.judge(process, self.phase(folder))
+        trial.wrong += [f"left {path.name}" for path in folder.rglob("*.part*")]
+        self.go_on(folder, trial)
+
+    def remove_folder(self) -> None:
+        """The run folder is removed."""
+        folder = self.new_folder()
+
+        def remove(_) -> None:
+            while folder.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+
+        process, phase, _ = self.disturbed(folder, remove)
+        trial = self.judge(process, phase)
+        trial.wrong += ["wrote on"] if process.code and folder.exists() else []
+        self.go_on(folder, trial)
+
+    def limit_memory(self) -> None:
+        """Hardly more memory may be taken than there is."""
+
+        def limit(process: Process) -> None:
+            pages = int(Path(f"/proc/{process.id}/statm").read_text().split()[0])
+            most = pages * resource.getpagesize() + self.draw.randrange(2**22)
+            resource.prlimit(process.id, resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
+
+        folder = self.new_folder()
+        process, phase, _ = self.disturbed(folder, limit)
+        trial = self.judge(process, phase)
+        trial.wrong += [f"left {path.name}" for path in folder.rglob("*.part*")]
+        self.go_on(folder, trial)
+
+    def kill_multirun(self) -> None:
+        """Two jobs at a time, one of them the undisturbed run's; SIGKILL goes to all processes."""
+        for number in (signal.SIGKILL, signal.SIGTERM):
+            top, kind = self.new_folder(), self.fault
+            words = [*self.overrides, "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1"]
+            words += [f"hydra.sweep.dir={top}", "hydra.sweep.subdir=${hydra.job.num}"]
+            process = Process(words, self.top / top.name)
+            process.wait(lambda top=top: any(top.glob("*/last.ckpt")))
+            (os.killpg if number == signal.SIGKILL else os.kill)(process.id, number)
+            process.wait()
+            self.fault = kind + number.name
+            trial = self.judge(process, "training, kriging", None, (143, -number))
+            again = Process(words, self.top / top.name)
+            again.wait()
+            trial.wrong += [f"going on: exit code {again.code}, {again.told}"] if again.code else []
+            self.fault = kind
+            self.go_on(top / "0", trial)
+
+
+FAULTS = {
+    "kill": (Soak.kill, 10),
+    "disk": (Soak.fill_disk, 6),
+    "files": (Soak.limit_files, 3),
+    "folder": (Soak.remove_folder, 3),
+    "memory": (Soak.limit_memory, 6),
+    "multirun": (Soak.kill_multirun, 1),
+}
+"""What is tried, in turns, and how often; ``kill`` and ``multirun`` with each of two signals."""
+
+
+def untimed(metrics: dict) -> dict:
+    """Metrics without what differs between two runs of the same command."""
+    values = {key: value for key, value in metrics.items() if key not in TIMED}
+    return {key: untimed(value) if isinstance(value, dict) else value for key, value in values.items()}
+
+
+def rows(trials: Sequence[Trial]) -> list[list[str]]:
+    """Of the table: a head, and a row for each fault."""
+    table = [["fault", "times", "at", "the run", "lost nothing", "training lost, median and most [s]"]]
+    for fault in dict.fromkeys(trial.fault for trial in trials):
+        own = [trial for trial in trials if trial.fault == fault]
+        lost = [trial.lost for trial in own if trial.lost is not None]
+        counted = (
+            ", ".join(f"{name} ({count})" for name, count in Counter(values).most_common())
+            for values in ((trial.phase for trial in own), (trial.end for trial in own))
+        )
+        seconds = f"{np.median(lost):.2f}, {max(lost):.2f}" if lost else ""
+        table.append([fault, str(len(own)), *counted, str(sum(not trial.wrong for trial in own)), seconds])
+    return table
+
+
+def wrong(trials: Sequence[Trial]) -> list[str]:
+    """What went wrong, a line each."""
+    return [f"- {trial.fault}, {trial.phase}: {text}" for trial in trials for text in trial.wrong]
+
+
+def page(soak: Soak, seed: int) -> str:
+    """The page of documentation."""
+    head, *body = rows(soak.trials)
+    good, device = sum(not trial.wrong for trial in soak.trials), device_name(torch.device("cpu"))
+    return PAGE.format(
+        table="\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body)),
+        verdict=f"{good} of {len(soak.trials)} lost nothing",
+        wrong="".join(f"{line}\n" for line in wrong(soak.trials)),
+        command=shlex.join(["python", *sys.argv]),
+        **{"seconds": soak.seconds, "work": soak.work, "seed": seed, "device": device},
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=[*FAULTS])
+    parser.add_argument("--repeats", type=int, help="of each fault")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="after which nothing more is tried")
+    parser.add_argument("--seed", type=int, default=0, help="of the random moments")
+    parser.add_argument("--markdown", type=Path, help="page to write")
+    options = parser.parse_intermixed_args()
+    torch.set_num_threads(1)
+    start = time.monotonic()
+    style.DPI = 40  # figures are drawn in less time
+    with tempfile.TemporaryDirectory(prefix="soak") as top:
+        soak = Soak(options.overrides or RUN, Path(top), random.Random(options.seed))
+        most = {name: options.repeats or FAULTS[name][1] for name in options.faults}
+        turns = [name for turn in range(max(most.values())) for name in most if turn < most[name]]
+        for name in turns:
+            if time.monotonic() > start + 60 * options.minutes:
+                break
+            soak.fault = NAMES[name]
+            FAULTS[name][0](soak)
+            if options.markdown:
+                with whole(options.markdown) as part:
+                    part.write_text(page(soak, options.seed))
+    head, *body = rows(soak.trials)
+    table = Table(*head, box=SIMPLE_HEAD)
+    for row in body:
+        table.add_row(*row)
+    Console().print(table)
+    raise SystemExit("\n".join(wrong(soak.trials)) or 0)
+
+
+if __name__ == "__main__":
+    main()
