@@ -80,7 +80,7 @@ class Process:
         if self.code < 0:
             return signal.Signals(-self.code).name
         messages = {"enough memory": "not enough memory", "not be written": "could not be written"}
-        messages |= {"stopped": "stopped", "not started": "stopped"}
+        messages |= {"was removed": "folder was removed", "stopped": "stopped", "not started": "stopped"}
         said = next(
             (name for words, name in messages.items() if any(words in line for line in self.told)), "no message"
         )

@@ -162,6 +162,8 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
             f"there must be enough memory, and there is not ({cause}); end other programs or give the run more, and "
             f"{goes_on}; or take a smaller training.batch_size in another folder"
         )
+    if not folder.is_dir():  # whatever was missed first
+        return f"{folder} must stay there while a run is at work, and was removed; the same command begins anew"
     if isinstance(error, OSError):
         return files.sentence(error, folder)
     if isinstance(error, ValueError | TypeError | ImportError | RuntimeError):

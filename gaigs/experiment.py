@@ -79,6 +79,8 @@ def run(config: dict, folder: Path) -> dict | None:
             metrics = read_metrics(finished)
         else:
             metrics = train_and_test(config, folder)
+            if not is_configuration(folder / "config.yaml"):  # the folder was removed, and loggers have made it anew
+                store(config, folder)
             with whole(finished) as part:
                 part.write_text(json.dumps(metrics, indent=2) + "\n")
     console = Console()
@@ -102,8 +104,7 @@ def claim(folder: Path, config: dict) -> None:
             "folder with hydra.run.dir=DIR"
         )
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
-        with whole(file) as part:
-            OmegaConf.save(OmegaConf.create(config), part)
+        store(config, folder)
         return
     differing = differences(OmegaConf.to_container(OmegaConf.load(file)), config)
     if differing:
@@ -113,6 +114,12 @@ def claim(folder: Path, config: dict) -> None:
             f"{folder} must be free or hold a run of the same configuration, but {listed}; choose another folder with "
             "hydra.run.dir=DIR (nothing was written into this one but Hydra's own .hydra/)"
         )
+
+
+def store(config: dict, folder: Path) -> None:
+    """Writes the configuration of a run into its folder."""
+    with whole(folder / "config.yaml") as part:
+        OmegaConf.save(OmegaConf.create(config), part)
 
 
 def is_configuration(file: Path) -> bool:

@@ -331,6 +331,21 @@ def test_a_damaged_checkpoint_to_go_on_from_destroys_nothing(finished, tmp_path,
     assert digest(copy) == before
 
 
+def test_a_folder_that_was_removed_and_made_anew_gets_its_configuration_again(finished, tmp_path, monkeypatch):
+    """Loggers make it anew where it is removed before the first save."""
+    config, _, metrics = finished
+    own = tmp_path / "run"
+
+    def remove(*_):
+        shutil.rmtree(own)
+        own.mkdir()
+        return metrics
+
+    monkeypatch.setattr(experiment, "train_and_test", remove)
+    assert experiment.run(config, own) == experiment.run(config, own) == metrics
+    assert yaml.safe_load((own / "config.yaml").read_text()) == config
+
+
 def test_a_folder_that_lost_its_configuration_is_refused(finished, tmp_path):
     config, folder, _ = finished
     shutil.copy(folder / "metrics.json", tmp_path)

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -311,6 +312,18 @@ def test_faults_of_the_machine_are_told_in_one_line(error, told, run, monkeypatc
     assert "Traceback" not in err
     assert told in err
     assert "memory" not in told or "the same command with hydra.run.dir=run goes on" in err
+
+
+def test_a_run_folder_that_was_removed_is_named_whatever_was_missed(run, tmp_path, monkeypatch):
+    def remove(*_):
+        shutil.rmtree(tmp_path / "run")
+        raise FileNotFoundError("no checkpoint at run/best.ckpt")
+
+    monkeypatch.setattr(experiment, "train_and_test", remove)
+    code, err = run(*SMALL, *HERE)
+    assert code == 1
+    assert "Traceback" not in err
+    assert "run must stay there while a run is at work, and was removed; the same command begins anew\n" in err
 
 
 def test_a_run_folder_that_hydra_cannot_make_is_told_in_one_line(run, tmp_path):

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import resource
 import subprocess
 from pathlib import Path
 
@@ -137,6 +138,21 @@ WRITERS = {
         "many",
     ),
 }
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_file_that_may_not_grow_so_large(name, tmp_path):
+    """As under a quota; unlike a full file system it takes no root to try."""
+    (tmp_path / name).write_text("old")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, limits[1]))
+    try:
+        with pytest.raises(OSError, match=rf"{name} could not be written"):
+            WRITERS[name](tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (tmp_path / name).read_text() == "old"
+    assert [*tmp_path.iterdir()] == [tmp_path / name]
 
 
 @pytest.mark.parametrize("name", WRITERS)
