@@ -5,13 +5,13 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+import traceback
+from collections.abc import Iterator
 from pathlib import Path
 
 import hydra
-from hydra._internal import utils
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
+from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -63,7 +63,7 @@ def train(config: DictConfig) -> float | None:
 
     Raises:
         CompactHydraException: What a user can mend, as one message; Hydra prints it without the traceback and exits
-            with 1, after the other jobs of a multirun. With ``hydra.verbose=true`` the error itself.
+            with 1, after the other jobs of a multirun. With ``hydra.verbose=true`` the traceback comes before it.
         SystemExit: A signal has stopped the run: 128 and the signal's number, as shells report it.
     """
     settings = HydraConfig.get()
@@ -128,7 +128,7 @@ def resolved(config: DictConfig) -> dict:
 
 @contextlib.contextmanager
 def mendable(goes_on: str) -> Iterator[None]:
-    """Has what a user can mend end as one message; with ``hydra.verbose=true`` as the error itself.
+    """Has what a user can mend end as one message; with ``hydra.verbose=true`` the traceback comes before it.
 
     Args:
         goes_on: How to go on with what is done here.
@@ -142,8 +142,8 @@ def mendable(goes_on: str) -> Iterator[None]:
     except Exception as error:
         told = advice(error, Path(settings.runtime.output_dir), goes_on)
         if settings.verbose:
-            os.environ["HYDRA_FULL_ERROR"] = "1"  # else Hydra leaves most of the traceback out
-        if settings.verbose or told is None:
+            traceback.print_exc()
+        if told is None:
             raise
         raise CompactHydraException(f"gaigs: {told}") from error
 
@@ -189,17 +189,29 @@ def list_devices() -> None:
         print(f"{name}  <- rasterizer=opencl takes this one" if number == names.index(default) else name)
 
 
-def in_one_line(work: Callable) -> object:
-    """Does what Hydra is about to do, and what it gives.
+def compose_and_run() -> None:
+    """Has Hydra read the command line and run its jobs.
 
     Raises:
-        CompactHydraException: One of Hydra's own files cannot be written, or there is no memory.
+        SystemExit: With 1 where a job fails, or the command line is wrong; what is wrong is printed as one sentence.
     """
+    asked = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands on what goes wrong
     try:
-        return work()
-    except (OSError, MemoryError) as error:
-        told = advice(error, Path.cwd(), "the same command goes on")
-        raise CompactHydraException(f"gaigs: {told}") from error
+        hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
+    except (HydraException, OmegaConfBaseException, ValueError, OSError, MemoryError) as error:
+        if asked == "1":
+            raise
+        if isinstance(error, OSError | MemoryError):  # of one of Hydra's own files
+            told = advice(error, Path.cwd(), "the same command goes on")
+        else:
+            told = configuration.explain(error)
+        print(f"gaigs: {told}", file=sys.stderr)
+        raise SystemExit(1) from None
+    finally:
+        os.environ.pop("HYDRA_FULL_ERROR")
+        if asked is not None:
+            os.environ["HYDRA_FULL_ERROR"] = asked
 
 
 def main() -> None:
@@ -215,10 +227,9 @@ def main() -> None:
         if not any(arg in ("-m", "--multirun") for arg in sys.argv):
             raise Stopped("stopped", number)
 
-    handler, report = signal.signal(signal.SIGTERM, stop), utils.run_and_report
-    utils.run_and_report = lambda work: report(lambda: in_one_line(work))
+    handler = signal.signal(signal.SIGTERM, stop)
     try:
-        hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
+        compose_and_run()
         at_end.write()
     except SystemExit as end:
         if end.code == 1 and not signals:  # a job has failed, and the others have ended
@@ -229,7 +240,6 @@ def main() -> None:
         raise SystemExit(128 + getattr(stop, "number", signal.SIGINT)) from None
     finally:
         signal.signal(signal.SIGTERM, handler)
-        utils.run_and_report = report
         if signals:
             sys.exit(128 + signals[0])
 

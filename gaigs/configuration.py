@@ -8,8 +8,10 @@ from pathlib import Path
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
+from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from gaigs.registry import KINDS, check_type, find_holders, suggest
 
@@ -91,6 +93,28 @@ def check(config: dict) -> None:
         raise ValueError(f"seed must be in 0..{2**32 - 1}, got {config['seed']}")
     if config["save_every"] < 0:
         raise ValueError(f"save_every must be at least 0 s, got {config['save_every']}")
+
+
+def explain(error: Exception) -> str:
+    """What is wrong with a command line of which Hydra makes no configuration, in one sentence."""
+    cause = error.__cause__
+    match error, cause:
+        case _, ConfigAttributeError(full_key=str(key)) | ConfigKeyError(full_key=str(key)):
+            has = [str(name) for name in cause.parent_node]
+            place = key.rpartition(".")[0] or "the configuration"
+            word = suggest(key.rpartition(".")[2], has)
+            return f"{place} has no key {word}; it has: {', '.join(sorted(has)) or 'none'}"
+        case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:
+            kind, _, name = file.rpartition("/")
+            return f"{kind} has no file {suggest(name, names)}; it has: {', '.join(names) or 'none'}"
+        case HydraException(), _ if str(error).startswith("gaigs: "):  # of a job, which says itself what is wrong
+            reason = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
+            return f"{str(error).removeprefix('gaigs: ')}{reason}"
+        case HydraException(), _:
+            words = " ".join(f"{error} {cause or ''}".split())
+            return f"Hydra cannot read it: {words}"
+        case _:  # of null, or a number, for a group
+            return f"a word on the command line that chooses a file must be its name ({error}); ~density chooses none"
 
 
 def _flat(config: dict, prefix: str = "") -> dict:

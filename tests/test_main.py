@@ -168,9 +168,20 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["tokenizer.anchor=3"], "Key 'anchor' is not in struct"),  # Hydra's own
-        (["tokenizer=foo"], "Could not find 'tokenizer/foo'"),
-        (["+experiment=foo"], "Available options in 'experiment':\n\tcsi\n\tmirrored"),
+        (
+            ["tokenizer.widht=3"],
+            "gaigs: tokenizer has no key 'widht' (did you mean 'width'?); it has: gaussian_octaves, hidden",
+        ),
+        (
+            ["training.learning_rates.meens=0.1"],
+            "gaigs: training.learning_rates has no key 'meens' (did you mean 'means'?); it has: log_scales, means",
+        ),
+        (["sede=3"], "gaigs: the configuration has no key 'sede' (did you mean 'seed'?); it has: baselines, command"),
+        (["tokenizer=gaa"], "gaigs: tokenizer has no file 'gaa' (did you mean 'ga'?); it has: euclidean, "),
+        (["+experiment=foo"], "gaigs: experiment has no file 'foo'; it has: csi, mirrored, "),
+        (["seed=["], "gaigs: Hydra cannot read it: no viable alternative at input '['"),
+        (["~nothing"], "gaigs: Hydra cannot read it: Could not delete from config. 'nothing' does not exist."),
+        (["density=null"], "gaigs: a word on the command line that chooses a file must be its name (Config group"),
         (["+tokenizer.widht=3"], "gaigs: tokenizer 'euclidean' has no option 'widht' (did you mean 'width'?)"),
         (["+trainer.max_step=3"], "gaigs: trainer has no option 'max_step' (did you mean 'max_steps'?)"),
         (["trainer.accelerator=abacus"], "invalid accelerator name: `accelerator='abacus'`"),
@@ -201,6 +212,13 @@ def test_what_a_user_can_mend_is_told_without_a_traceback(overrides, message, ru
     assert code == 1
     assert message in err
     assert "Traceback" not in err
+
+
+def test_whoever_wants_the_traceback_gets_it_before_the_message(run):
+    code, err = run(*SMALL, *HERE, "tokenizer.width=0", "hydra.verbose=true")
+    assert code == 1
+    assert re.search("Traceback.*\nValueError: (.*)\n.*gaigs: \\1", err, re.DOTALL)
+    assert "HYDRA_FULL_ERROR" not in os.environ
 
 
 @pytest.fixture

@@ -82,7 +82,7 @@ class DensityControl(Callback):
 
     def on_fit_start(self, trainer, module) -> None:
         if module.model.primitives is None:
-            raise ValueError("density needs a model with Gaussians, and this one has none; set density=null")
+            raise ValueError("density needs a model with Gaussians, and this one has none; leave density out")
 
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
         gaussians = module.model.primitives
