@@ -23,7 +23,7 @@ from torch import Tensor, distributed
 from gaigs import checkpoint, evaluation
 from gaigs.configuration import check, differences
 from gaigs.data import Links, load
-from gaigs.files import whole
+from gaigs.files import whole, write_text
 from gaigs.loss import Loss
 from gaigs.model import Model
 from gaigs.processes import STOPPING, Stopped, is_first, only_run
@@ -81,8 +81,7 @@ def run(config: dict, folder: Path) -> dict | None:
             metrics = train_and_test(config, folder)
             if not is_configuration(folder / "config.yaml"):  # the folder was removed, and loggers have made it anew
                 store(config, folder)
-            with whole(finished) as part:
-                part.write_text(json.dumps(metrics, indent=2) + "\n")
+            write_text(finished, json.dumps(metrics, indent=2) + "\n")
     console = Console()
     console.print(metrics_table(metrics))
     console.print(verdict(metrics))
@@ -125,7 +124,7 @@ def store(config: dict, folder: Path) -> None:
 def is_configuration(file: Path) -> bool:
     """Whether a file is the configuration of a run."""
     try:
-        content = yaml.safe_load(file.read_text())
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
         return False
     return isinstance(content, dict) and {"model", "data"} <= content.keys()

@@ -35,6 +35,16 @@ def whole(path: str | Path) -> Iterator[Path]:
         raise (OSError(told) if error.errno is None else OSError(error.errno, told)) from error
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Writes a text file in UTF-8, whole or not at all, as ``whole`` has it.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    with whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
 def sentence(error: OSError, folder: Path) -> str:
     """What a user can do about an error: its own words, or, where it has but those of the system, ours.
 

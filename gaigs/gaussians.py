@@ -11,7 +11,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor, nn
 
 from gaigs.files import whole
-from gaigs.geometry import from_spherical, semi_axes, unit_quaternions
+from gaigs.geometry import FAR, from_spherical, semi_axes, unit_quaternions
 from gaigs.scene import Scene
 
 SH_DC = 0.5 / math.sqrt(math.pi)
@@ -67,8 +67,8 @@ class Gaussians(nn.Module):
         receivers = len(scene.receivers)
         if count < receivers:
             raise ValueError(f"gaussians.count must be at least one a receiver ({receivers}), got {count}")
-        if not 0 < near <= far < math.inf:
-            raise ValueError(f"gaussians.near and far must satisfy 0 < near <= far < inf, got {near} and {far} m")
+        if not 0 < near <= far < FAR:
+            raise ValueError(f"gaussians.near and far must satisfy 0 < near <= far < {FAR:g} m, got {near} and {far}")
         if not 0 < spread < math.inf:
             raise ValueError(f"gaussians.spread must be positive, got {spread}")
         if not 0 < opacity < 1:

@@ -40,8 +40,8 @@ PLAIN = {
 }
 """Annotations that options are checked against: what suits them, and what errors call it. Numbers are no bool."""
 
-LARGEST = {int: 2**63 - 1, float: sys.float_info.max}
-"""Magnitudes beyond which numbers suit no option: torch counts in 64 bits, and what is not finite is no setting."""
+LARGEST = 2**63 - 1
+"""Whole numbers beyond it suit no option: torch takes 64 bits. Other numbers are finite."""
 
 
 @dataclass(frozen=True)
@@ -265,17 +265,17 @@ def check_type(what: str, value: object, annotation: object) -> None:
     words = " or ".join(PLAIN[kind][1] for kind in kinds)
     if isinstance(value, float) and not math.isfinite(value):
         words = words.replace("a number", "a finite number")
-    elif type(value) is int and LARGEST.keys() & kinds:
-        words += f" up to {LARGEST[float if float in kinds else int]:.2g}"
+    elif type(value) is int and {int, float} & set(kinds):
+        words += f" up to {LARGEST:.2g}"
     is_whole = int in kinds and isinstance(value, float) and value.is_integer() and _suits(int(value), int)
     raise TypeError(f"{what} must be {words}, got {value!r}" + (f"; write {int(value)}" if is_whole else ""))
 
 
 def _suits(value: object, kind: type) -> bool:
     """Whether a value is of a type of ``PLAIN``, whatever its entries."""
-    if kind in LARGEST and isinstance(value, numbers.Integral):
-        return not isinstance(value, bool) and abs(int(value)) <= LARGEST[kind]
-    return isinstance(value, PLAIN[kind][0]) and (kind not in LARGEST or math.isfinite(value))
+    if kind in (int, float) and isinstance(value, numbers.Integral):
+        return not isinstance(value, bool) and abs(int(value)) <= LARGEST
+    return isinstance(value, PLAIN[kind][0]) and (kind is not float or math.isfinite(value))
 
 
 def _check_entries(what: str, value: object, kinds: tuple) -> None:

@@ -108,9 +108,10 @@ def test_activations(scene):
     ("options", "message"),
     [
         ({"count": 1}, r"at least one a receiver \(2\), got 1"),
-        ({"near": 0.0}, "0 < near <= far < inf, got 0.0 and 5.0 m"),
+        ({"near": 0.0}, "0 < near <= far < 100000 m, got 0.0 and 5.0"),
         ({"near": 6.0}, "0 < near <= far"),
-        ({"far": math.inf}, "0 < near <= far < inf, got 2.0 and inf m"),
+        ({"far": math.inf}, "0 < near <= far < 100000 m, got 2.0 and inf"),
+        ({"far": 1e30}, "0 < near <= far < 100000 m, got 2.0 and 1e\\+30"),
         ({"spread": 0.0}, "spread must be positive, got 0.0"),
         ({"spread": math.nan}, "spread must be positive, got nan"),
         ({"signal": -1.0}, "signal must be at least 0, got -1.0"),

@@ -234,7 +234,7 @@ def tuned(
         ("count", 10**19, r"a whole number up to 9\.2e\+18, got 10000000000000000000"),
         ("width", math.nan, "a finite number, got nan"),
         ("width", -math.inf, "a finite number, got -inf"),
-        ("width", 10**309, r"a number up to 1\.8e\+308, got 10{309}"),
+        ("width", 10**30, r"a number up to 9\.2e\+18, got 10{30}"),
         ("rate", math.nan, "a finite number or null, got nan"),
         ("tagged", math.nan, "a finite number, got nan"),
         ("root", 3, "a string or a path, got 3"),

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import resource
 import subprocess
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import gaigs
 from gaigs import checkpoint
 from gaigs.files import sentence, whole
 from gaigs.gaussians import write_ply
@@ -112,6 +114,19 @@ def test_a_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
 )
 def test_an_error_of_the_system_becomes_a_sentence_and_others_stay(error, begins):
     assert sentence(error, Path("run")).startswith(begins)
+
+
+def test_nothing_is_written_otherwise():
+    """``part`` is what ``whole`` gives; ``file`` and ``stream`` are opened at such a place."""
+    written = re.compile(r"(\S+)\.write_text\(|np\.savez\w*\(\s*([^,]+),|\.savefig\(([^,)]+)")
+    root = Path(gaigs.__file__).parent
+    places = {
+        (str(file.relative_to(root)), next(filter(None, found.groups())))
+        for file in root.rglob("*.py")
+        for found in written.finditer(file.read_text(encoding="utf-8"))
+    }
+    assert len(places) > 5
+    assert {target for _, target in places} == {"part", "file", "stream"}, places
 
 
 @pytest.fixture

@@ -11,14 +11,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from gaigs.geometry import FAR
+
 SHOWN = 10
 """Defects that an error lists one by one."""
 
 LONGEST = 400
 """Characters of a defect that an error shows."""
-
-FAR = 1e5
-"""No coordinate reaches it [m]: float32 tells places apart by 8 mm there, and by half a metre at UTM's northings."""
 
 NEAR = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
 

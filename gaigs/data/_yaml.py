@@ -7,7 +7,8 @@ from pathlib import Path
 
 import yaml
 
-from gaigs.data._files import FAR, NEAR, read_lines, to_number
+from gaigs.data._files import NEAR, read_lines, to_number
+from gaigs.geometry import FAR
 
 CORE = "tag:yaml.org,2002:"
 """What the tags of YAML's own types begin with; others may stand for anything, as a unit."""

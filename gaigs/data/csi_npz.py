@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from gaigs.data import Links
-from gaigs.data._files import CARRIERS, FAR, NEAR, find_file, number_places, refuse
-from gaigs.geometry import Pose
+from gaigs.data._files import CARRIERS, NEAR, find_file, number_places, refuse
+from gaigs.geometry import FAR, Pose
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Array, Receiver

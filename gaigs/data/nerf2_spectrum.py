@@ -31,6 +31,7 @@ from gaigs.data._files import (
 )
 from gaigs.data._yaml import read_mapping, to_entries, to_position, to_vector
 from gaigs.directions import Grid
+from gaigs.files import whole, write_text
 from gaigs.geometry import Pose
 from gaigs.query import Query
 from gaigs.registry import register
@@ -144,6 +145,7 @@ def write(folder: str | Path, links: Links) -> None:
 
     Raises:
         FileExistsError: There is something in the folder.
+        OSError: A file cannot be written, e.g. as the disk is full.
         ValueError: There is more than one receiver, the labels are not spectra on the format's grid, or there is no
             split.
     """
@@ -161,20 +163,21 @@ def write(folder: str | Path, links: Links) -> None:
     (folder / "spectrum").mkdir(parents=True)
     for k in range(len(links)):
         pixels = (links.labels[torch.tensor([k])][0] * 255).round().byte()
-        Image.fromarray(pixels.numpy()).save(folder / "spectrum" / f"{k + 1:05d}.png")
+        with whole(folder / "spectrum" / f"{k + 1:05d}.png") as part:
+            Image.fromarray(pixels.numpy()).save(part)
     # Nine digits bring the same float32 back.
     rows = ["x,y,z", *(",".join(f"{value:.9g}" for value in row) for row in links.query.transmitters.tolist())]
-    (folder / "tx_pos.csv").write_text("\n".join(rows) + "\n")
+    write_text(folder / "tx_pos.csv", "\n".join(rows) + "\n")
     frequencies = links.query.frequencies
     if frequencies is not None:
-        (folder / FREQUENCIES).write_text("".join(f"{value / 1e9:.9g}\n" for value in frequencies.tolist()))
+        write_text(folder / FREQUENCIES, "".join(f"{value / 1e9:.9g}\n" for value in frequencies.tolist()))
     receiver = links.receivers[0]
     quaternion = Rotation.from_matrix(receiver.pose.rotation.double().numpy()).as_quat()
     pose = {"position": receiver.pose.position.tolist(), "orientation": quaternion.tolist()}
-    (folder / "gateway_info.yml").write_text(yaml.safe_dump({receiver.name: pose}, default_flow_style=None))
+    write_text(folder / "gateway_info.yml", yaml.safe_dump({receiver.name: pose}, default_flow_style=None))
     for name, part in (("train", torch.cat((split.train, split.validation))), ("test", split.test)):
         text = "".join(f"{k + 1:05d}\n" for k in part.tolist())
-        (folder / f"{name}_index.txt").write_text(text)
+        write_text(folder / f"{name}_index.txt", text)
 
 
 def _check_options(elements: Sequence[int] | None, frequency: float | None, bandwidth: float | None) -> None:

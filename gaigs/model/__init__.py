@@ -11,9 +11,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.data._files import FAR, NEAR
+from gaigs.data._files import NEAR
 from gaigs.directions import Directions
 from gaigs.gaussians import Gaussians
+from gaigs.geometry import FAR
 from gaigs.query import Batch, Query
 from gaigs.registry import check_type
 from gaigs.report.shapes import LearntRoom

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from gaigs.data import Links
-from gaigs.files import whole
+from gaigs.files import write_text
 from gaigs.gaussians import write_ply
 from gaigs.placement._words import fold, images
 from gaigs.placement.mirrored import Mirrored
@@ -328,8 +328,7 @@ def export(placement: Mirrored, query: Query, folder: Path) -> None:
         folder: To write into.
     """
     found = survey(placement, query)
-    with whole(folder / "planes.obj") as part:
-        part.write_text(wavefront_obj(placement, found))
+    write_text(folder / "planes.obj", wavefront_obj(placement, found))
     if placement.obstacles is not None:
         save_obstacles(placement, folder / "obstacles.ply")
 

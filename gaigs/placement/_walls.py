@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.data._files import FAR, NEAR, read_lines, refuse
+from gaigs.data._files import NEAR, read_lines, refuse
 from gaigs.data.nerf2_rssi import read_walls
+from gaigs.geometry import FAR
 
 SAME_TURN, SAME_PLACE = 0.02, 0.02
 """Planes are one where their normals differ by less [rad], and their offsets by less [m]."""

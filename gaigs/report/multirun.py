@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
-from gaigs.files import whole
+from gaigs.files import whole, write_text
 from gaigs.report.curves import speed_against_error
 from gaigs.report.runs import Run, Spread, read_runs, train_seconds
 from gaigs.report.style import DPI
@@ -142,8 +142,7 @@ def report(folder: Path) -> Group:
     markdown = f"{_markdown(rows, titles)}\n{caption}\n" + "".join(f"- without a result: {why}\n" for why in failures)
     if groups:
         markdown += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
-    with whole(folder / "ablation.md") as part:
-        part.write_text(markdown)
+    write_text(folder / "ablation.md", markdown)
     if any(run.metrics is not None for run in runs):
         with whole(folder / "speed_against_error.png") as part:
             _speed(runs, rows, shared, titles).savefig(part, dpi=DPI)

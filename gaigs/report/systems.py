@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gaigs.configuration import conf_dir, plugin_conf_dirs
-from gaigs.files import whole
+from gaigs.files import whole, write_text
 from gaigs.registry import registry
 from gaigs.report.curves import learning_curves, read_curves
 from gaigs.report.runs import Run, Spread, as_baseline, train_seconds
@@ -271,8 +271,7 @@ def write_systems(
     markdown = [*(_markdown(rows, table) for table in tables), "\n".join(notes) + "\n"]
     texts = {"systems.md": markdown, "systems.tex": [_tex(rows, table) for table in tables]}
     for name, parts in texts.items():
-        with whole(folder / name) as part:
-            part.write_text("\n".join(parts))
+        write_text(folder / name, "\n".join(parts))
     for name, figure in _figures(done, task, known).items():
         with whole(folder / f"systems_{name}.png") as part:
             figure.savefig(part, dpi=DPI)

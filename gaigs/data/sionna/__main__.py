@@ -8,6 +8,7 @@ import numpy as np
 from gaigs.data import Links, load, nerf2_spectrum
 from gaigs.data.sionna import find_room
 from gaigs.data.sionna.meshes import wavefront_obj
+from gaigs.files import whole, write_text
 
 
 def write_rssi(folder: Path, links: Links) -> None:
@@ -17,21 +18,22 @@ def write_rssi(folder: Path, links: Links) -> None:
         (links.query.transmitters.numpy(), positions[links.query.receivers.numpy()], links.labels.numpy())
     )
     lines = [",".join(f"{value:.9g}" for value in row) for row in numbers]  # nine digits bring the same float32 back
-    (folder / "room.csv").write_text("\n".join(("tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm", *lines)) + "\n")
+    write_text(folder / "room.csv", "\n".join(("tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm", *lines)) + "\n")
 
 
 def write_channels(folder: Path, links: Links) -> None:
     """Channels as the file of arrays that ``csi_npz`` reads."""
     (receiver,) = links.receivers
-    np.savez(
-        folder / "room.npz",
-        tx=links.query.transmitters.numpy(),
-        rx=receiver.pose.position.numpy()[None],
-        rx_index=links.query.receivers.numpy(),
-        frequencies=links.task.frequencies.numpy(),
-        h=links.labels.numpy(),
-        elements=(receiver.array.elements.double() @ receiver.pose.rotation.double().T).numpy(),
-    )
+    with whole(folder / "room.npz") as part:
+        np.savez(
+            part,
+            tx=links.query.transmitters.numpy(),
+            rx=receiver.pose.position.numpy()[None],
+            rx_index=links.query.receivers.numpy(),
+            frequencies=links.task.frequencies.numpy(),
+            h=links.labels.numpy(),
+            elements=(receiver.array.elements.double() @ receiver.pose.rotation.double().T).numpy(),
+        )
 
 
 WRITERS = {
@@ -73,9 +75,9 @@ def main() -> None:
         links = load({"name": name, **options}, {"name": "official", "validation": 0})
         folder.mkdir(parents=True, exist_ok=True)
         write(folder, links)
-    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        write_text(folder / "geometry.obj", wavefront_obj(find_room(options["room"]).meshes()))
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
         parser.error(str(error))
-    (folder / "geometry.obj").write_text(wavefront_obj(find_room(options["room"]).meshes()))
     print(f"{folder}: {len(links.split.train)} training and {len(links.split.test)} test labels")
 
 

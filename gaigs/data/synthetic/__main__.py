@@ -6,6 +6,7 @@ from pathlib import Path
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.data.synthetic import ROOM, wavefront_obj
+from gaigs.files import write_text
 
 
 def main() -> None:
@@ -27,9 +28,9 @@ def main() -> None:
     try:
         links = load({"name": "synthetic", **options}, {"name": "official", "validation": 0})
         write(folder, links)
-    except (ValueError, FileExistsError) as error:
+        write_text(folder / "geometry.obj", wavefront_obj(ROOM))
+    except (ValueError, TypeError, OSError) as error:
         parser.error(str(error))
-    (folder / "geometry.obj").write_text(wavefront_obj(ROOM))
     print(f"{folder}: {len(links.split.train)} training and {len(links.split.test)} test spectra")
 
 
