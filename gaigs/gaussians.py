@@ -14,6 +14,9 @@ from gaigs.files import whole
 from gaigs.geometry import FAR, from_spherical, semi_axes, unit_quaternions
 from gaigs.scene import Scene
 
+LARGEST = 1e6
+"""Of a Gaussian's spread and signal at the start: float32 holds squares and sums of them."""
+
 SH_DC = 0.5 / math.sqrt(math.pi)
 """The constant spherical harmonic, by which .ply viewers multiply the first signal coefficient."""
 
@@ -69,12 +72,12 @@ class Gaussians(nn.Module):
             raise ValueError(f"gaussians.count must be at least one a receiver ({receivers}), got {count}")
         if not 0 < near <= far < FAR:
             raise ValueError(f"gaussians.near and far must satisfy 0 < near <= far < {FAR:g} m, got {near} and {far}")
-        if not 0 < spread < math.inf:
-            raise ValueError(f"gaussians.spread must be positive, got {spread}")
+        if not 0 < spread <= LARGEST:
+            raise ValueError(f"gaussians.spread must be positive and at most {LARGEST:g}, got {spread}")
         if not 0 < opacity < 1:
             raise ValueError(f"gaussians.opacity must lie between 0 and 1, got {opacity}")
-        if not 0 <= signal < math.inf:
-            raise ValueError(f"gaussians.signal must be at least 0, got {signal}")
+        if not 0 <= signal <= LARGEST:
+            raise ValueError(f"gaussians.signal must be at least 0 and at most {LARGEST:g}, got {signal}")
         if not degree >= 0:
             raise ValueError(f"gaussians.degree must be at least 0, got {degree}")
         self.degree = degree

@@ -16,7 +16,7 @@ from gaigs.directions import Directions
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import FAR
 from gaigs.query import Batch, Query
-from gaigs.registry import check_type
+from gaigs.registry import check_type, registry
 from gaigs.report.shapes import LearntRoom
 from gaigs.scene import Scene
 
@@ -301,3 +301,14 @@ def as_numbers(what: str, values: object, expected: str) -> Tensor:
     except (TypeError, ValueError, RuntimeError, OverflowError):  # whatever torch meets in words, or in ragged lists
         raise ValueError(f"{what} must be {expected} in real numbers, got {reprlib.repr(values)}") from None
     return tensor.to(torch.float32)
+
+
+def build_trend(config: dict, scene: Scene) -> Model:
+    """The model that a trend's configuration names.
+
+    Raises:
+        ValueError: It names none, or that model cannot be made so.
+    """
+    if "name" not in config:
+        raise ValueError(f"model.trend must have the name of a model, such as mean, got {config}")
+    return registry("model").build(config, scene=scene)

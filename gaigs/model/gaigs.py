@@ -13,7 +13,7 @@ from gaigs.deformation import Residuals
 from gaigs.directions import Directions
 from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.geometry import semi_axes, spherical_harmonics
-from gaigs.model import Model, Prediction
+from gaigs.model import Model, Prediction, build_trend
 from gaigs.placement import Placed
 from gaigs.projection import Splats
 from gaigs.propagation import carriers
@@ -60,7 +60,7 @@ class GaussianSplatting(Model):
         super().__init__(scene)
         self.trend = None
         if trend is not None:
-            self.trend = registry("model").build(trend, scene=scene)
+            self.trend = build_trend(trend, scene)
             if not self.trend.state_dict() or [*self.trend.parameters()]:
                 kind = "needs its data" if not self.trend.state_dict() else "has to be trained itself"
                 raise ValueError(
@@ -153,6 +153,11 @@ class GaussianSplatting(Model):
         return self.trend is not None
 
     def forward(self, batch: Batch) -> Prediction:
+        own = next(self.parameters())
+        if torch.is_autocast_enabled(own.device.type) or torch.finfo(own.dtype).bits < 32:
+            raise ValueError(
+                "angles and phases of Gaussians need the digits of float32; set trainer.precision to 32-true or 64-true"
+            )
         query = batch.query
         # What a place excites is the same for all who hear it, unless a part looks at the receiver.
         places, which = query.unique(with_receivers=self._sees_receivers)

@@ -8,11 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.model import Model, Prediction
+from gaigs.model import Model, Prediction, build_trend
 from gaigs.model._known import at_directions, coordinates, distances, known_links
 from gaigs.model._process import LIMIT, PART, Hyperparameters, likeliest, numbers_of, weigh
 from gaigs.query import Batch, Query
-from gaigs.registry import register, registry
+from gaigs.registry import register
 from gaigs.scene import Scene
 
 NEIGHBOURS = 300
@@ -51,7 +51,7 @@ class GaussianProcess(Model):
 
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
-        built = registry("model").build({"name": "mean"} if trend is None else trend, scene=scene)
+        built = build_trend({"name": "mean"} if trend is None else trend, scene)
         if any(True for _ in built.parameters()):
             raise ValueError(
                 f"model.trend must be a model that is fitted at once, and {trend['name']} is trained; take mean, "

@@ -10,7 +10,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.model import Prediction, _learnt_room
+from gaigs.model import _learnt_room
 from gaigs.model._plane_search import fewer, find_planes
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.propagation import carriers
@@ -92,19 +92,6 @@ class Mirrored(GaussianSplatting):
     def _adds_waves(self) -> bool:
         """Whether labels take the sum of waves, so that powers alone tell nothing and phases count from the start."""
         return self.draws_map or self.pooling.takes == "fields"
-
-    def forward(self, batch: Batch) -> Prediction:
-        """As the pipeline's.
-
-        Raises:
-            ValueError: In half precision, which would lose the phases.
-        """
-        offsets = self.placement.offsets
-        if torch.is_autocast_enabled(offsets.device.type) or torch.finfo(offsets.dtype).bits < 32:
-            raise ValueError(
-                "model 'mirrored' counts wavelengths along paths; set trainer.precision to 32-true or 64-true"
-            )
-        return super().forward(batch)
 
     # --- what a run reports of it ---
 

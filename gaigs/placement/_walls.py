@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.data._files import NEAR, read_lines, refuse
+from gaigs.data._files import refuse
+from gaigs.data._meshes import read_obj
 from gaigs.data.nerf2_rssi import read_walls
-from gaigs.geometry import FAR
 
 SAME_TURN, SAME_PLACE = 0.02, 0.02
 """Planes are one where their normals differ by less [rad], and their offsets by less [m]."""
@@ -55,28 +55,12 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
 
 def _faces(file: Path) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f"]]:
     """Normals, a point and area of each triangle of a mesh."""
-    vertices, triangles, defects = [], [], []
-    lines = read_lines(file, "a mesh of 'v x y z' and 'f i j k'", defects)
-    refuse(file.parent, defects)
-    for number, line in enumerate(lines, 1):
-        word, *rest = line.split("#")[0].split() or [""]
-        try:
-            if word == "v":
-                vertices.append([float(value) for value in rest[:3]])
-            elif word == "f":
-                corners = [int(value.split("/")[0]) for value in rest]
-                corners = [k - 1 if k > 0 else len(vertices) + k for k in corners]  # negative ones count from the end
-                triangles += [(corners[0], *pair) for pair in itertools.pairwise(corners[1:])]
-        except ValueError as error:
-            raise ValueError(f"{file}, line {number}, must hold numbers, got {line.strip()!r}") from error
-    count = len(vertices)
-    if any(len(vertex) < 3 for vertex in vertices) or any(not 0 <= k < count for face in triangles for k in face):
-        raise ValueError(f"{file} must hold faces of vertices x y z, and a face or a vertex lacks some")
-    if not all(abs(value) < FAR for vertex in vertices for value in vertex):
-        raise ValueError(f"{file} must hold {NEAR}, and a vertex is farther away or none")
+    vertices, groups = read_obj(file)
+    faces = itertools.chain(*groups.values())
+    triangles = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
     if not triangles:
         return torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0)
-    corners = torch.tensor(vertices)[torch.tensor(triangles)]
+    corners = torch.from_numpy(vertices).float()[torch.tensor(triangles)]
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = normals.norm(dim=1) / 2
     large = areas > SHORTEST**2

@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
-from gaigs.files import whole
+from gaigs.files import whole, write_text
 from gaigs.report.style import COLUMN, DPI, LINES, STYLE
 
 
@@ -79,8 +79,7 @@ def write(
     drawn = [f"of a cell with more, {max(compared):,} random pairs are compared"] if compared else []
     remarks = [*remarks, *drawn]
     parts.append("\n".join(f"- {remark}" for remark in remarks))
-    with whole(folder / "agreement.md") as part:
-        part.write_text("\n\n".join(parts) + "\n")
+    write_text(folder / "agreement.md", "\n\n".join(parts) + "\n")
     _write_csv(folder / "agreement.csv", cells)
     with whole(folder / "agreement.png") as part:
         figure(score, cells).savefig(part, dpi=DPI)

@@ -21,6 +21,9 @@ NOISY_OCTAVE = -4
 the next one is, and features of 16 m leave it to the network how sharp a wall's shadow is; chosen by leaving out one of
 the robot's training runs in ble-flat."""
 
+FINEST = 30
+"""No octave is beyond it, up or down: float32 tells no places apart in waves of a nanometre, or of a million km."""
+
 BAND_FREQUENCIES = math.pi * 2.0 ** torch.arange(-1, 3)
 """Angular frequencies of the features of the carrier, over its position in the band, -1 to 1: periods from twice the
 band down to a quarter of it."""
@@ -42,7 +45,7 @@ class EuclideanTokenizer(nn.Module):
         width: Width of E(P_TX). With None for both there is no network, and E(P_TX) are the features themselves.
 
     Raises:
-        ValueError: A range of octaves is empty, a width is out of range, or one of the two is None alone.
+        ValueError: A range of octaves is empty or too wide, a width is out of range, or one of the two is None alone.
 
     Source: GAI-GS, "Multi-view Tokenizer"; Tancik et al., Fourier Features, 2020.
     """
@@ -69,9 +72,9 @@ class EuclideanTokenizer(nn.Module):
         self.scene = scene
         self.register_buffer("receivers_middle", scene.positions(scene.lower).mean(0))
         self.register_buffer("transmitters_middle", (scene.lower + scene.upper) / 2)
-        self.register_buffer("gaussian_frequencies", octaves("gaussian_octaves", *gaussian_octaves))
+        self.register_buffer("gaussian_frequencies", octaves("tokenizer.gaussian_octaves", *gaussian_octaves))
         transmitter_octaves = transmitter_octaves or learnable_octaves(scene)
-        self.register_buffer("transmitter_frequencies", octaves("transmitter_octaves", *transmitter_octaves))
+        self.register_buffer("transmitter_frequencies", octaves("tokenizer.transmitter_octaves", *transmitter_octaves))
         self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
         features = 3 * (1 + 2 * len(self.transmitter_frequencies))
         if scene.has_band:
@@ -100,7 +103,7 @@ def learnable_octaves(scene: Scene) -> tuple[int, int]:
     more than ``NOISY_OCTAVE``.
     """
     edge = (scene.upper - scene.lower).max().item()
-    highest = round(-math.log2(PERIOD * scene.spacing))
+    highest = min(round(-math.log2(PERIOD * scene.spacing)), FINEST)
     if scene.task.is_noisy:
         highest = min(highest, NOISY_OCTAVE)
     return min(highest, math.floor(-math.log2(2 * edge))), highest
@@ -110,10 +113,10 @@ def octaves(option: str, lowest: int, highest: int) -> Float[Tensor, "octaves"]:
     """Angular frequencies 2 pi 2^k [rad/m] for k from lowest to highest.
 
     Raises:
-        ValueError: The range is empty.
+        ValueError: The range is empty, or goes beyond ``FINEST``.
     """
-    if lowest > highest:
-        raise ValueError(f"tokenizer option {option} must be [lowest, highest], got [{lowest}, {highest}]")
+    if not -FINEST <= lowest <= highest <= FINEST:
+        raise ValueError(f"{option} must be [lowest, highest] within {-FINEST}..{FINEST}, got [{lowest}, {highest}]")
     return 2 * math.pi * 2.0 ** torch.arange(lowest, highest + 1)
 
 

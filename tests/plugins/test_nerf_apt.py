@@ -210,7 +210,8 @@ def test_a_run_from_start_to_end(task, tmp_path, monkeypatch):
         ({"rays": [8]}, r"model.rays must be \[rows, columns\], got \[8\]"),
         ({"widths": [4, 4]}, r"model.widths must be three numbers of at least 2, got \[4, 4\]"),
         ({"widths": [1, 4, 4]}, "three numbers of at least 2"),
-        ({"octaves": -1}, "model.octaves must be at least 0, got -1"),
+        ({"octaves": -1}, "model.octaves must be at least 0 and at most 30, got -1"),
+        ({"octaves": 200}, "model.octaves must be at least 0 and at most 30, got 200"),
     ],
 )
 def test_options_out_of_range(changes, message):

@@ -437,8 +437,8 @@ def test_the_discriminator_takes_labels_however_thin(stride):
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("mlp", {"octaves": [2, 1]}, r"model\.octaves must be \[lowest, highest\], got \[2, 1\]"),
-        ("mlp", {"pixel": 0.0}, r"model\.pixel must be positive and finite \[deg\], got 0\.0"),
+        ("mlp", {"octaves": [2, 1]}, r"model\.octaves must be \[lowest, highest\] within -30..30, got \[2, 1\]"),
+        ("mlp", {"pixel": 0.0}, r"model\.pixel must be above 0 and at most 90 \[deg\], got 0\.0"),
         ("mlp", {"widths": []}, r"model\.widths must be of at least 1, got \[\]"),
         ("mlp", {"dropout": 1.0}, r"model\.dropout must be in \[0, 1\), got 1\.0"),
         ("fire", {"widths": [4, 0, 4]}, r"model\.widths must be of at least 1"),
@@ -509,3 +509,13 @@ def test_a_run(name, task, tmp_path, monkeypatch):
         frequency = model.scene.frequencies[:1].expand(len(query)) if len(model.scene.frequencies) else None
         again = model.predict(replace(query, frequencies=frequency)).numpy()
         np.testing.assert_allclose(run["prediction"], again, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["mlp", "fire", "dcgan", "wrf_kan"])
+def test_channels_take_half_the_digits(name):
+    """``trainer.precision=bf16-mixed``: complex numbers are made of float32."""
+    links, model = LINKS["csi"], fitted(name, "csi")
+    with torch.autocast("cpu", torch.bfloat16):
+        value = model(links.batch(links.split.train)).value
+    assert value.dtype == torch.complex64
+    assert torch.view_as_real(value).isfinite().all()

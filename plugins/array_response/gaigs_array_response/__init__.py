@@ -12,6 +12,7 @@ from gaigs.model import Model, Prediction
 from gaigs.query import Batch
 from gaigs.scene import Scene
 from gaigs.tokenizer.euclidean import fourier_features, learnable_octaves
+from gaigs.tokenizer.euclidean import octaves as angular_frequencies
 
 
 class ArrayResponse(Model):
@@ -59,15 +60,18 @@ class ArrayResponse(Model):
             )
         if rows < 1 or columns < 1 or rows * columns < 2:
             raise ValueError(f"an array must have at least 2 elements, got model.rows={rows}, model.columns={columns}")
-        lowest, highest = octaves or learnable_octaves(scene)
-        if lowest > highest:
-            raise ValueError(f"model.octaves must be [lowest, highest], got {[lowest, highest]}")
+        if not 0 < pitch < math.inf:
+            raise ValueError(f"model.pitch must be positive [wavelengths], got {pitch}")
+        for option, count, least in (("width", width, 1), ("layers", layers, 0)):
+            if count < least:
+                raise ValueError(f"model.{option} must be at least {least}, got {count}")
+        frequencies = angular_frequencies("model.octaves", *(octaves or learnable_octaves(scene)))
         x = pitch * (torch.arange(columns) - (columns - 1) / 2)
         y = pitch * (torch.arange(rows) - (rows - 1) / 2)
         self.register_buffer("elements", torch.cartesian_prod(x, y), persistent=False)
         self.register_buffer("steering", self.steer(scene.task.directions), persistent=False)
         self.register_buffer("middle", (scene.lower + scene.upper) / 2)
-        self.register_buffer("frequencies", 2 * math.pi * 2.0 ** torch.arange(lowest, highest + 1))
+        self.register_buffer("frequencies", frequencies)
         self.fields = (len(scene.receivers), 2 * len(self.elements))
         widths = [3 * (1 + 2 * len(self.frequencies)), *[width] * layers]
         hidden = [layer for sizes in pairwise(widths) for layer in (nn.Linear(*sizes), nn.GELU())]
@@ -96,4 +100,5 @@ class ArrayResponse(Model):
 
 def magnitudes(parts: Float[Tensor, "b 2 pixels"]) -> Float[Tensor, "b pixels"]:
     """Of real and imaginary parts, with the gradient 0 at 0; ``norm(dim=1)`` takes ten times as long on a CPU."""
-    return torch.complex(*parts.unbind(1)).abs()
+    # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
+    return torch.complex(*parts.to(torch.promote_types(parts.dtype, torch.float32)).unbind(1)).abs()

@@ -73,7 +73,7 @@ class ComplexGaussians(Gaussians):
         if len(means) < len(scene.receivers):
             raise ValueError(
                 f"the grid of Gaussians must have a point for each of the {len(scene.receivers)} receivers, got "
-                f"{len(means)} that are heard; raise model.count"
+                f"{len(means)} that are heard; raise model.count, or lower model.pitch or model.margin"
             )
         options = {"near": 1.0, "far": 1.0, "spread": 1.0, "opacity": opacity, "signal": signal, "degree": degree}
         super().__init__(scene, zone, channels, len(means), **options)

@@ -10,7 +10,7 @@ from torch.nn.functional import leaky_relu, linear, relu
 from gaigs.query import Query
 from gaigs.scene import Scene
 from gaigs.tokenizer.euclidean import fourier_features
-from gaigs_nerf2.marching import RayMarching, Samples, render
+from gaigs_nerf2.marching import RayMarching, Samples, check_octaves, render
 
 __all__ = ["Nerf2", "RayMarching", "Samples", "amplitudes_and_phases", "render"]
 
@@ -44,9 +44,10 @@ class Nerf2(RayMarching):
         layers: int,
     ):
         super().__init__(scene, samples, far, rays, frequency)
-        for option, value, least in (("octaves", octaves, 0), ("width", width, 2), ("layers", layers, 2)):
+        for option, value, least in (("width", width, 2), ("layers", layers, 2)):
             if value < least:
                 raise ValueError(f"model.{option} must be at least {least}, got {value}")
+        check_octaves(octaves)
         self.register_buffer("frequencies", 2.0 ** torch.arange(octaves), persistent=False)
         features = 3 * (1 + 2 * octaves)
         self.joint = layers // 2

@@ -14,6 +14,7 @@ from gaigs.directions import Rays
 from gaigs.model import Model, Prediction
 from gaigs.query import Batch, Query
 from gaigs.scene import Scene
+from gaigs.tokenizer.euclidean import FINEST
 from gaigs_nerf2.readings import make_reading
 
 CALIBRATION = 16, 200
@@ -55,6 +56,16 @@ def render(
     strengths = (gains * (-passed).exp())[None, ..., None] * samples.amplitudes
     phases = samples.phases + (turned[..., None] + shifts)
     return torch.complex((strengths * phases.cos()).sum(2), (strengths * phases.sin()).sum(2))
+
+
+def check_octaves(octaves: int) -> None:
+    """Sees to it that float32 holds the features sin 2^k x for all k below ``octaves``.
+
+    Raises:
+        ValueError: It does not.
+    """
+    if not 0 <= octaves <= FINEST:
+        raise ValueError(f"model.octaves must be at least 0 and at most {FINEST}, got {octaves}")
 
 
 class RayMarching(Model):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import torch
 from gaigs_nerf2 import RayMarching, Samples, amplitudes_and_phases
+from gaigs_nerf2.marching import check_octaves
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
@@ -56,8 +57,7 @@ class NerfApt(RayMarching):
             )
         if len(widths) != 3 or min(widths) < 2:
             raise ValueError(f"model.widths must be three numbers of at least 2, got {widths}")
-        if octaves < 0:
-            raise ValueError(f"model.octaves must be at least 0, got {octaves}")
+        check_octaves(octaves)
         if self.grid is None:
             self.grid = around(scene.task.directions, *rays)
         self.register_buffer("frequencies", 2.0 ** torch.arange(octaves), persistent=False)

@@ -10,6 +10,9 @@ from gaigs.data import Links
 from gaigs.directions import Directions, Grid
 from gaigs.scene import Scene
 
+LARGEST = 90.0
+"""No pixel is larger [deg]: at least two rows are left of the sphere's upper half."""
+
 PART = 256
 """Labels held in memory at a time: a spectrum takes 130 KB."""
 
@@ -35,13 +38,13 @@ class LabelImage(nn.Module):
         grid: Directions of the pixels; None where a label has none.
 
     Raises:
-        ValueError: ``pixel`` is not positive.
+        ValueError: ``pixel`` is not positive, or larger than ``LARGEST``.
     """
 
     def __init__(self, scene: Scene, pixel: float):
         super().__init__()
-        if not 0 < pixel < math.inf:
-            raise ValueError(f"model.pixel must be positive and finite [deg], got {pixel}")
+        if not 0 < pixel <= LARGEST:
+            raise ValueError(f"model.pixel must be above 0 and at most {LARGEST:g} [deg], got {pixel}")
         self.task, self.grid = scene.task, None
         shape = scene.task.shape
         rows, columns = (shape[0], math.prod(shape[1:])) if len(shape) > 1 else (1, math.prod(shape))
@@ -69,7 +72,8 @@ class LabelImage(nn.Module):
 
     def values(self, images: Float[Tensor, "b channels rows columns"], directions: Directions | None) -> Tensor:
         """The labels that images stand for (b, *shape), of spectra in the directions asked for; None: the label's."""
-        images = images * self.scale + self.mean
+        # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
+        images = images.to(torch.promote_types(images.dtype, torch.float32)) * self.scale + self.mean
         if self.grid is not None:
             return interpolate(images[:, 0], self.grid, directions or self.task.directions)
         numbers = torch.complex(*images.unbind(1)) if self.task.dtype.is_complex else images

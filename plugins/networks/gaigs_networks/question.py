@@ -1,7 +1,5 @@
 """What the networks are told of a link."""
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -10,6 +8,7 @@ from torch.nn.functional import one_hot
 from gaigs.query import Query
 from gaigs.scene import Scene
 from gaigs.tokenizer.euclidean import BAND_FREQUENCIES, fourier_features, learnable_octaves
+from gaigs.tokenizer.euclidean import octaves as angular_frequencies
 
 
 class Question(nn.Module):
@@ -34,14 +33,12 @@ class Question(nn.Module):
 
     def __init__(self, scene: Scene, octaves: tuple[int, int] | None):
         super().__init__()
-        lowest, highest = octaves or learnable_octaves(scene)
-        if lowest > highest:
-            raise ValueError(f"model.octaves must be [lowest, highest], got {[lowest, highest]}")
+        frequencies = angular_frequencies("model.octaves", *(octaves or learnable_octaves(scene)))
         self.scene = scene
         self.register_buffer("middle", (scene.lower + scene.upper) / 2)
         self.register_buffer("half_edge", (scene.upper - scene.lower).max() / 2)
         # In radians per half an edge.
-        self.register_buffer("frequencies", self.half_edge * 2 * math.pi * 2.0 ** torch.arange(lowest, highest + 1))
+        self.register_buffer("frequencies", self.half_edge * frequencies)
         self.width = 3 * (1 + 2 * len(self.frequencies))
         if len(scene.receivers) > 1:
             self.width += len(scene.receivers)

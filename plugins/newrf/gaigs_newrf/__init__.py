@@ -10,7 +10,7 @@ from gaigs.model import Model, Prediction
 from gaigs.propagation import array_sign, check_elements, direct_waves, free_space, phase_sign
 from gaigs.query import Batch
 from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import fourier_features
+from gaigs.tokenizer.euclidean import FINEST, fourier_features
 from gaigs_newrf.arrivals import find_origins
 
 MARGIN = 0.5
@@ -82,7 +82,9 @@ class Field(nn.Module):
         for number, layer in enumerate(self.layers):
             joined = number == self.joint
             hidden = layer(torch.cat((places, hidden), -1) if joined else hidden).relu()
-        real, imaginary = self.send(torch.cat((hidden, views), -1)).tanh().chunk(2, -1)
+        sent = self.send(torch.cat((hidden, views), -1))
+        # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
+        real, imaginary = sent.to(torch.promote_types(sent.dtype, torch.float32)).tanh().chunk(2, -1)
         return softplus(self.density(hidden)[..., 0]), torch.complex(real, imaginary)
 
 
@@ -132,6 +134,8 @@ class NeWrf(Model):
         for (option, low), value in zip(least.items(), given, strict=True):
             if value < low:
                 raise ValueError(f"model.{option} must be at least {low}, got {value}")
+            if option.endswith("octaves") and value > FINEST:
+                raise ValueError(f"model.{option} must be at most {FINEST}, got {value}")
         lower, upper = scene.lower, scene.upper
         self.register_buffer("middle", (lower + upper) / 2)
         self.register_buffer("steps", (torch.arange(samples) + 1) / samples, persistent=False)

@@ -6,9 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
 
 from gaigs.data import synthetic
+from gaigs.data._meshes import NO_NAME, parse_obj, read_ply
+from gaigs.data._meshes import read_obj as read_mesh
 from gaigs.data.sionna import ROOMS, tracing
 from gaigs.data.sionna.meshes import THICKNESS, Mesh
 
@@ -25,9 +26,6 @@ FURNITURE = {
     "column": "concrete",
 }
 """What the built-in room's furniture is taken for. The simulation knows how much each piece dims, and no material."""
-
-UNNAMED = "unnamed"
-"""Name of a material that the file has none for."""
 
 SUFFIXES = (".obj", ".ply", ".xml")
 
@@ -94,7 +92,9 @@ def _read(file: Path) -> list[Mesh]:
         raise FileNotFoundError(f"no mesh at {file}; set model.mesh to a file of surfaces, or to null")
     match file.suffix:
         case ".obj":
-            meshes = read_obj(file.read_text(), str(file))
+            points, groups = read_mesh(file)
+            vertices = points.tolist()
+            meshes = [_mesh(*names, vertices, faces) for names, faces in groups.items()]
         case ".ply":
             meshes = _read_ply(file)
         case _:
@@ -114,42 +114,14 @@ def read_obj(text: str, source: str) -> list[Mesh]:
     Raises:
         ValueError: A line holds no numbers where it must, or a face takes vertices that there are not.
     """
-    vertices: list[tuple[float, float, float]] = []
-    groups: dict[tuple[str, str], list[tuple[int, ...]]] = {}
-    name, material = "mesh", UNNAMED
-    for number, line in enumerate(text.splitlines(), 1):
-        word, *rest = line.split("#")[0].split() or [""]
-        try:
-            match word:
-                case "o" | "g":
-                    name = " ".join(rest) or "mesh"
-                case "usemtl":
-                    material = " ".join(rest) or UNNAMED
-                case "v":
-                    x, y, z = map(float, rest[:3])
-                    vertices.append((x, y, z))
-                case "f":
-                    corners = [int(part.split("/")[0]) for part in rest]
-                    # Negative ones count from the end.
-                    face = tuple(k - 1 if k > 0 else len(vertices) + k for k in corners)
-                    if len(face) < 3 or not all(0 <= k < len(vertices) for k in face):
-                        raise ValueError("a face takes three vertices or more, of those before it")
-                    groups.setdefault((name, material), []).append(face)
-        except ValueError as error:
-            raise ValueError(f"{source}, line {number}, must hold numbers, got {line.strip()!r}: {error}") from error
-    return [_mesh(name, material, vertices, faces) for (name, material), faces in groups.items()]
+    vertices, groups = parse_obj(text.splitlines(), source)
+    return [_mesh(name, material, vertices.tolist(), faces) for (name, material), faces in groups.items()]
 
 
 def _read_ply(file: Path) -> list[Mesh]:
-    try:
-        content = PlyData.read(file)
-        corners, faces = content["vertex"], content["face"]
-        vertices = np.column_stack([corners[axis] for axis in "xyz"]).astype(float).tolist()
-        names = {part.name for part in faces.properties} & {"vertex_indices", "vertex_index"}
-        indices = [tuple(map(int, face)) for face in faces[names.pop()]]
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise ValueError(f"{file} must be a .ply of vertices x, y, z and faces, and is not ({error})") from error
-    return [_mesh(file.stem, UNNAMED, vertices, indices)] if indices else []
+    vertices, faces = read_ply(file)
+    corners = np.stack([vertices[axis] for axis in "xyz"], -1).tolist()
+    return [_mesh(file.stem, NO_NAME[1], corners, faces)] if faces else []
 
 
 def _read_scene(file: Path) -> list[Mesh]:

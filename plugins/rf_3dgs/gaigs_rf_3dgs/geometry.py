@@ -1,15 +1,18 @@
 """A room's geometry from a file: points, a mesh or splats."""
 
 import itertools
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from plyfile import PlyData, PlyParseError
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+from gaigs.data._files import read_points, refuse
+from gaigs.data._meshes import read_obj, read_ply
 
 NEIGHBOURS = 3
 """A Gaussian at a bare point is as wide as these are away, in root mean square, as 3-D Gaussian splatting starts."""
@@ -92,61 +95,26 @@ def _sample(corners: np.ndarray, count: int) -> np.ndarray:
 
 
 def _read_csv(file: Path) -> tuple[np.ndarray, np.ndarray, dict]:
-    lines = file.read_text(encoding="utf-8-sig").splitlines()
-    heading = bool(lines) and [cell.strip().lower() for cell in lines[0].split(",")] == ["x", "y", "z"]
-    rows = [line for line in lines[heading:] if line.strip()]
-    try:
-        points = np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.zeros((0, 3))
-    except ValueError as error:
-        raise ValueError(f"{file} must hold x,y,z in each line [m]: {error}") from error
-    if points.shape[1] != 3:
-        raise ValueError(f"{file} must hold x,y,z in each line [m], got {points.shape[1]} columns")
-    return points, np.zeros((0, 3), int), {}
+    defects: list[str] = []
+    points = read_points(file, "xyz", "x,y,z in each line [m]", defects)
+    refuse(file.parent, defects)
+    return np.array(points).reshape(-1, 3), _triangles(()), {}
 
 
 def _read_obj(file: Path) -> tuple[np.ndarray, np.ndarray, dict]:
-    vertices, faces = [], []
-    for number, line in enumerate(file.read_text().splitlines(), 1):
-        word, *rest = line.split("#")[0].split() or [""]
-        try:
-            if word == "v":
-                x, y, z, *_ = map(float, rest)
-                vertices.append((x, y, z))
-            elif word == "f":
-                corners = [int(value.split("/")[0]) for value in rest]
-                # They count from 1, or back from the last vertex so far.
-                faces.append([k - 1 if k > 0 else len(vertices) + k for k in corners])
-        except ValueError as error:
-            raise ValueError(f"{file}, line {number}, must hold numbers, got {line.strip()!r}") from error
-    return np.array(vertices).reshape(-1, 3), _triangles(file, faces, len(vertices)), {}
+    points, groups = read_obj(file)
+    return points, _triangles(itertools.chain(*groups.values())), {}
 
 
 def _read_ply(file: Path) -> tuple[np.ndarray, np.ndarray, dict]:
-    try:
-        content = PlyData.read(str(file))
-        vertices = content["vertex"].data
-        points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(float)
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise ValueError(f"{file} must be a whole .ply file of vertices x, y, z: {error}") from error
-    if all(column in vertices.dtype.names for columns in SPLATS.values() for column in columns):
-        columns = SPLATS.items()
-        return (
-            points,
-            np.zeros((0, 3), int),
-            {name: np.stack([vertices[column] for column in own], -1).astype(float) for name, own in columns},
-        )
-    faces = []
-    if "face" in content:
-        names = content["face"].data.dtype.names
-        key = next((name for name in ("vertex_indices", "vertex_index") if name in names), None)
-        faces = [] if key is None else content["face"].data[key]
-    return points, _triangles(file, faces, len(points)), {}
+    vertices, faces = read_ply(file)
+    columns = lambda names: np.stack([vertices[name] for name in names], -1)
+    if all(column in vertices.dtype.names for own in SPLATS.values() for column in own):
+        return columns("xyz"), _triangles(()), {name: columns(own) for name, own in SPLATS.items()}
+    return columns("xyz"), _triangles(faces), {}
 
 
-def _triangles(file: Path, faces, vertices: int) -> np.ndarray:
+def _triangles(faces: Iterable[tuple[int, ...]]) -> np.ndarray:
     """Triangles (f, 3) of polygons, as fans."""
-    fans = [(int(face[0]), int(a), int(b)) for face in faces for a, b in itertools.pairwise(face[1:])]
-    triangles = np.array(fans, int).reshape(-1, 3)
-    if triangles.size and not (triangles.min() >= 0 and triangles.max() < vertices):
-        raise ValueError(f"{file} must hold faces of its {vertices} vertices, and a face names another")
-    return triangles
+    fans = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
+    return np.array(fans, int).reshape(-1, 3)

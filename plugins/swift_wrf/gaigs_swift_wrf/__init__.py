@@ -15,6 +15,7 @@ from gaigs.query import Batch, Query
 from gaigs.scene import Scene
 from gaigs.tokenizer import Tokens
 from gaigs.tokenizer.euclidean import BAND_FREQUENCIES, fourier_features, learnable_octaves
+from gaigs.tokenizer.euclidean import octaves as angular_frequencies
 from gaigs_swift_wrf.plane import PlaneGaussians, add_up
 
 PLANE_FREQUENCIES = 2.0 ** torch.arange(5)
@@ -63,13 +64,11 @@ class SwiftWrf(Model):
         for option, number in (("count", count), ("width", width), ("layers", layers)):
             if number < 1:
                 raise ValueError(f"model.{option} must be at least 1, got {number}")
-        lowest, highest = octaves or learnable_octaves(scene)
-        if lowest > highest:
-            raise ValueError(f"model.octaves must be [lowest, highest], got {[lowest, highest]}")
+        frequencies = angular_frequencies("model.octaves", *(octaves or learnable_octaves(scene)))
         self.pixel_variance = grid.pitch**2 / 12
         self.chunk = max(1, LARGEST // count)
         self.register_buffer("middle", (scene.lower + scene.upper) / 2)
-        self.register_buffer("frequencies", 2 * math.pi * 2.0 ** torch.arange(lowest, highest + 1))
+        self.register_buffer("frequencies", frequencies)
 
         low, high = grid.elevations.min().item(), grid.elevations.max().item()
         azimuths, elevations, _ = to_spherical(fibonacci_lattice(count, low, high))

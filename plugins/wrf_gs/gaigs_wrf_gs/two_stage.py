@@ -14,7 +14,7 @@ from gaigs.projection import NEAR
 from gaigs.query import Query
 from gaigs.scene import Scene
 from gaigs.tokenizer import Tokens
-from gaigs.tokenizer.euclidean import fourier_features
+from gaigs.tokenizer.euclidean import FINEST, fourier_features
 
 
 class TwoStage(Deformation):
@@ -55,6 +55,8 @@ class TwoStage(Deformation):
         for option, count, least in (("width", width, 2), ("layers", layers, 2), ("view_octaves", view_octaves, 0)):
             if count < least:
                 raise ValueError(f"deformation.{option} must be at least {least}, got {count}")
+        if view_octaves > FINEST:
+            raise ValueError(f"deformation.view_octaves must be at most {FINEST}, got {view_octaves}")
         self.scene = scene
         links, gaussians, transmitters = tokenizer_widths
         matter = 0, gaussians, 0
