@@ -80,7 +80,7 @@ def test_a_checkpoint_brings_the_middles_along(scene):
 
 
 def test_an_empty_range_of_octaves_is_refused(scene):
-    with pytest.raises(ValueError, match=r"transmitter_octaves must be \[lowest, highest\], got \[3, 2\]"):
+    with pytest.raises(ValueError, match=r"octaves must be \[lowest, highest\] within -30..30, got \[3, 2\]"):
         EuclideanTokenizer(scene, **(OPTIONS | {"transmitter_octaves": (3, 2)}))
 
 
