@@ -202,10 +202,8 @@ def compose_and_run() -> None:
     except (HydraException, OmegaConfBaseException, ValueError, OSError, MemoryError) as error:
         if asked == "1":
             raise
-        if isinstance(error, OSError | MemoryError):  # of one of Hydra's own files
-            told = advice(error, Path.cwd(), "the same command goes on")
-        else:
-            told = configuration.explain(error)
+        is_of_a_file = isinstance(error, OSError | MemoryError) and not isinstance(error, HydraException)  # Hydra's own
+        told = advice(error, Path.cwd(), "the same command goes on") if is_of_a_file else configuration.explain(error)
         print(f"gaigs: {told}", file=sys.stderr)
         raise SystemExit(1) from None
     finally:
