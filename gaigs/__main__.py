@@ -199,12 +199,15 @@ def compose_and_run() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands on what goes wrong
     try:
         hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
-    except (HydraException, OmegaConfBaseException, ValueError, OSError, MemoryError) as error:
+    except Exception as error:
         if asked == "1":
             raise
-        is_of_a_file = isinstance(error, OSError | MemoryError) and not isinstance(error, HydraException)  # Hydra's own
-        told = advice(error, Path.cwd(), "the same command goes on") if is_of_a_file else configuration.explain(error)
-        print(f"gaigs: {told}", file=sys.stderr)
+        if isinstance(error, HydraException | OmegaConfBaseException | ValueError):
+            print(f"gaigs: {configuration.explain(error)}", file=sys.stderr)
+        elif isinstance(error, OSError | MemoryError):  # of one of Hydra's own files
+            print(f"gaigs: {advice(error, Path.cwd(), 'the same command goes on')}", file=sys.stderr)
+        else:
+            traceback.print_exc()
         raise SystemExit(1) from None
     finally:
         os.environ.pop("HYDRA_FULL_ERROR")
