@@ -1,5 +1,6 @@
 """Normalised mean squared error of complex channels."""
 
+import torch
 from torch import Tensor
 
 from gaigs.query import Batch
@@ -28,9 +29,9 @@ class Nmse:
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, which is its only term; see ``gaigs.loss.Loss``."""
-        # Scaled by the strongest entry, so that squares of weak channels do not underflow.
+        # Scaled by the strongest entry, so that squares of weak channels do not underflow; a denormal has no inverse.
         labels = batch.labels.flatten(1)
-        largest = labels.abs().amax(1, keepdim=True)
+        largest = labels.abs().amax(1, keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
         errors, powers = ((part / largest).abs().square().sum(1) for part in (values.flatten(1) - labels, labels))
         nmse = (errors / powers).mean()
         return nmse, {"nmse": nmse}

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gaigs.directions import Directions, Grid
 from gaigs.pooling import Pooling, sphere
-from gaigs.propagation import carriers
+from gaigs.propagation import FAINTEST, carriers
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene
@@ -105,7 +105,7 @@ class ArrayResponse(Pooling):
         half = heard.shape[1] // 2
         power = heard[:, half].real
         # Relative to the power, so that no scale of the fields overflows; silence has no spectrum, and 0 stands for it.
-        relative = heard[:, half:] / torch.where(power > 0, power, 1)[:, None]
+        relative = heard[:, half:] / torch.where(power < FAINTEST, 1, power)[:, None]
         parts = torch.cat((relative.real, relative.imag), 1)
         is_whole = _are_same(asked, own)
         spectra, order = [parts.new_zeros(0, math.prod(asked.shape))], [torch.zeros(0).long().to(parts.device)]
