@@ -84,6 +84,7 @@ def embed_reflection(
     Raises:
         ValueError: A normal is zero.
     """
+    normals, offsets = _of_moderate_length(normals, offsets)
     length = normals.norm(dim=-1)
     if not (length > 0).all():
         raise ValueError("a mirror needs a normal, got one of length zero")
@@ -94,9 +95,16 @@ def extract_reflection(
     multivectors: Float[Tensor, "*batch 16"],
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
     """Unit normals and offsets [m] of mirrors."""
-    normals, offsets = extract_plane(multivectors)
+    normals, offsets = _of_moderate_length(*extract_plane(multivectors))
     length = normals.norm(dim=-1)
     return normals / length[..., None], offsets / length
+
+
+def _of_moderate_length(normals: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """The same planes times a power of two, so that squares of their normals neither overflow nor vanish."""
+    exponents = torch.frexp(normals.detach().abs().amax(-1)).exponent
+    scale = torch.ldexp(torch.ones_like(offsets), -exponents.clamp(-126, 126))
+    return normals * scale[..., None], offsets * scale
 
 
 def embed_rotor(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 16"]:
