@@ -12,6 +12,11 @@ NOWHERE = 1e-9
 """A ray whose ends are as far from a plane as each other, to this many metres, runs along it and meets it nowhere."""
 
 
+UNTOLD = 8 * torch.finfo(torch.float32).eps
+"""A point whose height over a plane is less than this share of its and the plane's distance from the origin is on it:
+float32 does not tell on which side it stands."""
+
+
 class Bounces(NamedTuple):
     """Where the paths with at least so many bounces meet a plane.
 
@@ -94,7 +99,8 @@ def fold(
 ) -> Folded:
     """Folds straight lines from the receivers to the last images back into the room, at one plane after the other.
 
-    A line that does not cross its plane is bent at the end nearer to it; such a path does not exist.
+    A line that does not cross its plane is bent at the end nearer to it; such a path does not exist. Nor does one from
+    or to a point on the plane: of two planes in one place a path meets neither after the other.
 
     Args:
         seen: What ``images`` gives.
@@ -111,10 +117,11 @@ def fold(
         n, d = normals[plane], offsets[plane]
         begin, target = here[:, first:], seen[step + 1][:, first:]
         above, below = (begin * n).sum(-1) - d, (target * n).sum(-1) - d
-        apart = above - below
-        share = above / torch.where(apart.abs() > NOWHERE, apart, NOWHERE)
+        fall = above - below
+        share = above / torch.where(fall.abs() > NOWHERE, fall, NOWHERE)
         at = begin + share.clamp(0, 1)[..., None] * (target - begin)
-        exists = torch.cat((exists[:, :first], exists[:, first:] & (share > 0) & (share < 1)), 1)
+        apart = _is_told(above, begin, d) & _is_told(below, target, d)
+        exists = torch.cat((exists[:, :first], exists[:, first:] & (share > 0) & (share < 1) & apart), 1)
         cosines = (functional.normalize(target - begin, dim=-1) * n).sum(-1).abs()
         bounces.append(Bounces(first, plane, at, cosines))
         starts.append(at)
@@ -125,3 +132,10 @@ def fold(
     ends.append(here)
     path.append(numbers)
     return Folded(torch.cat(starts, 1), torch.cat(ends, 1), torch.cat(path), bounces, exists)
+
+
+def _is_told(
+    heights: Float[Tensor, "b w"], points: Float[Tensor, "b w 3"], offsets: Float[Tensor, "w"]
+) -> Bool[Tensor, "b w"]:
+    """Whether points are on one side of a plane for sure."""
+    return heights.abs() > UNTOLD * (points.detach().norm(dim=-1) + offsets.detach().abs())

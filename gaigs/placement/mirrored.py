@@ -123,9 +123,13 @@ class Mirrored(Placement):
         self.box = lower, upper
         self.diagonal = float((upper - lower).norm())
         margin = MARGIN * self.diagonal
-        normals = torch.cat((torch.eye(3), -torch.eye(3), torch.eye(3).repeat(-(-(planes - BOX) // 3), 1)))[:planes]
+        faces = torch.cat((torch.eye(3), -torch.eye(3), torch.eye(3).repeat(-(-(planes - BOX) // 3), 1)))[:planes]
         offsets = torch.cat((upper + margin, margin - lower, torch.zeros(planes - BOX)))
-        self.register_buffer("origin", torch.cat((normals + TILT * torch.randn(planes, 3), offsets[:, None]), 1))
+        # Planes turn about a point within a diagonal of the box, wherever the world's origin is; 0 where that is near.
+        self.register_buffer("pivot", ((lower + upper) / (2 * self.diagonal)).trunc() * self.diagonal)
+        normals = faces + TILT * torch.randn(planes, 3)
+        offsets = offsets + (functional.normalize(normals, dim=1) - faces) @ self.pivot
+        self.register_buffer("origin", torch.cat((normals, offsets[:, None]), 1))
         self.register_buffer("step", torch.ones(()))
         self.walls, self.fixed = walls, fixed
         self.shifts = nn.Parameter(torch.zeros(planes, 4), requires_grad=not fixed)
@@ -172,6 +176,11 @@ class Mirrored(Placement):
             self.place(plane, torch.stack(normal), offset.item())
         self.kept.copy_(self.words_of(torch.arange(len(planes), device=self.kept.device)))
 
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        """Planes of earlier checkpoints, which have no pivot, turn about the world's origin."""
+        state_dict.setdefault(f"{prefix}pivot", torch.zeros_like(self.pivot))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
     # --- the room ---
 
     @property
@@ -182,7 +191,8 @@ class Mirrored(Placement):
     @property
     def offsets(self) -> Float[Tensor, "w"]:
         """Of all planes along their normals, from the world's origin [m]."""
-        return self.origin[:, 3] + self.step * UNIT * self.diagonal * self.shifts[:, 3]
+        moved = self.origin[:, 3] + self.step * UNIT * self.diagonal * self.shifts[:, 3]
+        return moved + (self.normals - functional.normalize(self.origin[:, :3], dim=1)) @ self.pivot
 
     @property
     def used(self) -> Int[Tensor, "k"]:
