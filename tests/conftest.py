@@ -1,9 +1,23 @@
-"""One thread: the tests' tensors are small, and two that spin on a busy machine are several times slower."""
+"""One thread: the tests' tensors are small, and two that spin on a busy machine are several times slower.
+
+Properties are tried on the same examples each time, and none is timed.
+"""
 
 import pytest
 import torch
+from hypothesis import HealthCheck, Phase, settings
 
 torch.set_num_threads(1)
+settings.register_profile(
+    "gaigs",
+    derandomize=True,
+    deadline=None,
+    database=None,
+    max_examples=25,
+    phases=[Phase.explicit, Phase.generate, Phase.shrink],  # the others are slow, or need a database
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("gaigs")
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ import clifford
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gaigs.algebra import PROJECTIVE, SPACETIME, Algebra
@@ -119,7 +119,6 @@ def multivectors(size=16):
 algebras = st.sampled_from([PROJECTIVE, SPACETIME, Algebra(2, 0, 2)])
 
 
-@settings(deadline=None, max_examples=40)
 @given(algebras, multivectors(), multivectors(), multivectors())
 def test_laws(algebra, x, y, z):
     product, wedge = algebra.product, algebra.wedge

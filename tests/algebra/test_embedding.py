@@ -1,6 +1,6 @@
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -56,7 +56,6 @@ finite = st.floats(-3, 3)
 triples = st.tuples(finite, finite, finite).map(lambda values: torch.tensor(values, dtype=torch.float64))
 
 
-@settings(deadline=None, max_examples=40)
 @given(triples, triples, st.integers(0, 1000))
 def test_motions_move_points_and_directions(point, translation, seed):
     rotation = Rotation.random(rng=seed)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
@@ -134,7 +134,6 @@ def test_runs_stay_whole(links, length):
     assert len(result.test) == pytest.approx(0.2 * N, abs=length)
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 10**6), edge=st.floats(0.2, 1.4), far=st.sampled_from([0.0, -50.0, 1000.0]))
 def test_cubes_stay_whole(seed, edge, far):
     points = 3 * torch.rand(200, 3, generator=torch.Generator().manual_seed(seed)) + far

@@ -1,0 +1,83 @@
+"""Splits of any number of links, in rows of any length, anywhere in space."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import seeds
+
+from gaigs.data import Links
+from gaigs.geometry import Pose
+from gaigs.query import Query
+from gaigs.registry import registry
+from gaigs.scene import Receiver
+from gaigs.split import folds
+from gaigs.task.rssi import Rssi
+
+OPTIONS = {"blocks": {"edge": st.floats(1e-3, 1e3)}, "runs": {"length": st.integers(1, 2**62)}}
+OPTIONS |= {"sparse": {"train": st.integers(1, 300)}, "official": {"length": st.integers(1, 9)}}
+"""What each split needs beside the fractions; a split that is not here has only these."""
+
+
+@st.composite
+def links(draw):
+    """Links to one receiver in rows of one to three, in the order of measurement or not."""
+    count = draw(st.integers(1, 120))
+    generator = torch.Generator().manual_seed(draw(seeds))
+    rows = torch.arange(count)
+    if draw(st.booleans()):
+        rows = torch.randint(0, count, (count,), generator=generator)
+    where = torch.rand(count, 3, generator=generator)[rows] * draw(st.sampled_from([0.0, 1e-3, 3.0, 1e4]))
+    return Links(
+        query=Query(where, torch.zeros(count, dtype=torch.long)),
+        receivers=(Receiver("gateway1", Pose(torch.zeros(3), torch.eye(3))),),
+        labels=torch.linspace(-80, -40, count),
+        task=Rssi(),
+        rows=rows,
+        official=lambda: (torch.arange(0, count, 2), torch.arange(1, count, 2)),
+    )
+
+
+@pytest.mark.parametrize("name", registry("split").names())
+@given(links(), st.data(), st.floats(0.01, 0.99), st.floats(0, 0.9), st.integers(0, 2**63 - 1))
+def test_parts_are_disjoint_cover_and_repeat(name, links, data, test, validation, seed):
+    """Or the split says in words why it cannot part so few."""
+    options = {key: data.draw(strategy) for key, strategy in OPTIONS.get(name, {}).items()}
+    options |= {"validation": validation, "seed": seed} | ({} if name == "official" else {"test": test})
+    build = lambda: registry("split").build({"name": name} | options, links=links)
+    try:
+        split = build()
+    except ValueError:
+        return
+    parts = split.train, split.validation, split.test
+    for part, again in zip(parts, (build().train, build().validation, build().test), strict=True):
+        assert torch.equal(part, again)
+        assert (part.diff() > 0).all()
+    everything = torch.cat(parts)
+    assert len(everything.unique()) == len(everything)
+    assert everything.ge(0).all()
+    assert everything.lt(len(links)).all()
+    if name != "sparse":
+        assert len(everything) == len(links)
+    assert len(split.train) or not len(links)
+    if name != "official":
+        rows = [set(links.rows[part].tolist()) for part in parts]
+        assert not rows[0] & rows[1]
+        assert not rows[0] & rows[2]
+        assert not rows[1] & rows[2]
+
+
+@given(links(), st.integers(2, 6), seeds)
+def test_folds_test_each_training_link_once(links, count, seed):
+    try:
+        links = replace(links, split=registry("split").build({"name": "random", "seed": seed}, links=links))
+        parts = folds(links, count, seed)
+    except ValueError:
+        return
+    tested = torch.cat([part.test for part in parts])
+    assert torch.equal(tested.sort().values, links.split.train)
+    for part in parts:
+        assert torch.equal(torch.cat((part.train, part.test)).sort().values, links.split.train)
+        assert torch.equal(part.validation, links.split.validation)
