@@ -1,15 +1,18 @@
-"""Poses, quaternions, spherical coordinates and harmonics; conventions stand in docs/conventions.md."""
+"""Poses, quaternions, spherical and polar coordinates, harmonics; conventions stand in docs/conventions.md."""
 
 import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 FAR = 1e5
 """No coordinate reaches it [m]: float32 tells places apart by 8 mm there, and by half a metre at UTM's northings."""
+
+FAINTEST = torch.finfo(torch.float32).tiny
+"""Amplitudes and powers below this are silence: what is divided by such a number of float32 overflows."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,20 @@ def from_spherical(azimuths: Float[Tensor, "*batch"], elevations: Float[Tensor, 
     """Unit vectors towards azimuths and elevations [rad]; the inverse of ``to_spherical``."""
     horizontal = torch.cos(elevations)
     return torch.stack((horizontal * torch.cos(azimuths), horizontal * torch.sin(azimuths), torch.sin(elevations)), -1)
+
+
+def polar(amplitudes: Float[Tensor, "*batch"], phases: Float[Tensor, "*batch"]) -> Complex[Tensor, "*batch"]:
+    """Waves of amplitudes, at least 0, and phases [rad]; 0, as are its gradients, below ``FAINTEST``.
+
+    The gradient of ``torch.polar`` is finite at an amplitude of 0, and NaN just beside it.
+    """
+    return torch.polar(amplitudes.masked_fill(amplitudes < FAINTEST, 0), phases)
+
+
+def magnitudes(waves: Complex[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Of waves; 0, as is its gradient, where both parts are below ``FAINTEST``: as for ``polar``."""
+    largest = torch.maximum(waves.real.detach().abs(), waves.imag.detach().abs())
+    return waves.masked_fill(largest < FAINTEST, 0).abs()
 
 
 def spherical_harmonics(vectors: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch k"]:

@@ -13,9 +13,6 @@ from gaigs.scene import Scene
 NEAREST = 1e-2
 """Smaller distances count as this one [m]: at 0 a spherical wave has no value."""
 
-FAINTEST = torch.finfo(torch.float32).tiny
-"""Amplitudes and powers below this are silence: what is divided by such a number of float32 overflows."""
-
 KEPT = 0.01
 """Share of the channels' power that must follow the direct distance for a sign to be told, beside what chance keeps."""
 
@@ -34,15 +31,6 @@ def free_space(
     """
     phases = distances.double().clamp(min=NEAREST) * (2 * math.pi / speed_of_light) * frequencies.double()
     return torch.polar(0.5 / phases, sign * phases)
-
-
-def magnitudes(real: Float[Tensor, "*batch"], imaginary: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """|real + j imaginary| of waves; 0, as is its gradient, where both parts are below ``FAINTEST``.
-
-    The gradient of torch's complex magnitude is finite at 0, and NaN just beside it.
-    """
-    heard = torch.maximum(real.detach().abs(), imaginary.detach().abs()) >= FAINTEST
-    return torch.complex(real * heard, imaginary * heard).abs()
 
 
 def fresnel(

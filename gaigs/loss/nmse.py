@@ -1,8 +1,8 @@
 """Normalised mean squared error of complex channels."""
 
-import torch
 from torch import Tensor
 
+from gaigs.geometry import FAINTEST
 from gaigs.query import Batch
 from gaigs.registry import register
 from gaigs.task import Task
@@ -31,7 +31,7 @@ class Nmse:
         """The loss, which is its only term; see ``gaigs.loss.Loss``."""
         # Scaled by the strongest entry, so that squares of weak channels do not underflow; a denormal has no inverse.
         labels = batch.labels.flatten(1)
-        largest = labels.abs().amax(1, keepdim=True).clamp_min(torch.finfo(torch.float32).tiny)
+        largest = labels.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
         errors, powers = ((part / largest).abs().square().sum(1) for part in (values.flatten(1) - labels, labels))
         nmse = (errors / powers).mean()
         return nmse, {"nmse": nmse}

@@ -12,11 +12,11 @@ from gaigs.data import Links
 from gaigs.deformation import Residuals
 from gaigs.directions import Directions
 from gaigs.gaussians import SH_DC, Gaussians
-from gaigs.geometry import semi_axes, spherical_harmonics
+from gaigs.geometry import magnitudes, semi_axes, spherical_harmonics
 from gaigs.model import Model, Prediction, build_trend
 from gaigs.placement import Placed
 from gaigs.projection import Splats
-from gaigs.propagation import carriers, magnitudes
+from gaigs.propagation import carriers
 from gaigs.query import Batch, Query
 from gaigs.registry import call, register, registry
 from gaigs.scene import Scene
@@ -310,8 +310,7 @@ class GaussianSplatting(Model):
         if placed.gains is None:
             signal = SH_DC * signal
         elif signal.shape[-1] == 1:
-            gains = placed.gains[which]
-            signal = signal * magnitudes(gains.real, gains.imag)[..., None]
+            signal = signal * magnitudes(placed.gains[which])[..., None]
         else:
             signal = torch.view_as_real(
                 torch.complex(*signal.expand(len(which), -1, -1).unbind(-1)) * placed.gains[which]

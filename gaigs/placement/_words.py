@@ -12,9 +12,9 @@ NOWHERE = 1e-9
 """A ray whose ends are as far from a plane as each other, to this many metres, runs along it and meets it nowhere."""
 
 
-UNTOLD = 8 * torch.finfo(torch.float32).eps
-"""A point whose height over a plane is less than this share of its and the plane's distance from the origin is on it:
-float32 does not tell on which side it stands."""
+UNTOLD = 4
+"""A point whose height over a plane is less than so many roundings of its and the plane's distance from the origin is
+on it: on which side it stands is not told."""
 
 
 class Bounces(NamedTuple):
@@ -138,4 +138,5 @@ def _is_told(
     heights: Float[Tensor, "b w"], points: Float[Tensor, "b w 3"], offsets: Float[Tensor, "w"]
 ) -> Bool[Tensor, "b w"]:
     """Whether points are on one side of a plane for sure."""
-    return heights.abs() > UNTOLD * (points.detach().norm(dim=-1) + offsets.detach().abs())
+    rounding = torch.finfo(points.dtype).eps
+    return heights.abs() > UNTOLD * rounding * (points.detach().norm(dim=-1) + offsets.detach().abs())

@@ -8,8 +8,9 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.directions import Directions, Grid
+from gaigs.geometry import FAINTEST
 from gaigs.pooling import Pooling, sphere
-from gaigs.propagation import FAINTEST, carriers
+from gaigs.propagation import carriers
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene

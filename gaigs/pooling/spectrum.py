@@ -1,11 +1,12 @@
 """The spatial spectrum: the map's magnitude."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.directions import Directions
+from gaigs.geometry import magnitudes
 from gaigs.pooling import Pooling
-from gaigs.propagation import magnitudes
 from gaigs.query import Query
 from gaigs.registry import register
 
@@ -28,4 +29,4 @@ class Spectrum(Pooling):
         self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
     ) -> Float[Tensor, "b rows columns"]:
         """The predicted spectrum; where the map is 0, so is its gradient."""
-        return image[:, 0].abs() if self.channels == 1 else magnitudes(*image.unbind(1))
+        return image[:, 0].abs() if self.channels == 1 else magnitudes(torch.complex(*image.unbind(1)))

@@ -7,6 +7,7 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
+from gaigs.geometry import polar
 from gaigs.projection import Splats
 from gaigs.registry import register
 from gaigs.scene import Array
@@ -124,7 +125,7 @@ class Aperture:
         elements = array.elements.to(centres)
         wavelengths = speed_of_light / carriers.to(centres)[:, None, None]
         angles = 2 * math.pi / wavelengths * (centres @ elements[:, :2].T)
-        return torch.polar(_footprints(covariances, elements[:, :2], wavelengths), angles)
+        return polar(_footprints(covariances, elements[:, :2], wavelengths), angles)
 
     def _directions(self, splats: Splats, count: int) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2 2"]]:
         """Centres and covariances of each query's splats."""

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.directions import Directions
+from gaigs.geometry import magnitudes
 from gaigs.pooling import Pooling, sphere
-from gaigs.propagation import magnitudes
 from gaigs.query import Query
 
 RANGE = 100.0
@@ -47,4 +47,4 @@ class MeanAmplitude(Pooling):
     ) -> Float[Tensor, "b"]:
         """Level [dBm], float32 where the map is of half precision; where the map is 0, so is its gradient."""
         image = image.to(torch.promote_types(image.dtype, torch.float32))
-        return RANGE * (magnitudes(*image.unbind(1)).mean((1, 2)) - 1)
+        return RANGE * (magnitudes(torch.complex(*image.unbind(1))).mean((1, 2)) - 1)

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
-from gaigs.geometry import Pose, quaternions_to_rotations
+from gaigs.geometry import Pose, polar, quaternions_to_rotations
 from gaigs.projection import NEAR
 from gaigs.rasterizer import ALPHA_MAX
 from gaigs_gsrf.gaussians import ComplexGaussians
@@ -76,4 +76,4 @@ def weights(
     alphas = (gaussians.opacities[order, None] * footprints).clamp(max=ALPHA_MAX)
     losses, turns = torch.log1p(-alphas), gaussians.phases[order, None] * footprints
     amplitudes = alphas * (losses.cumsum(0) - losses).exp()
-    return torch.polar(amplitudes, turns.cumsum(0) - turns)
+    return polar(amplitudes, turns.cumsum(0) - turns)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.directions import Directions, Grid
+from gaigs.geometry import magnitudes
 from gaigs.propagation import array_sign, check_elements, direct_waves, phase_sign
 from gaigs.query import Query
 from gaigs.scene import Scene
@@ -63,7 +64,7 @@ class Spectrum(Reading):
         return labels
 
     def forward(self, sums: Complex[Tensor, "b r 1"], query: Query, directions: Directions) -> Tensor:
-        return sums[..., 0].abs().unflatten(1, directions.shape)
+        return magnitudes(sums[..., 0]).unflatten(1, directions.shape)
 
 
 class Level(Reading):
@@ -95,7 +96,7 @@ class Level(Reading):
         return 1 + labels / 100
 
     def forward(self, sums: Complex[Tensor, "b r 1"], query: Query, directions: Directions) -> Tensor:
-        return 100 * (sums.sum((1, 2)).abs() - 1)
+        return 100 * (magnitudes(sums.sum((1, 2))) - 1)
 
 
 class Channel(Reading):
