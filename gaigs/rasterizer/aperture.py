@@ -7,7 +7,7 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.geometry import polar
+from gaigs.geometry import magnitudes, polar
 from gaigs.projection import Splats
 from gaigs.registry import register
 from gaigs.scene import Array
@@ -99,7 +99,7 @@ class Aperture:
         half = len(steps) // 2
         angles = 2 * math.pi / wavelengths * (centres @ steps[half:, :2].T)
         narrow = _footprints(covariances, steps[half:, :2], wavelengths)
-        powers = amplitudes.abs().square() * (1 - coherences.square())
+        powers = magnitudes(amplitudes).square() * (1 - coherences.square())
         real, imaginary = ((powers[..., None] * narrow * part).sum(1) for part in (angles.cos(), angles.sin()))
         later = torch.complex(real, imaginary)
         found = torch.cat((later[:, 1:].conj().flip(1), later), 1)
