@@ -1,18 +1,17 @@
-"""Tokenizers, deformations, placements, poolings and losses at the ends of what they may be asked.
+"""Tokenizers, deformations, poolings and losses at the ends of what they may be asked.
 
-Each gives finite values and gradients, and in float32 what it gives in float64. Plug-ins are among them.
+Each gives finite values and gradients, in float32 what it gives in float64. Plug-ins are among them.
 """
 
-import copy
 import functools
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from precision import TASKS, build, configured, require_same, widen
 
+from gaigs.geometry import Pose
 from gaigs.placement import Placed
 from gaigs.query import Query
 from gaigs.registry import registry
@@ -20,132 +19,177 @@ from gaigs.testing import example_links
 from gaigs.testing.placement import example_gaussians
 from gaigs.tokenizer import Tokens
 
-sys.path.append(str(Path(__file__).parents[1]))
-from test_contracts import MADE_FOR, TASKS, configured
-
-TOLERANCE = 1e-3
-"""Between float32 and float64, of the largest value or of 1."""
-
-LINKS = example_links("rssi")
-SCENE = LINKS.scene
+SCENE = example_links("rssi").scene
 every = lambda kind: pytest.mark.parametrize("name", registry(kind).names())
 
-
-def require_same(single, double, leaves):
-    """Finite values that agree, with finite gradients."""
-    for one, two in zip(single, double, strict=True):
-        assert (one is None) == (two is None)
-        if one is not None:
-            assert one.isfinite().all()
-            scale = max(1.0, two.abs().max().item()) if two.numel() else 1.0
-            assert (one - two).abs().max() < TOLERANCE * scale if one.numel() else True
-    outputs = [value for value in single if value is not None and value.requires_grad and value.numel()]
-    real = [torch.view_as_real(value) if value.is_complex() else value for value in outputs]
-    if real:
-        total = sum((value / max(1.0, value.detach().abs().max().item())).mean() for value in real)
-        gradients = torch.autograd.grad(total, leaves, allow_unused=True)
-        assert all(gradient is None or gradient.isfinite().all() for gradient in gradients)
-
-
-def in_both(module):
-    """A module, and its like of float64."""
-    module = copy.deepcopy(module).eval()
-    return module, copy.deepcopy(module).double()
-
-
-# --- where transmitters may stand ---
+# --- where transmitters and Gaussians may stand ---
 
 receiver = SCENE.receivers[0].pose.position
+means = example_gaussians(SCENE, 20).means.detach()
 PLACES = {
     "on the receiver": receiver.expand(3, 3),
     "beside the receiver": receiver + torch.tensor([[1e-6, 0, 0], [0, 1e-4, 0], [0, 0, 1e-7]]),
     "at corners of the box": torch.stack((SCENE.lower, SCENE.upper, (SCENE.lower + SCENE.upper) / 2)),
     "all at one place": SCENE.lower.expand(3, 3) + 0.5,
     "outside": SCENE.upper + torch.tensor([[10.0, 0, 0], [0, 100, 0], [0, 0, -50]]),
-    "on a Gaussian": example_gaussians(SCENE, 7).means.detach()[:3],
+    "on an anchor": means[:3],
+    "beside each other": SCENE.lower + torch.tensor([[1, 1, 1], [1 + 1e-6, 1, 1], [1, 1, 1 - 1e-6]]),
 }
-LINE = replace(SCENE, upper=SCENE.lower + torch.tensor([1.0, 0, 0]))
+GAUSSIANS = {
+    "about": means,
+    "all at one place": means[:1].expand(20, 3),
+    "on the receiver": receiver.expand(20, 3),
+    "far": 1e4 * means,
+    "one": means[:1],
+    "none": means[:0],
+}
+FAR = torch.tensor([2.0**20, -(2.0**19), 2.0**18])
+"""About 1e6 m from the origin."""
+
+
+def moved(scene, shift):
+    """The scene elsewhere in the world."""
+    receivers = [replace(one, pose=Pose(one.pose.position + shift, one.pose.rotation)) for one in scene.receivers]
+    return replace(scene, receivers=tuple(receivers), lower=scene.lower + shift, upper=scene.upper + shift)
+
+
+SCENES = {
+    "room": SCENE,
+    "line": replace(SCENE, upper=SCENE.lower + torch.tensor([1.0, 0, 0])),
+    "far from the origin": moved(SCENE, FAR),
+    "large": replace(SCENE, upper=SCENE.lower + 1e5),
+    "of two bands": replace(SCENE, frequencies=torch.tensor([2.4e9, 5e9])),
+}
+TOKENS = [(place, "about", "room") for place in PLACES]
+TOKENS += [("on an anchor", gaussians, "room") for gaussians in GAUSSIANS if gaussians != "about"]
+TOKENS += [("on an anchor", "about", scene) for scene in SCENES if scene != "room"]
 
 
 def query_at(places, scene=SCENE):
-    return Query(places.float(), torch.arange(3) % len(scene.receivers))
+    carriers = scene.frequencies[torch.arange(3) % 2] if scene.has_band else None
+    return Query(places, torch.arange(3) % len(scene.receivers), carriers)
 
 
-def doubled(query):
-    return replace(query, transmitters=query.transmitters.detach().double())
+def ask_tokens(scene, opacities):
+    def ask(module, transmitters, stands):
+        return module(
+            Placed(stands[None]), widen(opacities[: len(stands)], stands.dtype), query_at(transmitters, scene)
+        )
+
+    return ask
+
+
+OPACITIES = torch.tensor([0.0, 1.0, 0.5, 1e-38, 1 - 1e-7]).repeat(4)
 
 
 @every("tokenizer")
-@pytest.mark.parametrize("places", PLACES)
-@pytest.mark.parametrize("scene", [SCENE, LINE], ids=["room", "line"])
-def test_tokens(name, places, scene):
-    query = query_at(PLACES[places])
-    query.transmitters.requires_grad_()
-    module, double = in_both(registry("tokenizer").build(configured("tokenizer", name), scene=scene))
-    gaussians = example_gaussians(SCENE, 7)
-    means, opacities = gaussians.means.detach()[None], torch.tensor([0.0, 1.0, 0.5, 1e-38, 1 - 1e-7, 0.3, 0.9])
-    single = module(Placed(means), opacities, query)
-    exact = double(Placed(means.double()), opacities.double(), doubled(query))
-    require_same(single, exact, [query.transmitters, *module.parameters()])
+@pytest.mark.parametrize(("places", "gaussians", "scene"), TOKENS)
+def test_tokens(name, places, gaussians, scene):
+    shift = FAR if scene == "far from the origin" else 0
+    own = SCENES[scene]
+    module = build("tokenizer", name, scene=own)
+    require_same(ask_tokens(own, OPACITIES), module, PLACES[places] + shift, GAUSSIANS[gaussians] + shift)
+
+
+@every("tokenizer")
+@pytest.mark.parametrize("size", [100.0, 0.0, 1e-20])
+def test_tokens_of_attention_with_huge_logits_or_none(name, size):
+    """Weights a hundred times as large make logits of 1e4, which decide between two tokens alone."""
+    module = build("tokenizer", name, scene=SCENE)
+    attending = [part for part in module.modules() if "Attention" in type(part).__name__]
+    with torch.no_grad():
+        for parameter in [parameter for part in attending for parameter in part.project.parameters()]:
+            parameter.mul_(size)
+    require_same(ask_tokens(SCENE, OPACITIES), module, PLACES["at corners of the box"], means, tolerance=1e-2)
 
 
 @every("deformation")
-@pytest.mark.parametrize("size", [0.0, 1e-38, 1.0, 1e4])
-def test_residuals(name, size):
-    widths, b, n = (5, 4, 6), 3, 7
+@pytest.mark.parametrize("size", [0.0, 1e-42, 1e-38, 1.0, 1e4])
+@pytest.mark.parametrize("n", [7, 1, 0])
+def test_residuals(name, size, n):
+    widths, b = (5, 4, 6), 3
     generator = torch.Generator().manual_seed(0)
-    random = lambda *shape: size * torch.randn(*shape, generator=generator)
-    build = functools.partial(registry("deformation").build, configured("deformation", name))
-    module, double = in_both(build(scene=SCENE, channels=2, tokenizer_widths=widths))
-    tokens = Tokens(random(b, widths[0]), random(n, widths[1]), random(b, widths[2]))
-    means = example_gaussians(SCENE, n).means.detach()[None].clone()
-    means[0, 0] = receiver
-    query = query_at(PLACES["on the receiver"])
-    single = module(tokens if module.reads_tokens else None, Placed(means), query)
-    wide = Tokens(*(token.double() for token in tokens))
-    exact = double(wide if module.reads_tokens else None, Placed(means.double()), doubled(query))
-    require_same(single, exact, [*module.parameters()])
-    if single.attenuations is not None:
-        assert single.attenuations.gt(0).all()
-        assert single.attenuations.le(1).all()
+    tokens = [size * torch.randn(*shape, generator=generator) for shape in ((b, 5), (n, 4), (b, 6))]
+    stands = means[None, :n].clone()
+    stands[0, :1] = receiver
+    torch.manual_seed(0)
+    module = registry("deformation").build(
+        configured("deformation", name), scene=SCENE, channels=2, tokenizer_widths=widths
+    )
 
+    def ask(module, transmitters, stands, *tokens):
+        return module(Tokens(*tokens) if module.reads_tokens else None, Placed(stands), query_at(transmitters))
 
-# --- planes ---
-
-
-def lay(placement, *planes):
-    """Puts planes there, each given by its normal and by where it cuts that [m]; returns the placement."""
-    for number, (normal, offset) in enumerate(planes):
-        placement.place(number, torch.tensor(normal, dtype=torch.float32), torch.tensor(float(offset)))
-    return placement
+    *_, attenuations = require_same(ask, module, PLACES["on the receiver"], stands, *tokens)
+    if attenuations is not None and attenuations.numel():
+        assert attenuations.gt(0).all()
+        assert attenuations.le(1).all()
 
 
 # --- what is read from a map ---
 
 MAPS = {
     "silent": lambda shape: torch.zeros(shape),
+    "denormal": lambda shape: torch.full(shape, 1e-42),
     "tiny": lambda shape: torch.full(shape, 1e-15),
     "constant": lambda shape: torch.full(shape, 0.7),
     "of 1e4": lambda shape: 1e4 * torch.linspace(-1, 1, math.prod(shape)).reshape(shape),
+    "of 1e10": lambda shape: 1e10 * torch.arange(math.prod(shape)).cos().reshape(shape),
     "a single bright pixel": lambda shape: torch.cat(
         (torch.full((1,), 1e6), torch.zeros(math.prod(shape) - 1))
     ).reshape(shape),
 }
-POOLED = [(name, task) for name, tasks in MADE_FOR["pooling"].items() for task in tasks]
+CARRIER = 5e9
 
 
+@functools.cache
+def poolings_of(name):
+    """A pooling for each task whose labels it gives, with links."""
+    found = []
+    for task in TASKS:
+        links = example_links(task, None if task == "csi" else CARRIER)
+        try:
+            pooling = build("pooling", name, scene=links.scene)
+        except ValueError:
+            continue
+        grid = pooling.grid or links.task.directions
+        if grid is not None:
+            value = pooling(torch.zeros(1, pooling.channels, *grid.shape), links.query[:1])
+            if value.shape[1:] == links.task.shape and value.dtype == links.task.dtype:
+                pooling.fit(links)
+                found.append((pooling, links, grid))
+    assert found, f"pooling {name!r} gives the labels of none of the tasks {', '.join(TASKS)}"
+    return found
+
+
+@every("pooling")
 @pytest.mark.parametrize("what", MAPS)
-@pytest.mark.parametrize(("name", "task"), POOLED)
-def test_values(name, task, what):
-    links = example_links(task, 5e9 if name == "array_response" else None)
-    pooling = registry("pooling").build(configured("pooling", name), scene=links.scene)
-    pooling.fit(links)
-    module, double = in_both(pooling)
-    grid = links.task.directions if pooling.grid is None else pooling.grid
-    image = MAPS[what]((2, pooling.channels, *grid.shape)).requires_grad_()
-    query = links.query[:2]
-    exact = double(image.detach().double(), doubled(query))
-    require_same([module(image, query)], [exact], [image, *module.parameters()])
+def test_values(name, what):
+    for pooling, links, grid in poolings_of(name):
+        query = links.query[:2]
+        ask = lambda module, image, query=query: module(image, widen(query, image.dtype))
+        require_same(ask, pooling, MAPS[what]((2, pooling.channels, *grid.shape)))
+
+
+@every("pooling")
+@pytest.mark.parametrize("size", [0.0, 1e-42, 1e-15, 1.0, 1e10])
+@pytest.mark.parametrize("alike", [True, False])
+def test_values_of_what_an_array_hears(name, size, alike):
+    """Fields or lags of a silent, faint or loud wave; ``alike`` where all elements hear the same."""
+    for pooling, links, _ in poolings_of(name):
+        if pooling.takes is None:
+            continue
+        array = links.receivers[0].array
+        if pooling.takes == "fields":
+            shape = 2, *links.task.shape
+            waves = torch.polar(torch.ones(shape), torch.zeros(shape) if alike else torch.arange(40.0).view(shape))
+        else:
+            steps = array.lags[0].float()
+            turns = 0 * steps[:, 0] if alike else 60 * steps[:, 0] + 30 * steps[:, 1]
+            waves = torch.polar(torch.ones_like(turns), turns).expand(2, -1)
+        query = links.query[:2]
+        ask = lambda module, heard, query=query: module.hear(heard, widen(query, heard.real.dtype))
+        require_same(ask, pooling, size * waves)
 
 
 # --- what is compared ---
@@ -154,25 +198,40 @@ LABELS = {
     "nothing": lambda labels: 0 * labels,
     "constant": lambda labels: 0 * labels + 1,
     "tiny": lambda labels: 0 * labels + 1e-30,
+    "denormal": lambda labels: 0 * labels + 1e-42,
     "as they are": lambda labels: labels,
 }
 VALUES = {"nothing": 0.0, "the labels": 1.0, "opposite": -1.0, "far too much": 1e4, "denormal": 1e-42}
 
 
+@functools.cache
+def losses_of(name):
+    """A loss for each task that it takes, with links."""
+    found = []
+    for task in TASKS:
+        links = example_links(task)
+        try:
+            found.append((build("loss", name, task=links.task, scene=links.scene), links))
+        except ValueError:
+            continue
+    assert found, f"loss {name!r} takes the labels of none of the tasks {', '.join(TASKS)}"
+    return found
+
+
+@every("loss")
 @pytest.mark.parametrize("values", VALUES)
 @pytest.mark.parametrize("labels", LABELS)
-@pytest.mark.parametrize(
-    ("name", "task"), [(name, task) for name in registry("loss").names() for task in MADE_FOR["loss"].get(name, TASKS)]
-)
-def test_losses(name, task, labels, values):
-    if task == "csi" and labels == "nothing":
-        pytest.skip("the task refuses channels that are zero throughout")
-    links = example_links(task)
-    loss = registry("loss").build(configured("loss", name), task=links.task)
-    batch = links.batch(links.split.train[:3])
-    batch = replace(batch, labels=LABELS[labels](batch.labels))
-    given = (VALUES[values] * batch.labels).requires_grad_()
-    wide = torch.complex128 if given.is_complex() else torch.float64
-    found, _ = loss(given, batch)
-    exact, _ = loss(given.detach().to(wide), replace(batch, labels=batch.labels.to(wide)))
-    require_same([found], [exact], [given])
+def test_losses(name, labels, values):
+    for loss, links in losses_of(name):
+        if links.task.dtype.is_complex and labels == "nothing":
+            continue  # the task refuses channels that are zero throughout
+        batch = links.batch(links.split.train[:3])
+        given = LABELS[labels](batch.labels)
+        is_beyond = links.task.dtype.is_complex and labels == "denormal"
+
+        def ask(_, values, loss=loss, batch=batch, given=given, is_beyond=is_beyond):
+            real = values.real.dtype if values.is_complex() else values.dtype
+            found, _ = loss(values, replace(batch, labels=widen(given, real)))
+            return found.detach() if is_beyond else found  # float32 does not reach one over such a channel
+
+        require_same(ask, None, VALUES[values] * given)

@@ -1,0 +1,118 @@
+"""What the hard cases share: components as they are configured, and float32 held against float64."""
+
+import copy
+import functools
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from gaigs.query import Query
+from gaigs.registry import registry
+
+sys.path.append(str(Path(__file__).parents[1]))
+import test_contracts
+
+TOLERANCE = 1e-3
+"""Between float32 and float64, of the largest value or of 1."""
+
+TASKS = test_contracts.TASKS
+DTYPES = (torch.float32, torch.float64)
+
+
+@functools.cache
+def _composed(*overrides):
+    return test_contracts.composed(*overrides)
+
+
+def composed(*overrides):
+    """The whole configuration, as the command line would have it; composed once."""
+    return copy.deepcopy(_composed(*overrides))
+
+
+def configured(kind, name, *overrides):
+    """The configuration of a name, its plug-ins' too, small enough for a test."""
+    small = [*test_contracts.SMALL.get(name, []), *test_contracts.GIVEN.get(name, [])]
+    return composed(f"{kind}={name}", *small, *overrides)[kind]
+
+
+def build(kind, name, *overrides, **context):
+    """A component of that name, the same at each call."""
+    torch.manual_seed(0)
+    return registry(kind).build(configured(kind, name, *overrides), **context)
+
+
+def build_rasterizer(name):
+    """A rasterizer; None where it cannot work here."""
+    try:
+        return registry("rasterizer").build({"name": name})
+    except (ImportError, RuntimeError) as error:
+        if not any(words in str(error) for words in ("needs an OpenCL driver", "cannot build kernels", "pyopencl")):
+            raise
+        return None
+
+
+def widen(part, dtype):
+    """Floating tensors, queries and tuples of them in another precision; anything else as it is."""
+    if isinstance(part, torch.Tensor) and (part.is_floating_point() or part.is_complex()):
+        return part.to(dtype.to_complex() if part.is_complex() else dtype)
+    if isinstance(part, Query):
+        return replace(part, transmitters=widen(part.transmitters, dtype))
+    if isinstance(part, nn.Module):
+        # Module.to would take complex buffers for real ones.
+        return (nn.Module.double if dtype == torch.float64 else nn.Module.float)(copy.deepcopy(part).eval())
+    if isinstance(part, tuple):
+        moved = [widen(entry, dtype) for entry in part]
+        return type(part)(*moved) if hasattr(part, "_fields") else tuple(moved)
+    return part
+
+
+def flat(values):
+    """Tensors of nested tuples, one after the other."""
+    if isinstance(values, tuple | list):
+        return [tensor for value in values for tensor in flat(value)]
+    return [values]
+
+
+def require_same(ask, module, *leaves, tolerance=TOLERANCE, within=None):
+    """Asks a module in float32 and in float64, and gives what float64 answers.
+
+    Values are finite, keep their precision and agree; gradients by the leaves and parameters are finite in both.
+
+    Args:
+        ask: Function of the module and of the leaves.
+        module: Or None.
+        leaves: Tensors that gradients are taken by.
+        tolerance: Of the largest value of each tensor, or of 1.
+        within: How far apart values may be at least, where digits are lost before they are asked for.
+    """
+    answers = []
+    for dtype in DTYPES:
+        part, own = widen(module, dtype), [widen(leaf.detach(), dtype).requires_grad_() for leaf in leaves]
+        answers.append(flat(ask(part, *own)))
+        require_finite(answers[-1], [*own, *(() if part is None else part.parameters())])
+    for one, two in zip(*answers, strict=True):
+        assert (one is None) == (two is None)
+        if one is None or not one.numel():
+            continue
+        if one.is_floating_point() or one.is_complex():
+            assert (one.dtype, two.dtype) == (widen(one, DTYPES[0]).dtype, widen(one, DTYPES[1]).dtype)
+        largest = max(1.0, two.detach().abs().max().item())
+        assert (one.to(two.dtype) - two).abs().max() <= max(tolerance * largest, within or 0)
+    return answers[1]
+
+
+def require_finite(values, leaves):
+    """Values and the gradients of their means by what they depend on."""
+    values = [value for value in flat(values) if value is not None and value.numel()]
+    assert all(value.isfinite().all() for value in values)
+    real = [torch.view_as_real(value) if value.is_complex() else value for value in values if value.requires_grad]
+    if real:
+        # A weight for each entry: sums of differences that cancel would hide gradients.
+        weights = [torch.arange(value.numel()).cos().to(value).view_as(value) for value in real]
+        sizes = [max(1.0, value.detach().abs().max().item()) * value.numel() for value in real]
+        total = sum((value * weight).sum() / size for value, weight, size in zip(real, weights, sizes, strict=True))
+        gradients = torch.autograd.grad(total, [leaf for leaf in leaves if leaf.requires_grad], allow_unused=True)
+        assert all(gradient is None or gradient.isfinite().all() for gradient in gradients)

@@ -1,0 +1,85 @@
+"""100,000 opaque splats in one pixel: what lies behind them is dark, and neither sums nor gradients overflow."""
+
+import math
+
+import pytest
+import torch
+from precision import build_rasterizer
+
+from gaigs.projection import Plane, Splats
+from gaigs.rasterizer import ALPHA_MAX
+from gaigs.registry import registry
+from gaigs.scene import Array
+
+CROWD = 100_000
+PLANE = Plane(torch.linspace(-0.1, 0.1, 5)[None], torch.linspace(-0.1, 0.1, 4)[:, None], 2 * math.pi)
+DRAWING = [name for name in registry("rasterizer").names() if name != "aperture"]
+
+
+def drawn(name, dtype, opacity, attenuation, alike):
+    """Map and transmittance of a crowd in the pixel at row 2, column 2, and what gradients are by."""
+    rasterizer = build_rasterizer(name)
+    if rasterizer is None:
+        pytest.skip("OpenCL does not work here")
+    middle = torch.stack((PLANE.u[0, 2], PLANE.v[2, 0])).to(dtype)
+    leaves = {
+        "means2d": middle.repeat(CROWD, 1),
+        "factors": torch.tensor([1e-3, 0, 1e-3], dtype=dtype).repeat(1, CROWD, 1),
+        "signal": torch.ones(1, CROWD, 1, dtype=dtype),
+        "opacities": torch.full((1, CROWD), opacity, dtype=dtype),
+        "attenuations": torch.full((1, CROWD), attenuation, dtype=dtype),
+    }
+    leaves = {part: leaf.requires_grad_() for part, leaf in leaves.items()}
+    depths = torch.full((CROWD,), 2.0, dtype=dtype) if alike else torch.linspace(1, 9, CROWD, dtype=dtype).flip(0)
+    splats = Splats(leaves["means2d"], leaves["factors"], depths, torch.ones(CROWD, dtype=torch.bool))
+    plane = Plane(PLANE.u.to(dtype), PLANE.v.to(dtype), PLANE.period)
+    try:
+        image, left = rasterizer(splats, leaves["signal"], leaves["opacities"], leaves["attenuations"], plane)
+    except TypeError:
+        if dtype == torch.float32:
+            raise
+        pytest.skip("takes float32 alone")
+    return image, left, leaves
+
+
+@pytest.mark.parametrize("name", DRAWING)
+@pytest.mark.parametrize(
+    ("dtype", "opacity", "attenuation", "alike"),
+    [(torch.float32, 1.0, 1.0, True), (torch.float32, 0.005, 1.0, False), (torch.float64, 1.0, 0.0, False)],
+    ids=["equal depths", "hardly opaque", "float64"],
+)
+def test_a_crowd_in_one_pixel(name, dtype, opacity, attenuation, alike):
+    image, left, leaves = drawn(name, dtype, opacity, attenuation, alike)
+    # In the middle of the crowd each takes its share a of what is left, at last all: sum a (1 - a)^i d^i.
+    a, d = min(opacity, ALPHA_MAX), attenuation
+    expected = a / (1 - (1 - a) * d)
+    assert image[0, 0, 2, 2].item() == pytest.approx(expected, abs=1e-4)
+    assert left[0, 2, 2].item() == pytest.approx(0, abs=1e-30)
+    elsewhere = torch.ones(4, 5, dtype=torch.bool)
+    elsewhere[2, 2] = False
+    assert not image[0, 0, elsewhere].any()
+    assert (left[0, elsewhere] == 1).all()
+    (image.sum() + left.sum()).backward()
+    for part, leaf in leaves.items():
+        assert leaf.grad.isfinite().all(), part
+    front = 0 if alike else CROWD - 1
+    assert leaves["signal"].grad[0, front, 0].item() == pytest.approx(a, rel=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+def test_a_crowd_in_one_direction(dtype):
+    """Nothing hides anything in the aperture: fields add up, and powers too."""
+    aperture = registry("rasterizer").build({"name": "aperture"})
+    array, carriers = Array.planar(2, 2, 0.03), torch.full((1,), 5e9, dtype=dtype)
+    means2d = torch.tensor([0.3, -0.2], dtype=dtype).repeat(CROWD, 1).requires_grad_()
+    factors = torch.full((1, CROWD, 3), 1e-3, dtype=dtype).requires_grad_()
+    splats = Splats(means2d, factors, torch.ones(CROWD, dtype=dtype), torch.ones(CROWD, dtype=torch.bool))
+    amplitudes = torch.ones(1, CROWD, dtype=dtype.to_complex()).requires_grad_()
+    lengths = torch.full((1, CROWD), 2.0, dtype=dtype).requires_grad_()
+    fields = aperture.fields(splats, amplitudes, lengths, array, carriers, torch.zeros(1, 2, dtype=dtype))
+    torch.testing.assert_close(fields.abs(), torch.full_like(fields.abs(), CROWD), rtol=1e-3, atol=0)
+    silent = torch.zeros(CROWD, dtype=dtype)  # of known phases there are few, and pairs of them are what costs
+    lags = aperture.lags(splats, amplitudes, lengths, silent, None, array, carriers)
+    assert lags[0, lags.shape[1] // 2].real.item() == pytest.approx(CROWD, rel=1e-4)
+    (fields.abs().sum() + lags.abs().sum()).backward()
+    assert all(leaf.grad.isfinite().all() for leaf in (means2d, factors, amplitudes, lengths))

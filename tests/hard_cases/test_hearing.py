@@ -1,0 +1,76 @@
+"""What an array hears without a map, and faint waves: silence, footprints beyond digits, no splat, one."""
+
+import pytest
+import torch
+from precision import DTYPES, require_same
+
+from gaigs.geometry import magnitudes, polar
+from gaigs.projection import Splats
+from gaigs.registry import registry
+from gaigs.scene import Array
+
+FAINT = [0.0, 1e-45, 1e-42, 1e-39, 1.2e-38, 1e-30, 1.0, 1e30]
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
+@pytest.mark.parametrize("amplitude", FAINT)
+@pytest.mark.parametrize("count", [1, 3, 8, 17])
+def test_faint_waves_have_gradients(dtype, amplitude, count):
+    """Of any count: torch works on some entries at a time, and on the rest in another way."""
+    amplitudes = torch.full((count,), amplitude, dtype=dtype).requires_grad_()
+    phases = torch.arange(count, dtype=dtype).requires_grad_()
+    waves = polar(amplitudes, phases)
+    back = magnitudes(waves)
+    torch.testing.assert_close(back, amplitudes, rtol=1e-5, atol=2e-38)
+    (waves.real.sum() + waves.imag.sum() + back.sum()).backward()
+    assert amplitudes.grad.isfinite().all()
+    assert phases.grad.isfinite().all()
+    if amplitude > 1e-37:
+        turned = torch.autograd.grad(magnitudes(polar(amplitudes, phases)).sum(), amplitudes)[0]
+        torch.testing.assert_close(turned, torch.ones_like(turned))
+
+
+def test_what_is_broken_shows_in_waves():
+    broken = torch.tensor([torch.nan, 1.0])
+    assert polar(broken, torch.zeros(2))[0].isnan()
+    assert magnitudes(torch.complex(broken, torch.zeros(2)))[0].isnan()
+    assert magnitudes(torch.complex(torch.zeros(2), broken))[0].isnan()
+
+
+N, B = 9, 2
+generator = torch.Generator().manual_seed(0)
+CENTRES = torch.rand(B, N, 2, generator=generator) - 0.5
+SPLATS = {
+    "points": torch.zeros(3),
+    "narrow": torch.tensor([1e-3, 0, 1e-3]),
+    "of all widths": torch.logspace(-2, 1.5, N)[None, :, None] * torch.tensor([1.0, 0.3, 1.0]),
+    "wider than all directions": torch.tensor([30.0, 10.0, 30.0]),
+    "long and thin": torch.tensor([10.0, 5.0, 1e-6]),
+}
+WAVES = {"silent": 0.0, "denormal": 1e-42, "faint": 1e-18, "loud": 1e10}
+CASES = [(splats, "loud", N) for splats in SPLATS] + [("narrow", waves, N) for waves in WAVES]
+CASES += [("narrow", "loud", 1), ("narrow", "loud", 0)]
+
+
+@pytest.mark.parametrize(("splats", "waves", "n"), CASES)
+@pytest.mark.parametrize("coherence", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("bandwidth", [None, 0.0, 1e9])
+def test_what_an_array_hears(splats, waves, n, coherence, bandwidth):
+    aperture = registry("rasterizer").build({"name": "aperture"})
+    array = Array.planar(3, 3, 0.03)
+    size = WAVES[waves]
+    amplitudes = size * torch.randn(B, N, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    lengths = torch.linspace(0, 50, B * N).view(B, N)
+
+    def ask(_, centres, factors, amplitudes, lengths, coherences):
+        visible = torch.arange(n) != 4
+        drawn = Splats(centres, factors, lengths.detach(), visible.expand(B, n))
+        carriers, offsets = lengths.new_full((B,), 5e9), lengths.new_tensor([[-1e7, 0, 1e7]]).expand(B, 3)
+        band = None if bandwidth is None else lengths.new_tensor(bandwidth)
+        fields = aperture.fields(drawn, amplitudes, lengths, array, carriers, offsets)
+        lags = aperture.lags(drawn, amplitudes, lengths, coherences, band, array, carriers)
+        return (fields, lags) if size <= 1 else (fields / size, lags / size**2)
+
+    factors = SPLATS[splats].expand(1, N, 3)
+    leaves = CENTRES[:, :n], factors[:, :n], amplitudes[:, :n], lengths[:, :n], torch.full((n,), coherence)
+    require_same(ask, None, *leaves)

@@ -1,0 +1,170 @@
+"""Placements where planes and transmitters are as awkward as they can be; plug-ins are among them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from precision import build, composed, require_same, widen
+from torch.nn import functional
+
+from gaigs.placement._words import all_words, fold, images
+from gaigs.placement.mirrored import BOX, TILT, UNIT
+from gaigs.query import Query
+from gaigs.registry import registry
+from gaigs.testing import example_links
+from gaigs.testing.placement import example_gaussians
+
+LINKS = {"rssi": example_links("rssi", 5e9), "spectrum": example_links("spectrum", 5e9), "csi": example_links("csi")}
+SCENE = LINKS["spectrum"].scene
+receiver = SCENE.receivers[0].pose.position
+middle = (SCENE.lower + SCENE.upper) / 2
+X, Y, Z = torch.eye(3).tolist()
+slanted = functional.normalize(torch.tensor([1.0, -2.0, 0.5]), dim=0)
+
+PLANES = {
+    "as they start": [],
+    "parallel": [(X, 5.0), (X, 6.0), (X, -1.0), (X, 7.0), (X, 5.5), (X, 8.0)],
+    "coincident": [(X, 5.0)] * 6,
+    "coincident, facing each other": [(X, 5.0), ([-1.0, 0.0, 0.0], -5.0)] * 3,
+    "nearly parallel": [([1.0, 1e-5 * k, -1e-5 * k], 5.0 + 1e-3 * k) for k in range(6)],
+    "through the receiver": [(slanted.tolist(), float(slanted @ receiver)), *[(axis, 4.0) for axis in (X, Y, Z)]],
+    "all through the receiver": [(axis, float(receiver @ torch.tensor(axis))) for axis in (X, Y, Z, X, Y, Z)],
+    "through the middle": [(axis, float(middle @ torch.tensor(axis))) for axis in (X, Y, Z, X, Y, Z)],
+    "a million metres away": [(X, 1e6), (Y, -1e6), (Z, 1e6)],
+    "at the origin": [(X, 0.0), (Y, 0.0), (Z, 0.0)],
+}
+PLACES = {
+    "somewhere": torch.stack((middle, SCENE.lower + 0.3, SCENE.upper - 0.2)),
+    "on the receiver": receiver.expand(3, 3),
+    "beside the receiver": receiver + torch.tensor([[1e-6, 0, 0], [0, 1e-4, 0], [0, 0, 1e-7]]),
+    "on a plane": torch.stack((torch.tensor([5.0, 1, 1]), torch.tensor([0.0, 0, 0]), middle)),
+    "on the receiver's height": torch.stack([torch.tensor([x, 1.0, float(receiver[2])]) for x in (1.0, 2.0, 3.0)]),
+    "right below the receiver": receiver - torch.tensor([[0, 0, 0.5], [0, 0, 1.0], [0, 0, 2.0]]),
+    "behind the planes": torch.tensor([[50.0, 1, 1], [-50.0, 2, 1], [1.0, 1, -70]]),
+}
+CASES = [(planes, "somewhere") for planes in PLANES]
+CASES += [(planes, places) for planes in ("parallel", "all through the receiver") for places in PLACES]
+CASES += [("as they start", places) for places in PLACES if places != "somewhere"]
+DIGITS = 2e-6
+"""Of the longest way that an image takes: five roundings at each of some mirrors."""
+
+
+def laid(placement, planes):
+    """The placement with planes there, each given by its normal and by where it cuts that [m]; all of them in use."""
+    if planes and hasattr(placement, "place"):
+        for number, (normal, offset) in enumerate(planes):
+            placement.place(number, torch.tensor(normal), offset)
+        placement.kept.copy_(placement.words_of(torch.arange(len(planes))))
+    return placement
+
+
+def ask_placed(gaussians):
+    def ask(module, transmitters):
+        receivers = torch.arange(len(transmitters)) % 2
+        query = Query(transmitters, receivers, transmitters.new_full((len(transmitters),), 5e9))
+        own = None if gaussians is None else widen(gaussians, transmitters.dtype)
+        placed = module(own, query)
+        if placed.gains is None:
+            return placed
+        # Whoever stands on a plane by float32's digits may rightly be on either side of it: gains are finite there, and
+        # no more is asked.
+        assert placed.gains.isfinite().all()
+        heard_at = module.scene.positions(transmitters)[receivers]
+        heights = torch.stack([(ends @ module.normals.T - module.offsets).abs() for ends in (transmitters, heard_at)])
+        sure = (heights[:, :, module.used] > 1e-5).all(-1).all(0)[:, None]
+        return placed._replace(gains=placed.gains - torch.where(sure, 0, placed.gains.detach()))
+
+    return ask
+
+
+@pytest.mark.parametrize("name", registry("placement").names())
+@pytest.mark.parametrize("task", LINKS)
+@pytest.mark.parametrize(("planes", "places"), CASES)
+def test_placed(name, task, planes, places):
+    """Values as of float64; where planes are 1e6 m away only to that many of its digits, and phases not at all."""
+    scene = LINKS[task].scene
+    options = ["placement.planes=6", "placement.order=2", "placement.obstacles=3"] if name == "mirrored" else []
+    placement = laid(build("placement", name, *options, scene=scene, channels=2), PLANES[planes])
+    gaussians = example_gaussians(scene, 5)
+    far = 1e6 if planes == "a million metres away" else 0.0
+    placed = require_same(ask_placed(gaussians), placement, PLACES[places], within=8 * DIGITS * far)
+    assert len(placed)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("planes", [name for name in PLANES if name != "as they start"])
+@pytest.mark.parametrize("places", PLACES)
+def test_ways_of_words(order, planes, places):
+    """Folded paths are as long as the straight line to the image wherever they exist."""
+    words = all_words(len(PLANES[planes]), order)
+    normals = functional.normalize(torch.tensor([normal for normal, _ in PLANES[planes]]), dim=1)
+    offsets = torch.tensor([offset for _, offset in PLANES[planes]])
+
+    def ask(_, transmitters, normals, offsets):
+        seen = images(transmitters, words, normals, offsets)
+        receivers = receiver.to(transmitters).expand_as(transmitters)
+        return seen, receivers, fold(seen, receivers, words, normals, offsets)
+
+    far = 1e6 if planes == "a million metres away" else 0.0
+    results = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [part.to(dtype).requires_grad_() for part in (PLACES[places], normals, offsets)]
+        seen, receivers, folded = ask(None, *leaves)
+        ends = [*seen, folded.start, folded.end, *(bounce.points for bounce in folded.bounces)]
+        assert all(end.isfinite().all() for end in ends)
+        gradients = torch.autograd.grad(sum(end.mean() for end in ends), leaves)
+        assert all(gradient.isfinite().all() for gradient in gradients)
+        straight = (seen[-1] - receivers[:, None]).norm(dim=-1)
+        legs = (folded.end - folded.start).norm(dim=-1)
+        ways = torch.zeros_like(straight).index_add(1, folded.path, legs)
+        bound = 1e-3 if dtype == torch.float32 else 1e-6
+        assert (ways - straight)[folded.exists].abs().max() <= bound * max(1.0, straight.max().item())
+        results.append((seen[-1], folded.exists))
+    (single, _), (double, _) = results
+    assert (single - double).abs().max() <= DIGITS * order * max(50.0, far, double.abs().max().item())
+
+
+@pytest.mark.parametrize("planes", PLANES)
+def test_phases_of_many_mirrors_are_those_of_float64(planes):
+    """Where phases count, a path's length is known to a fraction of the wavelength."""
+    if planes == "a million metres away":
+        pytest.skip("float32 has no such digits")
+    scene = LINKS["spectrum"].scene
+    config = composed("placement=mirrored", "placement.planes=6", "placement.order=3", "placement.obstacles=0")
+    torch.manual_seed(0)
+    placement = registry("placement").build(config["placement"], scene=scene, channels=2)
+    laid(placement, PLANES[planes]).sharpen(0.06)
+    require_same(ask_placed(None), placement, PLACES["somewhere"], tolerance=5e-3)
+
+
+FAR = torch.tensor([4096.0, -8192.0, 512.0])
+
+
+def far_placement():
+    """The planes of a room far from the world's origin, as they start."""
+    receivers = [replace(one, pose=replace(one.pose, position=one.pose.position + FAR)) for one in SCENE.receivers]
+    far = replace(SCENE, receivers=tuple(receivers), lower=SCENE.lower + FAR, upper=SCENE.upper + FAR)
+    return build("placement", "mirrored", scene=far, channels=2).requires_grad_(False)
+
+
+def test_planes_of_a_room_lie_alike_wherever_the_origin_is():
+    """The walls that a training starts from stand beyond the box, and a step of training turns them about the room."""
+    here, there = build("placement", "mirrored", scene=SCENE, channels=2).requires_grad_(False), far_placement()
+    turn = 0.01 * torch.randn(here.shifts.shape, generator=torch.Generator().manual_seed(0))
+    for shifts in (0 * turn, turn):
+        here.shifts.copy_(shifts)
+        there.shifts.copy_(shifts)
+        torch.testing.assert_close(there.normals, here.normals)
+        apart = (there.offsets - there.normals @ FAR) - here.offsets
+        assert apart[:BOX].abs().max() < 4 * TILT * here.diagonal
+
+
+def test_planes_of_earlier_checkpoints_stay_where_they_were():
+    """They know no pivot and turn about the world's origin."""
+    placement = far_placement()
+    assert placement.pivot.abs().max() > 8000
+    state = {name: part for name, part in placement.state_dict().items() if name != "pivot"}
+    state["shifts"] = 0.1 * torch.ones_like(state["shifts"])
+    placement.load_state_dict(state)
+    assert not placement.pivot.any()
+    torch.testing.assert_close(placement.offsets, state["origin"][:, 3] + UNIT * placement.diagonal * 0.1)

@@ -1,0 +1,170 @@
+"""Null, huge and nearly parallel multivectors: versors and equivariant layers, held against float64."""
+
+import math
+
+import pytest
+import torch
+from precision import DTYPES, require_same
+
+from gaigs.algebra import PROJECTIVE, SPACETIME
+from gaigs.algebra.embedding import embed_direction, embed_plane, embed_point, embed_reflection, extract_point
+from gaigs.algebra.layers import (
+    EquivariantLinear,
+    GATrBlock,
+    GeometricAttention,
+    GeometricBilinear,
+    equivariant_norm,
+    gated_gelu,
+)
+
+ALGEBRAS = {"projective": PROJECTIVE, "spacetime": SPACETIME}
+B, TOKENS, C, S = 2, 5, 4, 4
+
+
+def random(*shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(0))
+
+
+def light_like(algebra):
+    """Vectors whose square is zero: e0 of the projective algebra, e1 + e4 of space-time."""
+    x = torch.zeros(B, TOKENS, C, algebra.size)
+    x[..., 1] = 1
+    if algebra is SPACETIME:
+        x[..., 4] = 1
+    return x
+
+
+def at_infinity(algebra):
+    """Points without a place; of space-time all blades that hold a light-like vector."""
+    if algebra is PROJECTIVE:
+        return embed_direction(random(B, TOKENS, C, 3))
+    return algebra.product(random(B, TOKENS, C, algebra.size), light_like(algebra))
+
+
+TOKENS_OF = {
+    "nothing": lambda algebra: torch.zeros(B, TOKENS, C, algebra.size),
+    "null vectors": light_like,
+    "null vectors of 1e4": lambda algebra: 1e4 * light_like(algebra),
+    "points at infinity": at_infinity,
+    "nearly at infinity": lambda algebra: at_infinity(algebra) + 1e-6 * random(B, TOKENS, C, algebra.size),
+    "all alike": lambda algebra: random(1, 1, 1, algebra.size).expand(B, TOKENS, C, -1),
+    "tiny": lambda algebra: 1e-20 * random(B, TOKENS, C, algebra.size),
+    "denormal": lambda algebra: 1e-42 * random(B, TOKENS, C, algebra.size),
+    "of 1e4": lambda algebra: 1e4 * random(B, TOKENS, C, algebra.size),
+    "one huge among others": lambda algebra: (
+        random(B, TOKENS, C, algebra.size) * (1 + 1e5 * (torch.arange(TOKENS) == 2))[:, None, None]
+    ),
+}
+
+
+def attend(module, x, s):
+    return module(x, s)
+
+
+LAYERS = {
+    "linear": (lambda algebra: EquivariantLinear(algebra, (C, 6), (S, 2)), attend),
+    "bilinear": (lambda algebra: GeometricBilinear(algebra, C, S), lambda m, x, s: m(x, s, x.mean((-3, -2)))),
+    "attention": (lambda algebra: GeometricAttention(algebra, C, S, 2), lambda m, x, s: m(*norm(m.algebra, x, s))),
+    "block": (lambda algebra: GATrBlock(algebra, C, S, 2), lambda m, x, s: m(x, s, x.mean((-3, -2)))),
+    "norm": (lambda algebra: Holder(algebra, equivariant_norm), attend),
+    "gelu": (lambda algebra: Holder(algebra, lambda _, x, s: gated_gelu(x, s)), attend),
+}
+
+
+def norm(algebra, x, s):
+    return equivariant_norm(algebra, x, s)
+
+
+class Holder(torch.nn.Module):
+    """A function as a layer."""
+
+    def __init__(self, algebra, function):
+        super().__init__()
+        self.algebra, self.function = algebra, function
+
+    def forward(self, x, s):
+        return self.function(self.algebra, x, s)
+
+
+@pytest.mark.parametrize("algebra", ALGEBRAS)
+@pytest.mark.parametrize("layer", LAYERS)
+@pytest.mark.parametrize("tokens", TOKENS_OF)
+def test_layers(algebra, layer, tokens):
+    algebra = ALGEBRAS[algebra]
+    make, ask = LAYERS[layer]
+    torch.manual_seed(0)
+    x = TOKENS_OF[tokens](algebra)
+    # Squares of light-like vectors of 1e4 cancel in a logit or product but for float32's last digits: they are finite,
+    # and no more is asked.
+    within = math.inf if tokens == "null vectors of 1e4" else 0
+    require_same(ask, make(algebra), x, random(B, TOKENS, S), tolerance=2e-3, within=within)
+
+
+@pytest.mark.parametrize("algebra", ALGEBRAS)
+@pytest.mark.parametrize("factor", [30.0, 300.0])
+def test_attention_with_logits_of_1e4_and_more(algebra, factor):
+    """The softmax of huge logits picks one token; it neither overflows nor loses its gradient to NaN."""
+    algebra = ALGEBRAS[algebra]
+    torch.manual_seed(0)
+    layer = GeometricAttention(algebra, C, S, 2)
+    with torch.no_grad():
+        for parameter in layer.project.parameters():
+            parameter.mul_(factor)
+    require_same(attend, layer, random(B, TOKENS, C, algebra.size), random(B, TOKENS, S), tolerance=2e-2)
+
+
+# --- mirrors ---
+
+TURNS = [0.0, 1e-12, 1e-7, 1e-4, 0.1, math.pi / 2, math.pi - 1e-7, math.pi]
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("apart", [0.0, 1e-7, 1.0, 1e3])
+def test_two_mirrors_turn_by_twice_their_angle(dtype, turn, apart):
+    """Two planes, parallel, nearly so or one and the same: the versor is of unit length and moves as the mirrors do."""
+    normals = torch.tensor([[1.0, 0, 0], [math.cos(turn), math.sin(turn), 0]], dtype=dtype).requires_grad_()
+    offsets = torch.tensor([0.5, 0.5 + apart], dtype=dtype).requires_grad_()
+    first, second = embed_reflection(normals, offsets)
+    versor = PROJECTIVE.product(second, first)
+    eps = torch.finfo(dtype).eps
+    assert PROJECTIVE.inner(versor, versor).item() == pytest.approx(1, abs=20 * eps)
+    points = 3 * random(6, 3).to(dtype)
+    moved = extract_point(PROJECTIVE.sandwich(versor, embed_point(points)))
+    expected = points
+    for normal, offset in zip(normals, offsets, strict=True):
+        expected = expected - 2 * (expected @ normal - offset)[:, None] * normal
+    assert (moved - expected).abs().max().item() <= 60 * eps * (10 + 2 * apart)
+    gradients = torch.autograd.grad(moved.sum(), (normals, offsets))
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
+@pytest.mark.parametrize("length", [1e-30, 1e-18, 1.0, 1e18, 1e30])
+def test_a_mirror_is_the_same_however_long_its_normal_is(dtype, length):
+    normals = torch.tensor([[0.6, 0.0, 0.8]], dtype=dtype)
+    expected = embed_reflection(normals, torch.tensor([2.0], dtype=dtype))
+    scaled = (length * normals).requires_grad_()
+    found = embed_reflection(scaled, torch.tensor([2.0 * length], dtype=dtype))
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    assert torch.autograd.grad(found[0, 2:5].sum(), scaled)[0].isfinite().all()
+
+
+@pytest.mark.parametrize("vector", ["e0", "nothing", "e1 + e4"])
+def test_what_has_no_inverse_moves_nothing(vector):
+    algebra = SPACETIME if vector == "e1 + e4" else PROJECTIVE
+    versor = torch.zeros(algebra.size)
+    if vector != "nothing":
+        versor = light_like(algebra)[0, 0, 0]
+    with pytest.raises(ValueError, match="not null"):
+        algebra.sandwich(versor, random(algebra.size))
+
+
+def test_coincident_planes_meet_nowhere():
+    """Their wedge is null: no line, and no NaN."""
+    plane = embed_plane(torch.tensor([0.0, 0.6, 0.8]), torch.tensor(2.0))
+    assert not PROJECTIVE.wedge(plane, plane).any()
+    turned = embed_plane(torch.tensor([0.0, 0.6, 0.8]), torch.tensor(5.0))
+    line = PROJECTIVE.wedge(plane, turned)
+    assert PROJECTIVE.inner(line, line) == 0
+    assert line.isfinite().all()
