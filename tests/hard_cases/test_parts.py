@@ -126,6 +126,19 @@ def test_residuals(name, size, n):
         assert attenuations.le(1).all()
 
 
+@pytest.mark.parametrize("push", [-1e4, 1e4])
+def test_attenuations_of_a_network_that_has_run_away(push):
+    """Their logarithm stays finite."""
+    heads = "deformation.heads=[rotation,scale,signal,opacity,attenuation]"
+    module = build("deformation", "two_branch", heads, scene=SCENE, channels=2, tokenizer_widths=(5, 4, 6))
+    torch.nn.init.constant_(module.heads["attenuation"].bias, push)
+    tokens = torch.ones(3, 5), torch.ones(7, 4), torch.ones(3, 6)
+    ask = lambda module, *tokens: module(Tokens(*tokens), None, None)
+    *_, attenuations = require_same(ask, module, *tokens)
+    assert attenuations.gt(0).all()
+    assert attenuations.le(1).all()
+
+
 # --- what is read from a map ---
 
 MAPS = {

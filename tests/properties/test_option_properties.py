@@ -25,9 +25,9 @@ def suits(value, annotation):
     """Written down anew: numbers are no bool, whole ones are numbers too, and all are finite and of 64 bits."""
     match annotation:
         case _ if annotation is int:
-            return type(value) is int and abs(value) <= LARGEST[int]
+            return type(value) is int and abs(value) <= LARGEST
         case _ if annotation is float:
-            return type(value) in (int, float) and math.isfinite(value) and abs(value) <= LARGEST[float]
+            return suits(value, int) or (type(value) is float and math.isfinite(value))
         case _ if annotation is str:
             return isinstance(value, str)
         case _ if annotation is bool:
