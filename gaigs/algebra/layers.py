@@ -8,12 +8,15 @@ Source: Brehmer et al., Geometric Algebra Transformer, 2023; Spinner et al., Lor
 Transformers, 2024, for signatures with negative squares.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
 from gaigs.algebra import Algebra
+from gaigs.algebra._mix import Mix
 
 NORM_FLOOR = 0.01
 """Added to the squared size in the norm: components with e0 have no size, and light-like ones cancel, so tokens may be
@@ -56,17 +59,9 @@ class EquivariantLinear(nn.Module):
     def forward(
         self, multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
     ) -> tuple[Float[Tensor, "*batch c_out k"], Float[Tensor, "*batch s_out"]]:
-        # One matrix a component, (k, tokens, channels): on a CPU three times as fast as one matrix over channels and
-        # components, which is nine tenths zeros. The result keeps that order in memory: only the first layer copies.
-        x = multivectors.movedim(-1, 0).flatten(1, -2)
-        weights = self.weight[self.maps]
-        null_wedges = self.algebra.table("null_wedges", x)
-        result = functional.pad(self.from_scalars(scalars).flatten(0, -2)[None], (0, 0, 0, 0, 0, len(x) - 1))
-        result = torch.baddbmm(result, x, weights[0])
-        for wedge, weight in zip(null_wedges[1:], weights[1:], strict=True):
-            result = torch.baddbmm(result, (wedge @ x.flatten(1)).view_as(x), weight)
-        result = result.unflatten(1, multivectors.shape[:-2]).movedim(0, -1)
-        return result, self.to_scalars(torch.cat((multivectors[..., 0], scalars), -1))
+        null_wedges = self.algebra.table("null_wedges", self.weight)
+        linears = self.from_scalars.weight, self.from_scalars.bias, self.to_scalars.weight, self.to_scalars.bias
+        return Mix.apply(multivectors, scalars, self.weight, *linears, self.maps, null_wedges)
 
 
 class GeometricBilinear(nn.Module):
@@ -162,6 +157,33 @@ class GeometricAttention(nn.Module):
     def forward(
         self, multivectors: Float[Tensor, "*batch tokens c k"], scalars: Float[Tensor, "*batch tokens s"]
     ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
+        """What each token sees of all."""
+        query, key, value = self._project(multivectors, scalars)
+        return self._read(functional.scaled_dot_product_attention(query, key, value).movedim(-3, -2))
+
+    def look(
+        self, multivectors: Float[Tensor, "tokens c k"], scalars: Float[Tensor, "tokens s"], groups: tuple[int, int]
+    ) -> tuple[Float[Tensor, "b c k"], Float[Tensor, "b s"]]:
+        """What the first token of each group sees of its group, and of the tokens that are alike for all groups.
+
+        Args:
+            multivectors: Tokens' multivectors: one group after the other, then those that are alike, if any.
+            scalars: Likewise.
+            groups: Number of groups, and of tokens in each.
+        """
+        query, key, value = self._project(multivectors, scalars)
+        own = math.prod(groups)
+        query = query[:, :own].unflatten(1, groups)[:, :, 0]
+        logits = (key[:, :own].unflatten(1, groups) @ query[..., None]).squeeze(-1), query @ key[:, own:].mT
+        weights = (torch.cat(logits, -1) * query.shape[-1] ** -0.5).softmax(-1)
+        grouped, alike = weights.split((groups[1], key.shape[1] - own), -1)
+        mixed = (grouped[..., None, :] @ value[:, :own].unflatten(1, groups)).squeeze(-2) + alike @ value[:, own:]
+        return self._read(mixed.movedim(0, 1))
+
+    def _project(
+        self, multivectors: Float[Tensor, "*batch tokens c k"], scalars: Float[Tensor, "*batch tokens s"]
+    ) -> list[Float[Tensor, "*batch heads tokens f"]]:
+        """Query, key and value of each token."""
         multivectors, scalars = self.project(multivectors, scalars)
         # Query, key and value first, then heads before tokens.
         multivectors = multivectors.unflatten(-2, (3, self.heads, -1)).movedim((-4, -3), (0, -4))
@@ -169,9 +191,13 @@ class GeometricAttention(nn.Module):
         query_key, value = multivectors.split((2, 1))
         query, key = self.features(query_key)
         channels = zip((query @ self.form, key, value[0]), scalars, strict=True)
-        query, key, value = (torch.cat((x.flatten(-2), s), -1) for x, s in channels)
-        mixed = functional.scaled_dot_product_attention(query, key, value).movedim(-3, -2)
-        width = scalars.shape[-1]
+        return [torch.cat((x.flatten(-2), s), -1) for x, s in channels]
+
+    def _read(
+        self, mixed: Float[Tensor, "*tokens heads f"]
+    ) -> tuple[Float[Tensor, "*tokens c k"], Float[Tensor, "*tokens s"]]:
+        """Multivectors and scalars of mixed values."""
+        width = self.project.to_scalars.out_features // (3 * self.heads)
         multivectors, scalars = mixed.split((mixed.shape[-1] - width, width), -1)
         multivectors = multivectors.unflatten(-1, (-1, self.algebra.size)).flatten(-3, -2)
         return self.output(multivectors, scalars.flatten(-2))
@@ -245,6 +271,14 @@ class GATrBlock(nn.Module):
         """The block's first half, in which tokens look at each other."""
         attended = self.attention(*equivariant_norm(self.algebra, multivectors, scalars))
         return multivectors + attended[0], scalars + attended[1]
+
+    def look(
+        self, multivectors: Float[Tensor, "tokens c k"], scalars: Float[Tensor, "tokens s"], groups: tuple[int, int]
+    ) -> tuple[Float[Tensor, "b 1 c k"], Float[Tensor, "b 1 s"]]:
+        """``attend`` for the first token of each group alone; see ``GeometricAttention.look``."""
+        seen = self.attention.look(*equivariant_norm(self.algebra, multivectors, scalars), groups)
+        firsts = (x[: math.prod(groups)].unflatten(0, groups)[:, :1] for x in (multivectors, scalars))
+        return tuple(first + part[:, None] for first, part in zip(firsts, seen, strict=True))
 
     def transform(
         self,

@@ -102,20 +102,33 @@ class GATokenizer(nn.Module):
         b, m = len(query), min(self.anchors, means.shape[1])
         anchors = means[:, opacities.topk(m).indices]
         tx, anchors = ((positions - self.middle) / self.scale for positions in (transmitters, anchors))
-        points = self.embed(torch.cat((self.cls.expand(b, 1, 3), tx[:, None], anchors.expand(b, m, 3)), 1))
-        types = torch.cat((self.types[:2], self.types[2:].expand(m, 2)))
-        types = types.expand(b, -1, -1)
-        if self.scene.has_band:
-            band = self.scene.band_positions(query)[:, None, None].expand(-1, types.shape[1], 1)
-            types = torch.cat((types, band), 2)
-
-        multivectors, scalars = self.first(points[..., None, :], types)
-        reference = points.mean(1)
+        tokens = [self.cls.expand(b, 1, 3), tx[:, None]]
         *blocks, final = self.blocks
-        for block in blocks:
-            multivectors, scalars = block(multivectors, scalars, reference)
-        # Only CLS is read, so the half of the final block in which tokens are by themselves runs for CLS alone.
-        multivectors, scalars = (x[:, :1] for x in final.attend(multivectors, scalars))
-        multivectors, scalars = self.last(*final.transform(multivectors, scalars, reference))
+        # Anchors are alike for all queries as long as nobody reads what they become once they see the transmitter.
+        alike = len(anchors) == 1 and not blocks and not self.scene.has_band
+        if not alike:
+            tokens.append(anchors.expand(b, m, 3))
+        tokens = torch.cat(tokens, 1)
+        groups = tuple(tokens.shape[:2])
+        types = torch.cat((self.types[:2], self.types[2:].expand(m, 2)))
+        types = types[: groups[1]].expand(*groups, 2).flatten(0, 1)
+        tokens = tokens.flatten(0, 1)
+        if alike:
+            tokens, types = torch.cat((tokens, anchors[0])), torch.cat((types, self.types[2:].expand(m, 2)))
+        if self.scene.has_band:
+            band = self.scene.band_positions(query).repeat_interleave(groups[1])
+            types = torch.cat((types, band[:, None]), 1)
+
+        points = self.embed(tokens)
+        multivectors, scalars = self.first(points[:, None], types)
+        reference = points[: b * groups[1]].unflatten(0, groups)[:, 1]  # the transmitter, which moves with the room
+        if blocks:
+            multivectors, scalars = multivectors.unflatten(0, groups), scalars.unflatten(0, groups)
+            for block in blocks:
+                multivectors, scalars = block(multivectors, scalars, reference)
+            multivectors, scalars = multivectors.flatten(0, 1), scalars.flatten(0, 1)
+        # Only CLS is read, so in the final block it alone looks, and it alone goes on.
+        multivectors, scalars = final.transform(*final.look(multivectors, scalars, groups), reference)
+        multivectors, scalars = self.last(multivectors, scalars)
         scene = self.read_out(torch.cat((multivectors.flatten(1), scalars.flatten(1)), -1))
         return Tokens(scene, means.new_zeros(means.shape[1], 0), transmitters.new_zeros(b, 0))
