@@ -1,0 +1,46 @@
+"""Means over windows, which structural similarity is made of."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+def window_means(images: Float[Tensor, "*batch rows columns"], window: int) -> Float[Tensor, "*batch r c"]:
+    """Means over every square window that lies within an image.
+
+    ``torch.nn.functional.avg_pool2d`` with a stride of 1, which adds up window² pixels for each on a CPU; here they are
+    added along rows and then along columns, whole images at a time.
+
+    Args:
+        images: At least as many rows and columns as the window has.
+        window: Its edge [pixels].
+    """
+    return _WindowMeans.apply(images, window)
+
+
+class _WindowMeans(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, images, window):
+        ctx.window = window
+        for axis in (-1, -2):
+            count = images.shape[axis] - window + 1
+            total = images.narrow(axis, 0, count).clone()
+            for first in range(1, window):
+                total += images.narrow(axis, first, count)
+            images = total
+        return images.div_(window**2)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, of_means):
+        gradient = of_means / ctx.window**2
+        for axis in (-2, -1):
+            count = gradient.shape[axis]
+            shape = list(gradient.shape)
+            shape[axis] += ctx.window - 1
+            total = gradient.new_zeros(shape)
+            for first in range(ctx.window):
+                total.narrow(axis, first, count).add_(gradient)
+            gradient = total
+        return gradient, None
