@@ -1,5 +1,6 @@
 """Learning rates over a training, and the optimizers they belong to."""
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping
 from types import ModuleType
 
@@ -18,7 +19,8 @@ def make_optimizer(
 
     Args:
         config: ``_target_``, a class of ``torch.optim``, and its options. A weight decay is that of the group
-            ``network`` alone: positions, scales and opacities have no reason to be small.
+            ``network`` alone: positions, scales and opacities have no reason to be small. On a CPU a step is fused
+            where the class can do it and no option says otherwise.
         groups: Parameters by name.
         rates: Learning rate of each group.
 
@@ -30,6 +32,10 @@ def make_optimizer(
     if "lr" in options:
         raise ValueError("training.optimizer takes no lr, as each group has its own; set training.learning_rates")
     parts = [{"params": list(parameters), "lr": rates[name], "name": name} for name, parameters in groups.items()]
+    parameters = [parameter for part in parts for parameter in part["params"]]
+    implementations = {"fused", "foreach", "differentiable"} & inspect.signature(kind).parameters.keys()
+    if "fused" in implementations and not implementations & options.keys():
+        options["fused"] = all(p.is_floating_point() and p.device.type == "cpu" for p in parameters)
     optimizer = call("training.optimizer", kind, options, params=parts)
     for group in optimizer.param_groups:
         if group["name"] != "network" and "weight_decay" in group:

@@ -61,6 +61,42 @@ def test_momentum_is_torchs_own(groups):
     torch.testing.assert_close(x.detach(), 1 - 0.5 * (1 + 1.9) * x.grad)
 
 
+@pytest.mark.parametrize(
+    ("target", "options", "fused"),
+    [
+        ("AdamW", {}, True),
+        ("SGD", {}, True),
+        ("AdamW", {"fused": False}, False),
+        ("AdamW", {"foreach": True}, None),
+        ("RMSprop", {}, None),
+    ],
+)
+def test_a_step_is_fused_where_torch_can(groups, target, options, fused):
+    optimizer = make_optimizer({"_target_": f"torch.optim.{target}", **options}, groups, RATES)
+    assert optimizer.defaults.get("fused") is fused
+
+
+def test_parameters_of_another_kind_are_not_fused(groups):
+    groups["means"] = [torch.nn.Parameter(torch.ones(2, dtype=torch.complex64))]
+    assert make_optimizer(ADAM, groups, RATES).defaults["fused"] is False
+
+
+def test_a_fused_step_is_the_plain_one(groups):
+    start = {name: [parameter.detach().clone() for parameter in group] for name, group in groups.items()}
+    ends = []
+    for fused in (False, True):
+        own = {name: [torch.nn.Parameter(x.double()) for x in group] for name, group in start.items()}
+        optimizer = make_optimizer(ADAM | {"fused": fused}, own, RATES)
+        torch.manual_seed(0)
+        for _ in range(5):
+            for parameter in (parameter for group in own.values() for parameter in group):
+                parameter.grad = torch.randn_like(parameter)
+            optimizer.step()
+        ends.append([parameter.detach() for group in own.values() for parameter in group])
+    for plain, fused in zip(*ends, strict=True):
+        torch.testing.assert_close(fused, plain, rtol=1e-12, atol=1e-14)
+
+
 ELSEWHERE = ("os.system", "AdamW", "torch.nn.Linear", "torch.optim.AdanW", "torch.optim.lr_scheduler.StepLR")
 
 
