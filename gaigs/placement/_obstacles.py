@@ -79,16 +79,15 @@ class _Depth(torch.autograd.Function):
     def forward(ctx, start, end, centres, log_widths, log_densities):
         ctx.shape = start.shape
         start, end = start.reshape(-1, 3), end.reshape(-1, 3)
-        *_, r, near, inside, length = _parts(start, end, centres, log_widths)
+        parts = *_, r, near, inside, length = _parts(start, end, centres, log_widths)
         each = near * inside * r * (log_densities.exp() * math.sqrt(math.pi))
-        ctx.save_for_backward(start, end, centres, log_widths, log_densities)
+        ctx.save_for_backward(start, end, centres, log_widths, log_densities, *parts)
         return (each.sum(-1) * length).view(ctx.shape[:-1])
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
-        start, end, centres, log_widths, log_densities = ctx.saved_tensors
-        a, b, r, near, inside, length = _parts(start, end, centres, log_widths)
+        start, end, centres, log_widths, log_densities, a, b, r, near, inside, length = ctx.saved_tensors
         gradient = gradient.reshape(-1, 1)
         scale = gradient * length[:, None] * (log_densities.exp() * math.sqrt(math.pi))
         rate = scale * near * r  # of the depth by E
