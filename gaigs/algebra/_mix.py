@@ -32,16 +32,15 @@ class Mix(torch.autograd.Function):
         ctx, multivectors, scalars, weight, from_weight, from_bias, to_weight, to_bias, maps, null_wedges
     ) -> tuple[Tensor, Tensor]:
         ctx.shapes = multivectors.shape, scalars.shape
-        with torch.autocast(weight.device.type, enabled=False):
-            x, flat = _components_first(multivectors).to(weight.dtype), scalars.flatten(0, -2).to(weight.dtype)
-            wedges = [x, *((wedge @ x.flatten(1)).view_as(x) for wedge in null_wedges[1:])]
-            matrices = weight.index_select(0, maps.flatten()).view(*maps.shape, *weight.shape[1:])
-            result = torch.bmm(x, matrices[0])
-            for wedge, matrix in zip(wedges[1:], matrices[1:], strict=True):
-                result.baddbmm_(wedge, matrix)
-            result[0].addmm_(flat, from_weight.mT).add_(from_bias)
-            seen = torch.cat((x[0], flat), -1)
-            mixed = torch.addmm(to_bias, seen, to_weight.mT)
+        x, flat = _components_first(multivectors), scalars.flatten(0, -2)
+        wedges = [x, *((wedge @ x.flatten(1)).view_as(x) for wedge in null_wedges[1:])]
+        matrices = weight.index_select(0, maps.flatten()).view(*maps.shape, *weight.shape[1:])
+        result = torch.bmm(x, matrices[0])
+        for wedge, matrix in zip(wedges[1:], matrices[1:], strict=True):
+            result.baddbmm_(wedge, matrix)
+        result[0].addmm_(flat, from_weight.mT).add_(from_bias)
+        seen = torch.cat((x[0], flat), -1)
+        mixed = torch.addmm(to_bias, seen, to_weight.mT)
         ctx.save_for_backward(seen, matrices, weight, from_weight, to_weight, maps, null_wedges, *wedges)
         tokens = multivectors.shape[:-2]
         return result.unflatten(1, tokens).movedim(0, -1), mixed.unflatten(0, tokens)

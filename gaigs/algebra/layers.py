@@ -59,6 +59,10 @@ class EquivariantLinear(nn.Module):
     def forward(
         self, multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
     ) -> tuple[Float[Tensor, "*batch c_out k"], Float[Tensor, "*batch s_out"]]:
+        device = self.weight.device.type
+        if torch.is_autocast_enabled(device):  # products by hand are those of the weights' precision
+            with torch.autocast(device, enabled=False):
+                return self(multivectors.to(self.weight.dtype), scalars.to(self.weight.dtype))
         null_wedges = self.algebra.table("null_wedges", self.weight)
         linears = self.from_scalars.weight, self.from_scalars.bias, self.to_scalars.weight, self.to_scalars.bias
         return Mix.apply(multivectors, scalars, self.weight, *linears, self.maps, null_wedges)

@@ -161,7 +161,7 @@ class GaussianSplatting(Model):
         query = batch.query
         # What a place excites is the same for all who hear it, unless a part looks at the receiver.
         places, which = query.unique(with_receivers=self._sees_receivers)
-        placed, residuals = self._excite(places)
+        _, residuals, _ = excited = self._excite(places)
         links, values = [], []
         for receiver in query.receivers.unique().tolist() or [0]:  # no links have a label's shape too
             links.append((query.receivers == receiver).nonzero()[:, 0])
@@ -169,11 +169,11 @@ class GaussianSplatting(Model):
             if self.draws_map:
                 maps = [
                     self.rasterizer(*arguments)[0]
-                    for arguments in self._arguments(placed, residuals, which[links[-1]], receiver, batch.directions)
+                    for arguments in self._arguments(*excited, which[links[-1]], receiver, batch.directions)
                 ]
                 value = self.pooling(torch.cat(maps), own, batch.directions)
             else:
-                heard = self._sum(placed, residuals, which[links[-1]], receiver, own)
+                heard = self._sum(*excited, which[links[-1]], receiver, own)
                 value = self.pooling.hear(heard, own, batch.directions)
             if self.pooling.grid is None and batch.directions is not None:
                 value = value.reshape(len(own), *batch.directions.shape)  # a list of rays was rendered as one row
@@ -228,8 +228,8 @@ class GaussianSplatting(Model):
         parts = self.placement, self.tokenizer, self.deformation
         return any(getattr(part, "sees_receivers", False) for part in parts)
 
-    def _excite(self, query: Query) -> tuple[Placed, Residuals]:
-        """The Gaussians for each query, and what it changes in them."""
+    def _excite(self, query: Query) -> tuple[Placed, Residuals, Float[Tensor, "places n 3 3"]]:
+        """The Gaussians for each query, what it changes in them, and their semi-axes then (1 or b, n, 3, 3) [m]."""
         placed = self.placement(self.gaussians, query)
         if placed.opacities is None:
             own = self.gaussians
@@ -242,12 +242,19 @@ class GaussianSplatting(Model):
         # The network says how a place responds to a transmitter; where the Gaussians go is learnt from the image alone.
         seen = Placed(*(None if part is None else part.detach() for part in placed))
         tokens = None if self.tokenizer is None else self.tokenizer(seen, seen.opacities, query)
-        return placed, self.deformation(tokens, seen, query)
+        residuals = self.deformation(tokens, seen, query)
+        quats, scales = placed.quats[None], placed.scales
+        if residuals.delta_quats is not None:
+            quats = quats + residuals.delta_quats
+        if residuals.delta_scales is not None:
+            scales = scales + residuals.delta_scales
+        return placed, residuals, semi_axes(quats, scales)
 
     def _arguments(
         self,
         placed: Placed,
         residuals: Residuals,
+        axes: Float[Tensor, "places n 3 3"],
         which: Int[Tensor, "b"],
         receiver: int,
         directions: Directions | None,
@@ -265,19 +272,26 @@ class GaussianSplatting(Model):
         for row in rows:
             if not len(placed.means):
                 n = placed.means.shape[1]
-                placed = placed._replace(means=placed.means.new_zeros(1, n, 3), scales=placed.means.new_ones(1, n, 3))
+                placed = placed._replace(means=placed.means.new_zeros(1, n, 3))
+                axes = placed.means.new_ones(1, n, 3, 3)
             stands = placed.means if len(placed.means) == 1 else placed.means[row]
-            splats = self._splats(placed, residuals, stands, row, receiver)
+            splats = self._splats(stands, axes, row, receiver)
             signal, opacities, attenuations = self._strengths(placed, residuals, row)
             calls.append((splats, signal, opacities, attenuations, plane))
         return calls
 
     def _sum(
-        self, placed: Placed, residuals: Residuals, which: Int[Tensor, "b"], receiver: int, query: Query
+        self,
+        placed: Placed,
+        residuals: Residuals,
+        axes: Float[Tensor, "places n 3 3"],
+        which: Int[Tensor, "b"],
+        receiver: int,
+        query: Query,
     ) -> Tensor:
         """What the receiver's elements hear, summed without a map."""
         stands = placed.means.expand(len(which), -1, -1) if len(placed.means) == 1 else placed.means[which]
-        splats = self._splats(placed, residuals, stands, which, receiver)
+        splats = self._splats(stands, axes, which, receiver)
         signal, opacities, _ = self._strengths(placed, residuals, which)
         amplitudes = torch.complex(signal[..., 0], signal[..., 1]) * opacities
         n = amplitudes.shape[1]
@@ -318,19 +332,11 @@ class GaussianSplatting(Model):
         return signal.expand(len(which), -1, -1), opacities.expand(len(which), -1), attenuations
 
     def _splats(
-        self, placed: Placed, residuals: Residuals, means: Tensor, which: Int[Tensor, "b"], receiver: int
+        self, means: Tensor, axes: Float[Tensor, "places n 3 3"], which: Int[Tensor, "b"], receiver: int
     ) -> Splats:
         """Some queries' Gaussians on the receiver's plane."""
-        quats, scales = placed.quats[None], placed.scales
-        if len(scales) > 1:
-            scales = scales[which]
-        if residuals.delta_quats is not None:
-            quats = quats + residuals.delta_quats[which]
-        if residuals.delta_scales is not None:
-            scales = scales + residuals.delta_scales[which]
-        return self.projection.project(
-            means if not self.draws_map else means[0], semi_axes(quats, scales), self.scene.receivers[receiver].pose
-        )
+        axes, pose = axes if len(axes) == 1 else axes[which], self.scene.receivers[receiver].pose
+        return self.projection.project(means if not self.draws_map else means[0], axes, pose)
 
 
 def _towards(bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]) -> Float[Tensor, "*b n c 1"]:
