@@ -205,3 +205,89 @@ def test_channels_that_cannot_be_shared_are_refused():
         GeometricAttention(PROJECTIVE, 6, 4, heads=3)
     with pytest.raises(ValueError, match="must be even, got 3"):
         GeometricBilinear(PROJECTIVE, 3, 2)
+
+
+# --- by hand ---
+
+
+def plain_linear(layer, multivectors, scalars):
+    """The sum over the maps, a matrix of components for each: a grade alone, or e0 times a grade."""
+    algebra, eye = layer.algebra, torch.eye(layer.algebra.size, dtype=torch.float64)
+    grades = algebra.table("grades", eye)
+    matrices = [torch.diag(grade) for grade in grades]
+    if algebra.r:
+        e0 = eye[algebra.blades.index("e0")]
+        matrices += [(algebra.wedge(e0, eye) * grade[:, None]).mT for grade in grades[:-1]]
+    assert len(matrices) == len(layer.weight)
+    result = sum(
+        torch.einsum("...ck,lk,cd->...dl", multivectors, matrix, weight)
+        for matrix, weight in zip(matrices, layer.weight, strict=True)
+    )
+    ones = torch.nn.functional.pad(layer.from_scalars(scalars)[..., None], (0, algebra.size - 1))
+    return result + ones, layer.to_scalars(torch.cat((multivectors[..., 0], scalars), -1))
+
+
+@algebras
+@pytest.mark.parametrize("batch", [(B, TOKENS), (1,), (0, 3), (3, 0)], ids=str)
+@pytest.mark.parametrize("channels", [(C, 6), (1, 3)], ids=str)
+def test_linear_is_the_sum_over_its_maps_and_so_are_its_gradients(algebra, batch, channels):
+    layer = EquivariantLinear(algebra, channels, (S, 2)).double()
+    torch.nn.init.normal_(layer.from_scalars.bias)
+    multivectors = torch.randn(*batch, algebra.size, channels[0]).double().mT.requires_grad_()
+    scalars = torch.randn(*batch, S).double().requires_grad_()
+    before = multivectors.detach().clone()
+    found, expected = layer(multivectors, scalars), plain_linear(layer, multivectors, scalars)
+    weights = [torch.randn_like(part) for part in expected]
+    wanted = (multivectors, scalars, *layer.parameters())
+    gradients = [torch.autograd.grad(parts, wanted, weights) for parts in (found, expected)]
+    for one, other in zip((*found, *gradients[0]), (*expected, *gradients[1]), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+    assert torch.equal(multivectors, before)
+
+
+def test_gradients_of_the_linear_map_are_those_of_differences():
+    layer = EquivariantLinear(PROJECTIVE, (2, 3), (2, 1)).double()
+    inputs = torch.randn(2, 2, 16).double(), torch.randn(2, 2).double()
+    assert torch.autograd.gradcheck(layer, [x.requires_grad_() for x in inputs])
+    names, values = zip(*layer.named_parameters(), strict=True)
+    on_parameters = lambda *values: torch.func.functional_call(layer, dict(zip(names, values, strict=True)), inputs)
+    assert torch.autograd.gradcheck(on_parameters, values)
+
+
+def test_a_linear_map_in_mixed_precision_is_that_of_its_weights():
+    layer = EquivariantLinear(PROJECTIVE, (2, 2), (1, 1))
+    multivectors, scalars = torch.randn(3, 2, 16), torch.randn(3, 1, requires_grad=True)
+    expected = layer(multivectors, scalars)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = layer(multivectors, scalars)
+    assert all(map(torch.equal, found, expected))
+    assert torch.autograd.grad(found[1].sum(), scalars)[0].dtype == torch.float32
+
+
+# --- the first token of each group ---
+
+
+@algebras
+@pytest.mark.parametrize("groups", [(3, 2), (1, 4), (2, 1), (0, 2)], ids=str)
+@pytest.mark.parametrize("alike", [0, 1, 5])
+def test_the_first_token_sees_what_it_would_among_all(algebra, groups, alike):
+    """Each group by itself, with the tokens that are alike beside it, through the whole attention."""
+    block = GATrBlock(algebra, C, 4, heads=2).double()
+    b, size = groups
+    multivectors = torch.randn(b * size + alike, C, algebra.size).double().requires_grad_()
+    scalars = torch.randn(b * size + alike, 4).double().requires_grad_()
+    expected = [[], []]
+    for i in range(b):
+        own = [torch.cat((x[i * size : (i + 1) * size], x[b * size :])) for x in (multivectors, scalars)]
+        for parts, attended in zip(expected, block.attend(*own), strict=True):
+            parts.append(attended[:1])
+    found = block.look(multivectors, scalars, groups)
+    assert [part.shape for part in found] == [(b, 1, C, algebra.size), (b, 1, 4)]
+    if not b:
+        return
+    expected = [torch.stack(parts) for parts in expected]
+    weights = [torch.randn_like(part) for part in expected]
+    wanted = (multivectors, scalars, *block.attention.parameters())
+    gradients = [torch.autograd.grad(parts, wanted, weights) for parts in (found, expected)]
+    for one, other in zip((*found, *gradients[0]), (*expected, *gradients[1]), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-11)
