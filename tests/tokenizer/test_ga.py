@@ -184,3 +184,30 @@ def test_carriers_tell_transmitters_of_one_place_apart(room, algebra):
     assert (scene[0] - scene[1]).abs().max() > 1e-4
     with pytest.raises(ValueError, match="so a frequency must be given"):
         tokens_of(GATokenizer(band, algebra=algebra), means, opacities, places)
+
+
+def plain_scene(tokenizer, means, opacities, transmitters):
+    """CLS where all tokens of all transmitters go through all of each block, anchors too."""
+    b, m = len(transmitters), min(tokenizer.anchors, len(means))
+    anchors = means[opacities.topk(m).indices].expand(b, m, 3)
+    tx, anchors = ((positions - tokenizer.middle) / tokenizer.scale for positions in (transmitters, anchors))
+    points = tokenizer.embed(torch.cat((tokenizer.cls.expand(b, 1, 3), tx[:, None], anchors), 1))
+    types = torch.cat((tokenizer.types[:2], tokenizer.types[2:].expand(m, 2))).expand(b, -1, -1)
+    tokens = tokenizer.first(points[..., None, :], types)
+    for block in tokenizer.blocks:
+        tokens = block(*tokens, points.mean(1))
+    multivectors, scalars = tokenizer.last(*tokens)
+    return tokenizer.read_out(torch.cat((multivectors[:, 0, 0], scalars[:, 0]), -1))
+
+
+@both
+@pytest.mark.parametrize("blocks", [1, 2])
+@pytest.mark.parametrize(("b", "n"), [(B, N), (1, 1), (5, 3), (2, 0), (0, 3)])
+def test_what_is_left_out_changes_neither_values_nor_gradients(algebra, blocks, b, n):
+    tokenizer = GATokenizer(make_scene(), blocks=blocks, algebra=algebra).double()
+    inputs = 3 * torch.randn(n, 3).double(), torch.rand(n).double(), 4 * torch.rand(b, 3).double()
+    found, expected = tokens_of(tokenizer, *inputs).scene, plain_scene(tokenizer, *inputs)
+    weights = torch.randn_like(expected)
+    gradients = [torch.autograd.grad(scene, [*tokenizer.parameters()], weights) for scene in (found, expected)]
+    for one, other in zip((found, *gradients[0]), (expected, *gradients[1]), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-11)
