@@ -1,12 +1,13 @@
 """The command line: ``python -m gaigs +experiment=spectrum``."""
 
 import contextlib
+import importlib
 import logging
 import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hydra
@@ -17,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gaigs import configuration, files, processes
-from gaigs.processes import Stopped, forward_to_children, lacks_memory, limit_threads, stopping
+from gaigs.processes import Stopped, forward_to_children, lacks_memory, limit_threads, only_run, stopping
 from gaigs.report import at_end
 
 log = logging.getLogger("gaigs")
@@ -47,12 +48,16 @@ def run(config: DictConfig) -> float | None:
                     # Hydra prints that of the first job that failed alone: so each says it in its log, in one line.
                     log.error("gaigs: %s", " ".join(str(error).removeprefix("gaigs: ").split()) or repr(error))
                 raise
+        case "benchmark":
+            return benchmark(config)
         case "devices":
             return list_devices()
         case "agreement":
             return compare_labels(config)
         case unknown:
-            raise CompactHydraException(f"gaigs: command must be train, agreement or devices, got {unknown!r}")
+            raise CompactHydraException(
+                f"gaigs: command must be train, benchmark, agreement or devices, got {unknown!r}"
+            )
 
 
 def train(config: DictConfig) -> float | None:
@@ -66,30 +71,37 @@ def train(config: DictConfig) -> float | None:
             with 1, after the other jobs of a multirun. With ``hydra.verbose=true`` the traceback comes before it.
         SystemExit: A signal has stopped the run: 128 and the signal's number, as shells report it.
     """
-    settings = HydraConfig.get()
-    plain, is_sweep = resolved(config), settings.mode is RunMode.MULTIRUN
-    mode = "sweep" if is_sweep else "run"
-    goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
-    try:
-        with mendable(goes_on):
-            from gaigs import experiment  # slow to import: here, once the configuration has proved good
+    plain, folder = resolved(config), Path(HydraConfig.get().runtime.output_dir)
 
-            for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
-                logging.getLogger(name).setLevel(logging.WARNING)
-            with stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
-                metrics = experiment.run(plain, Path(settings.runtime.output_dir))
-    except KeyboardInterrupt as stop:
-        told = f"gaigs: {str(stop) or 'stopped'}; {goes_on}"
-        number = getattr(stop, "number", signal.SIGINT)
-        if is_sweep and settings.launcher["_target_"] != BASIC_LAUNCHER:
-            # Only this job ends: a launcher that sees a process exit kills its other jobs before they have saved.
-            processes.received.append(number)
-            raise CompactHydraException(told) from None
-        if not processes.is_first():  # it ends well: at a code of failure Lightning would kill the first one
-            raise SystemExit(0) from None
-        print(told, file=sys.stderr)
-        raise SystemExit(128 + number) from None
+    def work() -> dict | None:
+        from gaigs import experiment  # slow to import
+
+        return experiment.run(plain, folder)
+
+    metrics = going_on_later(work)
     return None if metrics is None else metrics["validation_score"]
+
+
+def benchmark(config: DictConfig) -> None:
+    """Runs a benchmark in Hydra's run folder.
+
+    Raises:
+        CompactHydraException, SystemExit: As of ``train``.
+    """
+    plain, folder = resolved(config), Path(HydraConfig.get().runtime.output_dir)
+    own = ("command=", "benchmark=", "benchmark.")
+    overrides = [word for word in HydraConfig.get().overrides.task if not word.lstrip("+~").startswith(own)]
+
+    def work() -> None:
+        from gaigs.benchmark import Context, devices  # slow to import
+        from gaigs.registry import registry
+
+        chosen = registry("benchmark").build(plain["benchmark"])
+        with only_run(folder):
+            chosen.run(folder, Context(tuple(overrides), devices()))
+        log.info("results: %s", folder)
+
+    going_on_later(work)
 
 
 def compare_labels(config: DictConfig) -> None:
@@ -124,6 +136,35 @@ def resolved(config: DictConfig) -> dict:
     except (TypeError, ValueError) as error:
         raise CompactHydraException(f"gaigs: {error}") from error
     return plain
+
+
+def going_on_later(work: Callable):
+    """What ``work`` gives, which goes on in the same folder where it was stopped.
+
+    Raises:
+        CompactHydraException, SystemExit: As of ``train``.
+    """
+    settings = HydraConfig.get()
+    is_sweep = settings.mode is RunMode.MULTIRUN
+    mode = "sweep" if is_sweep else "run"
+    goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
+    try:
+        with mendable(goes_on), stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
+            importlib.import_module("lightning.pytorch")  # slow: here, once the configuration has proved good
+            for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
+                logging.getLogger(name).setLevel(logging.WARNING)
+            return work()
+    except KeyboardInterrupt as stop:
+        told = f"gaigs: {str(stop) or 'stopped'}; {goes_on}"
+        number = getattr(stop, "number", signal.SIGINT)
+        if is_sweep and settings.launcher["_target_"] != BASIC_LAUNCHER:
+            # Only this job ends: a launcher that sees a process exit kills its other jobs before they have saved.
+            processes.received.append(number)
+            raise CompactHydraException(told) from None
+        if not processes.is_first():  # it ends well: at a code of failure Lightning would kill the first one
+            raise SystemExit(0) from None
+        print(told, file=sys.stderr)
+        raise SystemExit(128 + number) from None
 
 
 @contextlib.contextmanager

@@ -22,8 +22,11 @@ HARMLESS = (
 )  # fmt: skip
 """Keys that change nothing of what a run finds: one that goes on may have others."""
 
+MAY_BE_NULL = ("gaussians", "density", "benchmark")
+"""Choices that a configuration may be without."""
+
 KEYS = {
-    **dict.fromkeys((*KINDS, "trainer"), dict), **dict.fromkeys(("gaussians", "density"), dict | None),
+    **dict.fromkeys((*KINDS, "trainer"), dict), **dict.fromkeys(MAY_BE_NULL, dict | None),
     "kriging": bool, "kriging_folds": int, "baselines": list[dict], "command": str, "seed": int, "save_every": float,
     "tensorboard": bool, "threads": int | None,
 }  # fmt: skip
@@ -82,11 +85,16 @@ def check(config: dict) -> None:
     if unknown := [key for key in config if key not in KEYS]:
         listed = ", ".join(sorted(KEYS))
         raise ValueError(f"the configuration has no key {suggest(unknown[0], KEYS)}; there are: {listed}")
-    if missing := sorted(KEYS.keys() - {"density", "gaussians"} - config.keys()):  # which may be null
+    if missing := sorted(KEYS.keys() - {*MAY_BE_NULL} - config.keys()):
         raise ValueError(f"the configuration needs the key {missing[0]!r}; conf/config.yaml has them all")
     for key, annotation in KEYS.items():
         check_type(key, config.get(key), annotation)
-    for kind in KINDS:
+    if config.get("benchmark") is not None and config["command"] != "benchmark":
+        raise ValueError(
+            f"benchmark={config['benchmark'].get('name')} needs command=benchmark, got command={config['command']}; "
+            "add command=benchmark, or leave out the benchmark"
+        )
+    for kind in KINDS[: KINDS.index("benchmark")]:
         check_type(f"{kind}.name", config[kind].get("name"), str)
     check_type("task.baselines", config["task"].get("baselines", []), list[dict])
     if not 0 <= config["seed"] < 2**32:

@@ -24,9 +24,9 @@ from omegaconf import OmegaConf
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
-    "model", "training",
+    "model", "training", "benchmark",
 )  # fmt: skip
-"""In the order of a prediction's parts; each is a folder of gaigs and of conf."""
+"""In the order of a prediction's parts, and then what measures them; each is a folder of gaigs and of conf."""
 
 PLAIN = {
     int: (numbers.Integral, "a whole number"),

@@ -57,7 +57,7 @@ def rasterize_densely(
     plane: Plane,
 ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
     """The formula of ``gaigs.rasterizer.Rasterizer`` over all pairs of splat and pixel, in float64: slow, but plain."""
-    order, footprints = _footprints(splats, plane)
+    order, footprints = footprints_of(splats, plane)
     product = opacities[:, order, None, None].double() * footprints
     acts = product >= ALPHA_MIN
     alpha = torch.where(acts, product.clamp(max=ALPHA_MAX), 0)
@@ -69,7 +69,7 @@ def rasterize_densely(
     return image, passed.prod(1)
 
 
-def _footprints(splats: Splats, plane: Plane) -> tuple[Tensor, Float[Tensor, "b n rows columns"]]:
+def footprints_of(splats: Splats, plane: Plane) -> tuple[Tensor, Float[Tensor, "b n rows columns"]]:
     """Indices of visible splats front to back, and exp(-x' C^-1 x / 2) of each at every pixel, float64."""
     order = splats.depths.argsort(stable=True)
     order = order[splats.visible[order]]
@@ -85,7 +85,7 @@ def _footprints(splats: Splats, plane: Plane) -> tuple[Tensor, Float[Tensor, "b 
 @torch.no_grad()
 def _distance_to_jumps(splats, signal, opacities, attenuations, plane) -> Float[Tensor, "b rows columns"]:
     """How far, relatively, each pixel is from the nearest jump of value or gradient, a G = ALPHA_MIN or ALPHA_MAX."""
-    order, footprints = _footprints(splats, plane)
+    order, footprints = footprints_of(splats, plane)
     product = opacities[:, order, None, None].double() * footprints
     bounds = product.new_tensor([ALPHA_MIN, ALPHA_MAX])[:, None, None, None, None]
     distances = (product / bounds - 1).abs().amin(0)

@@ -1,0 +1,253 @@
+"""Rasterizers: error against a dense float64 sum, time, memory, share of what the arithmetic allows."""
+
+import functools
+import logging
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+
+import torch
+
+from gaigs.benchmark import UNAVAILABLE, Context, Glance, Measured, Row, clock, named
+from gaigs.benchmark import _rasterizer_page as page
+from gaigs.benchmark._limits import OPERATIONS_OF_FIELDS, WAYS, Ceiling, Product, operations
+from gaigs.benchmark._memory import peak_mb
+from gaigs.benchmark._passes import Passes, Times, in_turns
+from gaigs.benchmark._scenes import DRAWS_NO_MAP, SCENES, ApertureScene, Scene, cast
+from gaigs.benchmark._truth import Truth, errors_of, errors_of_gradients, errors_of_pooled, pooled, sum_densely
+from gaigs.registry import register, registry, suggest
+
+log = logging.getLogger(__name__)
+
+PRECISIONS = ("float64", "float32", "bfloat16", "float16")
+
+CAUSES = (TypeError, ValueError, RuntimeError, ImportError)
+"""What says that a rasterizer does not do a cell."""
+
+
+@register("benchmark", "rasterizer")
+class RasterizerBenchmark(Measured):
+    """Rasterizers x scenes x Gaussians x grids x precisions, forward and backward.
+
+    The rasterizers of a cell take turns, so that their ratios hold on a busy machine, too.
+
+    Args:
+        rasterizers: Names; None: all that are registered but ``fastest``, which is one of the others.
+        common, training, aperture: Numbers of Gaussians in the scene of that name; an empty list leaves it out.
+        grids: Rows and columns of maps, in pairs.
+        precisions: Of the tensors.
+        repeats: Of passes of under half a second.
+        minutes, device: As of every benchmark.
+
+    Raises:
+        ValueError: An option is out of range, or names what there is not.
+    """
+
+    name = "rasterizer"
+    keys = ("device", "rasterizer", "precision", "scene", "gaussians", "grid", "way")
+    values = (
+        "ms", "spread_ms", "least_ms", "repeats", "composited_ms", "pairs", "live_pairs", "pairs_per_second",
+        "gigaops_limit", "share_of_limit", "floor_ms", "live_floor_ms", "error_max", "error_mean", "ssim", "error_db",
+        "pixels_checked", "peak_mb", "tile",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        common: list[int],
+        training: list[int],
+        aperture: list[int],
+        grids: list[list[int]],
+        precisions: list[str],
+        rasterizers: list[str] | None = None,
+        repeats: int = 20,
+        minutes: float | None = None,
+        device: str | None = None,
+    ):
+        super().__init__(minutes, device)
+        known = registry("rasterizer").names()
+        self.rasterizers = [name for name in known if name != "fastest"] if rasterizers is None else rasterizers
+        for what, words, there in (
+            ("rasterizers", self.rasterizers, known),
+            ("precisions", precisions, PRECISIONS),
+        ):
+            if unknown := [word for word in words if word not in there]:
+                listed = ", ".join(there)
+                raise ValueError(f"benchmark.{what} has {suggest(unknown[0], there)}, and there are: {listed}")
+            if not words:
+                raise ValueError(f"benchmark.{what} must have at least one of {', '.join(there)}, got none")
+        self.scenes = {"common": common, "training": training, "aperture": aperture}
+        for scene, counts in self.scenes.items():
+            if any(n < 1 for n in counts):
+                raise ValueError(f"benchmark.{scene} must be numbers of Gaussians of at least 1, got {counts}")
+        if not grids or any(len(grid) != 2 or min(grid) < 8 for grid in grids):
+            raise ValueError(f"benchmark.grids must be pairs of rows and columns, each at least 8, got {grids}")
+        if repeats < 1:
+            raise ValueError(f"benchmark.repeats must be at least 1, got {repeats}")
+        self.grids, self.precisions, self.repeats = grids, precisions, repeats
+
+    def cells(self, context: Context) -> Iterator[list[Row]]:
+        places = []
+        for scene, counts in self.scenes.items():
+            # Of the aperture the grid is only that of what is pooled: the largest will do.
+            grids = [max(self.grids)] if scene == DRAWS_NO_MAP else self.grids
+            places += [
+                (n * grid[0] * grid[1] * (16 if scene == "training" else 1), n, scene, grid)
+                for n in counts
+                for grid in grids
+            ]
+        for _, n, scene, (rows, columns) in sorted(places):
+            for device in context.devices:
+                for precision in self.precisions:
+                    own = {"device": named(device), "precision": precision, "scene": scene, "gaussians": str(n)}
+                    own["grid"] = f"{rows} x {columns}"
+                    yield [own | {"rasterizer": name, "way": way} for name in self.rasterizers for way in WAYS]
+
+    def measure(self, cell: Sequence[Row], context: Context) -> Iterator[Row]:
+        first = cell[0]
+        device = next(device for device in context.devices if named(device) == first["device"])
+        grid = tuple(map(int, first["grid"].split(" x ")))
+        place = first["scene"], int(first["gaussians"]), grid
+        dtype = getattr(torch, first["precision"])
+        double, truth = _scene(*place, device)
+        scene = cast(double, device, dtype)
+        runs, causes = {}, {}
+        for name in dict.fromkeys(row["rasterizer"] for row in cell):
+            try:
+                runs[name] = _start(name, scene)
+            except CAUSES as error:
+                causes[name] = " ".join(str(error).split())
+        times = in_turns(self._turns(runs, scene, device, dtype), self.repeats)
+        found = {name: _errors(run, truth, grid) for name, run in runs.items()}
+        peaks = {name: peak_mb(name, *place, first["precision"], device) for name in runs}
+        for row in cell:
+            name, way = row["rasterizer"], row["way"]
+            if name in causes:
+                yield row | {"status": UNAVAILABLE + causes[name]}
+                continue
+            yield row | found[name][way] | self._figures(times, name, way, scene, truth) | {
+                "peak_mb": peaks[name], "tile": tile_of(runs[name].rasterizer)
+            }  # fmt: skip
+
+    def _turns(self, runs: Mapping[str, Passes], scene: Scene, device: str, dtype: torch.dtype) -> dict:
+        now = clock(device)
+
+        def timed(run: Passes):
+            def turn() -> dict[str, float]:
+                start = now()
+                run.forward()
+                between = now()
+                run.backward()
+                seconds = {"forward": between - start, "backward": now() - between}
+                composited = time_compositing(run, now)
+                return seconds | ({} if composited is None else {"composited": composited})
+
+            return turn
+
+        turns = {name: timed(run) for name, run in runs.items()}
+        product = Product(device, dtype)
+        turns["limit"] = lambda: {"limit": 1 / product.measure()}
+        if "opencl" in runs:
+            ceiling = _ceiling(scene.signal.shape[-1], scene.attenuations is not None)
+            turns["ceiling"] = lambda: {way: ceiling.measure(way) for way in WAYS}
+        return turns
+
+    def _figures(self, times: Mapping[str, Times], name: str, way: str, scene: Scene, truth: Truth) -> Row:
+        own = times[name][way]
+        seconds = statistics.median(own)
+        low, _, high = statistics.quantiles(own, n=4) if len(own) > 1 else own * 3
+        if isinstance(scene, ApertureScene):
+            count = OPERATIONS_OF_FIELDS[way]
+        else:
+            count = operations(way, scene.signal.shape[-1], scene.attenuations is not None)
+        limit = 1 / statistics.median(times["limit"]["limit"])
+        figures = {
+            "ms": 1e3 * seconds, "spread_ms": 1e3 * (high - low), "least_ms": 1e3 * min(own), "repeats": len(own),
+            "pairs": truth.pairs, "live_pairs": truth.live, "pairs_per_second": truth.pairs / seconds,
+            "gigaops_limit": limit / 1e9, "share_of_limit": truth.pairs * count / seconds / limit,
+        }  # fmt: skip
+        if composited := times[name].get("composited") if way == "forward" else None:
+            figures["composited_ms"] = 1e3 * statistics.median(composited)
+        if "ceiling" in times:
+            pair = 1e3 * statistics.median(times["ceiling"][way])
+            figures |= {"floor_ms": pair * truth.pairs, "live_floor_ms": pair * truth.live}
+        return figures
+
+    def tables(self, rows: Sequence[Row]) -> str:
+        return page.tables(rows)
+
+    def figures(self, rows: Sequence[Row]):
+        return page.figures(rows)
+
+    def highlights(self, rows: Sequence[Row]) -> Sequence[Glance]:
+        return page.highlights(rows)
+
+
+def tile_of(rasterizer) -> str | None:
+    """Rows and columns of a rasterizer's tiles, where it has them; none has them as an option."""
+    match rasterizer.used.split()[0]:
+        case "torch":
+            from gaigs.rasterizer.torch import TILE
+
+            return f"{TILE} x {TILE}"
+        case "opencl":
+            from gaigs.rasterizer import opencl
+
+            return f"{opencl.ROWS} x {opencl.COLUMNS}"
+    return None
+
+
+def time_compositing(run: Passes, now) -> float | None:
+    """Time of the forward pass without sorting and listing [s], for the one rasterizer that has them apart."""
+    if type(run.rasterizer).__name__ != "OpenCLRasterizer":
+        return None
+    from gaigs.rasterizer import opencl
+
+    with torch.no_grad():
+        splats, *others = run.scene
+        render = opencl._Render(opencl.open_queue(run.rasterizer.device), splats, *others)
+        start = now()
+        render.forward(differentiate=True)
+        return now() - start
+
+
+@functools.lru_cache(1)
+def _scene(name: str, n: int, grid: tuple[int, int], device: str) -> tuple[Scene, Truth]:
+    """A scene in float64 and what it gives; the cells of several precisions come one after the other."""
+    scene = SCENES[name](n, *grid)
+    return scene, sum_densely(scene, device)
+
+
+_ceiling = functools.cache(Ceiling)
+
+
+def _start(name: str, scene: Scene) -> Passes:
+    """A rasterizer that has done its first passes on a scene.
+
+    Raises:
+        TypeError, ValueError, RuntimeError, ImportError: It does not do that.
+    """
+    rasterizer = registry("rasterizer").build({"name": name})
+    draws = getattr(rasterizer, "draws_map", True)
+    if draws == isinstance(scene, ApertureScene):
+        told = "it draws maps, and sums nothing in an aperture" if draws else "it draws no map: see the scene aperture"
+        raise ValueError(told)
+    run = Passes(rasterizer, scene)
+    run.forward()
+    run.backward()
+    return run
+
+
+def _errors(run: Passes, truth: Truth, grid: tuple[int, int]) -> dict[str, dict[str, float]]:
+    """Errors of the map and its pooled value, and those of gradients, by way."""
+    run.forward()
+    found = run.result()
+    pixels = None
+    if not isinstance(run.scene, ApertureScene):
+        pixels = found.new_zeros(found.shape[0], *found.shape[2:])
+        pixels[..., truth.band] = truth.clear.to(pixels)
+    run.backward(pixels)
+    ssim, level = errors_of_pooled(pooled(found, grid, truth.band), pooled(truth.outputs, grid, slice(None)))
+    largest, mean = errors_of(found, truth)
+    forward = {"error_max": largest, "error_mean": mean, "ssim": ssim, "error_db": level}
+    largest, mean = errors_of_gradients(run.gradients(), truth)
+    checked = {"pixels_checked": truth.checked}
+    return {"forward": forward | checked, "backward": {"error_max": largest, "error_mean": mean} | checked}
