@@ -5,18 +5,21 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from gaigs import configuration
 from gaigs.benchmark._rows import MEASURED, NOT_MEASURED, UNAVAILABLE, Row, Rows, text_of
 from gaigs.evaluation import device_name
 from gaigs.files import whole
+from gaigs.registry import suggest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,7 +51,8 @@ class Context:
             TypeError: A value is not of its key's type.
             ValueError: A key is unknown or missing, or its value out of range.
         """
-        with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
+        running = GlobalHydra.instance().is_initialized()  # which Hydra's main has done, and allows no other
+        with nullcontext() if running else initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
             config = compose("config", [*self.overrides, *overrides])
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         configuration.check(plain)
@@ -200,14 +204,33 @@ class Measured(Benchmark):
             rows.add(self.measure(cell, context))
             if context.deadline < math.inf:
                 longest = max(longest, time.monotonic() - begun)
-            told = ", ".join(dict.fromkeys(row[key] for row in cell for key in self.keys if key != "device"))
+            shared = {key: cell[0][key] for key in self.keys if len({row[key] for row in cell}) == 1}
+            told = ", ".join(text for key, text in shared.items() if text and key != "device")
             minutes = (time.monotonic() - started) / 60
-            log.info("%s %d/%d, %.1f min: %s", self.name, number + 1, len(left), minutes, told)
+            log.info("%s %d/%d, %.1f min %s", self.name, number + 1, len(left), minutes, told)
 
 
 def devices() -> tuple[str, ...]:
     """Devices that torch tensors may be on here."""
     return ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
+
+
+def device_of(row: Row, context: Context) -> str:
+    """The torch device that a row's name stands for."""
+    return next(device for device in context.devices if named(device) == row["device"])
+
+
+def check_names(option: str, words: Sequence[str], known: Sequence[str]) -> None:
+    """Sees to it that a list of an option names at least one thing, and only such as there are.
+
+    Raises:
+        ValueError: It does not.
+    """
+    if not words:
+        raise ValueError(f"benchmark.{option} must have at least one of {', '.join(known)}, got none")
+    for word in words:
+        if word not in known:
+            raise ValueError(f"benchmark.{option} has {suggest(word, known)}, and there are: {', '.join(known)}")
 
 
 def named(device: str) -> str:

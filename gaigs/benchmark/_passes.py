@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaigs.benchmark._scenes import ApertureScene, Scene, with_leaves
+from gaigs.registry import registry
 
 BRIEF, LONG, FEWEST = 0.5, 10.0, 3
 """What takes less than ``BRIEF`` [s] is repeated as often as asked for; all else for ``LONG`` [s], but ``FEWEST`` times
@@ -53,6 +54,27 @@ class Passes:
     def gradients(self) -> list[Tensor]:
         """Of the last backward pass, by each leaf of the scene."""
         return [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in self.scene.leaves()]
+
+
+CAUSES = (TypeError, ValueError, RuntimeError, ImportError)
+"""What says that a rasterizer does not do a scene."""
+
+
+def start(name: str, scene: Scene) -> Passes:
+    """A rasterizer that has done its first passes on a scene.
+
+    Raises:
+        TypeError, ValueError, RuntimeError, ImportError: It does not do that.
+    """
+    rasterizer = registry("rasterizer").build({"name": name})
+    draws = getattr(rasterizer, "draws_map", True)
+    if draws == isinstance(scene, ApertureScene):
+        told = "draws maps, and sums nothing in an aperture" if draws else "draws no map; see the scene aperture"
+        raise ValueError(f"{name} {told}")
+    run = Passes(rasterizer, scene)
+    run.forward()
+    run.backward()
+    return run
 
 
 Times = dict[Hashable, list[float]]

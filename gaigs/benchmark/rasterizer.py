@@ -7,21 +7,18 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 
-from gaigs.benchmark import UNAVAILABLE, Context, Glance, Measured, Row, clock, named
+from gaigs.benchmark import UNAVAILABLE, Context, Glance, Measured, Row, check_names, clock, device_of, named
 from gaigs.benchmark import _rasterizer_page as page
 from gaigs.benchmark._limits import OPERATIONS_OF_FIELDS, WAYS, Ceiling, Product, operations
 from gaigs.benchmark._memory import peak_mb
-from gaigs.benchmark._passes import Passes, Times, in_turns
+from gaigs.benchmark._passes import CAUSES, Passes, Times, in_turns, start
 from gaigs.benchmark._scenes import DRAWS_NO_MAP, SCENES, ApertureScene, Scene, cast
 from gaigs.benchmark._truth import Truth, errors_of, errors_of_gradients, errors_of_pooled, pooled, sum_densely
-from gaigs.registry import register, registry, suggest
+from gaigs.registry import register, registry
 
 log = logging.getLogger(__name__)
 
 PRECISIONS = ("float64", "float32", "bfloat16", "float16")
-
-CAUSES = (TypeError, ValueError, RuntimeError, ImportError)
-"""What says that a rasterizer does not do a cell."""
 
 
 @register("benchmark", "rasterizer")
@@ -65,15 +62,8 @@ class RasterizerBenchmark(Measured):
         super().__init__(minutes, device)
         known = registry("rasterizer").names()
         self.rasterizers = [name for name in known if name != "fastest"] if rasterizers is None else rasterizers
-        for what, words, there in (
-            ("rasterizers", self.rasterizers, known),
-            ("precisions", precisions, PRECISIONS),
-        ):
-            if unknown := [word for word in words if word not in there]:
-                listed = ", ".join(there)
-                raise ValueError(f"benchmark.{what} has {suggest(unknown[0], there)}, and there are: {listed}")
-            if not words:
-                raise ValueError(f"benchmark.{what} must have at least one of {', '.join(there)}, got none")
+        check_names("rasterizers", self.rasterizers, known)
+        check_names("precisions", precisions, PRECISIONS)
         self.scenes = {"common": common, "training": training, "aperture": aperture}
         for scene, counts in self.scenes.items():
             if any(n < 1 for n in counts):
@@ -103,7 +93,7 @@ class RasterizerBenchmark(Measured):
 
     def measure(self, cell: Sequence[Row], context: Context) -> Iterator[Row]:
         first = cell[0]
-        device = next(device for device in context.devices if named(device) == first["device"])
+        device = device_of(first, context)
         grid = tuple(map(int, first["grid"].split(" x ")))
         place = first["scene"], int(first["gaussians"]), grid
         dtype = getattr(torch, first["precision"])
@@ -112,7 +102,7 @@ class RasterizerBenchmark(Measured):
         runs, causes = {}, {}
         for name in dict.fromkeys(row["rasterizer"] for row in cell):
             try:
-                runs[name] = _start(name, scene)
+                runs[name] = start(name, scene)
             except CAUSES as error:
                 causes[name] = " ".join(str(error).split())
         times = in_turns(self._turns(runs, scene, device, dtype), self.repeats)
@@ -217,23 +207,6 @@ def _scene(name: str, n: int, grid: tuple[int, int], device: str) -> tuple[Scene
 
 
 _ceiling = functools.cache(Ceiling)
-
-
-def _start(name: str, scene: Scene) -> Passes:
-    """A rasterizer that has done its first passes on a scene.
-
-    Raises:
-        TypeError, ValueError, RuntimeError, ImportError: It does not do that.
-    """
-    rasterizer = registry("rasterizer").build({"name": name})
-    draws = getattr(rasterizer, "draws_map", True)
-    if draws == isinstance(scene, ApertureScene):
-        told = "it draws maps, and sums nothing in an aperture" if draws else "it draws no map: see the scene aperture"
-        raise ValueError(told)
-    run = Passes(rasterizer, scene)
-    run.forward()
-    run.backward()
-    return run
 
 
 def _errors(run: Passes, truth: Truth, grid: tuple[int, int]) -> dict[str, dict[str, float]]:
