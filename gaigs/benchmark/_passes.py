@@ -77,6 +77,16 @@ def start(name: str, scene: Scene) -> Passes:
     return run
 
 
+def compositor(run: Passes) -> Callable[[], object]:
+    """Of a run of ``opencl`` the forward pass without sorting and listing, which are done here."""
+    from gaigs.rasterizer import opencl  # not where there is no driver
+
+    with torch.no_grad():
+        splats, *others = run.scene
+        render = opencl._Render(opencl.open_queue(run.rasterizer.device), splats, *others)
+    return lambda: render.forward(differentiate=True)
+
+
 Times = dict[Hashable, list[float]]
 """Seconds, or whatever a turn gives, by part."""
 

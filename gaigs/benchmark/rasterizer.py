@@ -11,7 +11,7 @@ from gaigs.benchmark import UNAVAILABLE, Context, Glance, Measured, Row, check_n
 from gaigs.benchmark import _rasterizer_page as page
 from gaigs.benchmark._limits import OPERATIONS_OF_FIELDS, WAYS, Ceiling, Product, operations
 from gaigs.benchmark._memory import peak_mb
-from gaigs.benchmark._passes import CAUSES, Passes, Times, in_turns, start
+from gaigs.benchmark._passes import CAUSES, Passes, Times, compositor, in_turns, start
 from gaigs.benchmark._scenes import DRAWS_NO_MAP, SCENES, ApertureScene, Scene, cast
 from gaigs.benchmark._truth import Truth, errors_of, errors_of_gradients, errors_of_pooled, pooled, sum_densely
 from gaigs.registry import register, registry
@@ -120,19 +120,24 @@ class RasterizerBenchmark(Measured):
     def _turns(self, runs: Mapping[str, Passes], scene: Scene, device: str, dtype: torch.dtype) -> dict:
         now = clock(device)
 
-        def timed(run: Passes):
+        def timed(name: str, run: Passes):
+            composite = compositor(run) if name == "opencl" else None
+
             def turn() -> dict[str, float]:
                 start = now()
                 run.forward()
                 between = now()
                 run.backward()
                 seconds = {"forward": between - start, "backward": now() - between}
-                composited = time_compositing(run, now)
-                return seconds | ({} if composited is None else {"composited": composited})
+                if composite:
+                    start = now()
+                    composite()
+                    seconds["composited"] = now() - start
+                return seconds
 
             return turn
 
-        turns = {name: timed(run) for name, run in runs.items()}
+        turns = {name: timed(name, run) for name, run in runs.items()}
         product = Product(device, dtype)
         turns["limit"] = lambda: {"limit": 1 / product.measure()}
         if "opencl" in runs:
@@ -183,20 +188,6 @@ def tile_of(rasterizer) -> str | None:
 
             return f"{opencl.ROWS} x {opencl.COLUMNS}"
     return None
-
-
-def time_compositing(run: Passes, now) -> float | None:
-    """Time of the forward pass without sorting and listing [s], for the one rasterizer that has them apart."""
-    if type(run.rasterizer).__name__ != "OpenCLRasterizer":
-        return None
-    from gaigs.rasterizer import opencl
-
-    with torch.no_grad():
-        splats, *others = run.scene
-        render = opencl._Render(opencl.open_queue(run.rasterizer.device), splats, *others)
-        start = now()
-        render.forward(differentiate=True)
-        return now() - start
 
 
 @functools.lru_cache(1)
