@@ -191,7 +191,7 @@ class Measured(Benchmark):
 
     def _measure_cells(self, rows: Rows, context: Context) -> None:
         cells = [[{key: text_of(row[key]) for key in self.keys} for row in cell] for cell in self.cells(context)]
-        left = [cell for cell in cells if not all(map(rows.has, cell))]
+        left = [cell for cell in cells if rows.lack(cell)]  # `all` is a module here
         if len(left) < len(cells):
             log.info("%s: %d of %d cells are measured already", self.name, len(cells) - len(left), len(cells))
         started, longest = time.monotonic(), 0.0

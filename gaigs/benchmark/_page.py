@@ -23,16 +23,23 @@ def number(text: str) -> str:
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:#.3g}".removesuffix(".")
 
 
-def remarks(rows: Sequence[Row], keys: Sequence[str]) -> str:
-    """What could not be measured and why, and what there was no time for, as lists."""
+def remarks(rows: Sequence[Row], keys: Sequence[str], place: Sequence[str] = ()) -> str:
+    """What could not be measured and why, and what there was no time for, as a list.
+
+    Args:
+        rows: Of the file.
+        keys: What to call a row that could not be measured.
+        place: What to call one that there was no time for; nothing: the same.
+    """
     causes: dict[str, dict[str, None]] = {}
     for row in rows:
         if row["status"].startswith(UNAVAILABLE):
             cause = row["status"].removeprefix(UNAVAILABLE)
             causes.setdefault(cause, {})[", ".join(row[key] for key in keys[:2] if row[key])] = None
     lines = [f"- unavailable: {'; '.join(where)}: {cause}" for cause, where in causes.items()]
-    late = [", ".join(row[key] for key in keys if row[key]) for row in rows if row["status"] == NOT_MEASURED]
-    lines += [f"- not measured, as time was up: {what}" for what in late]
+    late = [", ".join(row[key] for key in place or keys if row[key]) for row in rows if row["status"] == NOT_MEASURED]
+    if late:
+        lines.append(f"- not measured, as time was up: {'; '.join(dict.fromkeys(late))}")
     return "\n".join(lines) + "\n" if lines else ""
 
 

@@ -40,6 +40,10 @@ class Rows:
         found = self._rows.get(self._key(row))
         return found is not None and found["status"] != NOT_MEASURED
 
+    def lack(self, cell: Iterable[Row]) -> bool:
+        """Whether a row of a cell is still to be measured."""
+        return not all(map(self.has, cell))
+
     def add(self, rows: Iterable[Row]) -> None:
         """Appends rows to the file.
 
