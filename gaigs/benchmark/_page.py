@@ -1,6 +1,7 @@
 """What the pages of benchmarks share."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Sequence
 
 from gaigs.benchmark._rows import NOT_MEASURED, UNAVAILABLE, Row
 
@@ -41,6 +42,21 @@ def remarks(rows: Sequence[Row], keys: Sequence[str], place: Sequence[str] = ())
     if late:
         lines.append(f"- not measured, as time was up: {'; '.join(dict.fromkeys(late))}")
     return "\n".join(lines) + "\n" if lines else ""
+
+
+def load_now() -> float | None:
+    """How many processes want a core, as the system tells; None where it does not."""
+    try:
+        return os.getloadavg()[0]
+    except (AttributeError, OSError):
+        return None
+
+
+def load_of(rows: Iterable[Row]) -> str:
+    """The range of the column "load"."""
+    loads = [float(row["load"]) for row in rows if row["load"]]
+    ends = dict.fromkeys(f"{end:.1f}" for end in (min(loads), max(loads))) if loads else ["unknown"]
+    return " to ".join(ends)
 
 
 def best(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

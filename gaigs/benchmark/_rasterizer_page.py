@@ -5,7 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from gaigs.benchmark import MEASURED, Glance, Row
 from gaigs.benchmark._limits import WAYS
-from gaigs.benchmark._page import number, remarks, table
+from gaigs.benchmark._page import load_of, number, remarks, table
+from gaigs.benchmark._scenes import SCENES
 
 ABOUT = """Every rasterizer composites the same Gaussians, and is held against the dense sum over all pairs of splat and
 pixel in float64. The rasterizers of a table took turns, so that ratios within it hold on a busy machine, too; those
@@ -20,11 +21,12 @@ between tables may not.
 | times | as fast as `torch` in the same precision |
 | pairs | splat, pixel and transmitter where the splat's opacity is at least 1/255 |
 | live | pairs in front of which the transmittance is at least 1e-4 |
-| of limit | operations that the pairs take by the formulas, over those of a matrix product in that precision |
+| of limit | operations that the pairs take by the formulas, over those of the fastest matrix product meanwhile |
 | floor | what the OpenCL kernels' arithmetic takes for all pairs, and for live pairs, with every operand at hand |
 | composited | the forward pass of `opencl` without sorting and listing |
 | error | of the map, and backward of the gradients, over the largest value; where no pair is within 1e-4 of a bound |
 | SSIM, dB | of the amplitude that is pooled from the map, and of its power |
+| load | processes that wanted a core meanwhile, this one among them; above the threads, times are too long |
 | memory | what both passes add to the memory in use at most, in a process of their own |
 
 Inputs are rounded to each precision, which is part of its error. Of many Gaussians the dense sum covers a band of
@@ -42,15 +44,15 @@ PLACE = ("scene", "gaussians", "grid", "precision")
 def tables(rows: Sequence[Row]) -> str:
     """The section."""
     parts = [f"## Rasterizers\n\n{ABOUT}"]
-    if figures(rows):
-        parts.append("![Error of the map against time](rasterizer.png)\n")
-    for place, own in _places(rows).items():
+    parts += [f"![Error against time]({name}.png)\n" for name in figures(rows)]
+    for place, own in sorted(_places(rows).items(), key=lambda item: _order(item[0])):
         device, scene, gaussians, grid = place
         first = next(iter(own.values()))
         pixels = "elements" if scene == "aperture" else "pixels"
         sizes = f"{int(first['pairs']):,} pairs, {int(first['live_pairs']):,} of them live"
         checked = f"{int(first['pixels_checked']):,} {pixels} checked"
-        parts.append(f"### {scene}, {int(gaussians):,} Gaussians, {grid}\n\n{device}; {sizes}; {checked}.\n")
+        load = f"load of the machine {load_of(own.values())}"
+        parts.append(f"### {scene}, {int(gaussians):,} Gaussians, {grid}\n\n{device}; {sizes}; {checked}; {load}.\n")
         parts.append(_times(own))
         parts.append(_errors(own))
     return "\n".join(parts) + "\n" + remarks(rows, ("rasterizer", "precision"), PLACE)
@@ -87,7 +89,8 @@ def _errors(own: Mapping[tuple[str, str, str], Row]) -> str:
     lines = []
     for (name, precision, way), row in own.items():
         if way == WAYS[0] and (back := own.get((name, precision, WAYS[1]))):
-            errors = [number(row[key]) for key in ("error_max", "error_mean", "ssim", "error_db")]
+            errors = [number(row["error_max"]), number(row["error_mean"]), f"{float(row['ssim']):.4f}"]
+            errors.append(number(row["error_db"]))
             gradients = [number(back[key]) for key in ("error_max", "error_mean")]
             lines.append([name, precision, *errors, *gradients, number(row["peak_mb"])])
     head = ["rasterizer", "precision", "largest error", "mean error", "SSIM", "dB"]
@@ -95,32 +98,48 @@ def _errors(own: Mapping[tuple[str, str, str], Row]) -> str:
 
 
 def figures(rows: Sequence[Row]) -> dict:
-    """Error against time of each device, a panel for each way."""
+    """Error against time of both passes, by device and scene; a panel a number of Gaussians, on the largest grid."""
     from gaigs.benchmark._pareto import pareto  # matplotlib is slow to import
 
+    panels: dict[tuple[str, str], dict[int, dict[str, list[tuple[float, float]]]]] = {}
+    for (device, scene, gaussians, _), own in sorted(_places(rows).items(), key=lambda item: _order(item[0])):
+        points = {}
+        for (name, precision, way), row in own.items():
+            error = float(row["error_max"])
+            if way == WAYS[0] and math.isfinite(error) and error > 0:
+                points[f"{name}, {precision}"] = [(_both(own, name, precision), error)]
+        if points:
+            panels.setdefault((device, scene), {})[int(gaussians)] = points  # a larger grid takes a smaller one's place
     found = {}
-    devices = [*dict.fromkeys(row["device"] for row in rows)]
-    for number_, device in enumerate(devices):
-        panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
-        for row in rows:
-            if row["device"] == device and row["status"] == MEASURED and row["scene"] != "aperture":
-                point = float(row["ms"]), float(row["error_max"])
-                if point[1] > 0 and math.isfinite(point[1]):
-                    name = f"{row['rasterizer']}, {row['precision']}"
-                    panels.setdefault(row["way"], {}).setdefault(name, []).append(point)
-        if panels:
-            name = "rasterizer" if number_ == 0 else f"rasterizer_{number_ + 1}"
-            found[name] = pareto(panels, "time [ms]", "largest error over largest value")
+    devices = [*dict.fromkeys(device for device, _ in panels)]
+    for (device, scene), by_count in panels.items():
+        number_ = devices.index(device) + 1
+        shown = {f"{count:,} Gaussians": by_count[count] for count in sorted(by_count)}
+        name = f"rasterizer_{scene}" + (f"_{number_}" if number_ > 1 else "")
+        label = f"{scene} on {device}: forward and backward [ms]"
+        found[name] = pareto(shown, label, "largest error\nover largest value")
     return found
 
 
+def _order(place: Place) -> tuple:
+    """Of places on the page: scenes as they are listed, and the small ones first."""
+    device, scene, gaussians, grid = place
+    rows, columns = map(int, grid.split(" x "))
+    return [*SCENES].index(scene), int(gaussians), rows * columns, device
+
+
+def _both(own: Mapping[tuple[str, str, str], Row], name: str, precision: str) -> float:
+    """Time of both passes [ms]."""
+    return sum(float(own[name, precision, way]["ms"]) for way in WAYS)
+
+
 def highlights(rows: Sequence[Row]) -> list[Glance]:
-    """Each rasterizer beside torch in float32, where both have most pairs in common."""
+    """Each rasterizer beside torch in float32, by scene, where both have most pairs in common."""
     return [glance for device in dict.fromkeys(row["device"] for row in rows) for glance in _of_device(rows, device)]
 
 
 def _of_device(rows: Sequence[Row], device: str) -> Iterator[Glance]:
-    shown: dict[tuple[str, str], tuple[int, Glance]] = {}
+    shown: dict[tuple[str, str, str], tuple[int, Glance]] = {}
     for (at, scene, gaussians, grid), own in _places(rows).items():
         base = own.get(("torch", "float32", "forward"))
         if at != device or (base is None and scene != "aperture"):
@@ -131,10 +150,10 @@ def _of_device(rows: Sequence[Row], device: str) -> Iterator[Glance]:
             back = own[name, precision, "backward"]
             times = _ratios(own, name, precision)
             told = f"{number(row['ms'])} + {number(back['ms'])} ms{times}"
-            error = f"{number(row['error_max'])} of the largest value, SSIM {float(row['ssim']):.4f}"
+            error = f"{number(row['error_max'])}, SSIM {float(row['ssim']):.4f}"
             choice = f"`{name}` in {precision}" + (" for `torch` in float32" if times else "")
             where = f"{scene}, {int(gaussians):,} Gaussians, {grid}, forward + backward"
-            key, pairs = (name, precision), int(row["pairs"])
+            key, pairs = (name, precision, scene), int(row["pairs"])
             if key not in shown or shown[key][0] <= pairs:
                 shown[key] = pairs, Glance(choice, where, told, error, device)
     yield from (glance for _, glance in shown.values())
@@ -144,5 +163,5 @@ def _ratios(own: Mapping[tuple[str, str, str], Row], name: str, precision: str) 
     """How many times as fast as torch in float32, both passes."""
     if ("torch", "float32", "forward") not in own:
         return ""
-    both = lambda *key: sum(float(own[*key, way]["ms"]) for way in WAYS)
-    return f", {both('torch', 'float32') / both(name, precision):.2g} times as fast"
+    times = _both(own, "torch", "float32") / _both(own, name, precision)
+    return f", {times:.2g} times as fast"

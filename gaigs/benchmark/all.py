@@ -1,6 +1,7 @@
 """Several benchmarks one after the other, in one process, and one page of them."""
 
 import logging
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from gaigs.registry import register, registry
 log = logging.getLogger(__name__)
 
 PAGE = "speed-error"
-"""Name of the page."""
+"""Name of the page, and of the folder beside it that has the files of its parts."""
 
 INTRODUCTION = """# Speed against error
 
@@ -30,7 +31,8 @@ python -m gaigs command=benchmark
 
 @register("benchmark", "all")
 class All(Benchmark):
-    """Runs its parts in turn, shares the minutes between them, and joins their sections into ``speed-error.md``.
+    """Runs its parts in turn, shares the minutes between them, and joins their sections into ``speed-error.md``;
+    ``speed-error/`` beside it has their files.
 
     Args:
         parts: Configurations of benchmarks, by name, in the order of the page.
@@ -48,12 +50,15 @@ class All(Benchmark):
 
     def run(self, folder: Path, context: Context) -> None:
         context = context.within(self.minutes, self.device)
+        beside = folder / PAGE
+        beside.mkdir(exist_ok=True)
         for number, part in enumerate(self.parts):
             share = context.seconds_left() / (len(self.parts) - number)
-            part.run(folder, context.within(share / 60))
+            part.run(beside, context.within(share / 60))
         page = folder / f"{PAGE}.md"
+        text = INTRODUCTION + self._table(beside) + "\n" + self.section(beside)
         with whole(page) as part:
-            part.write_text(INTRODUCTION + self._table(folder) + "\n" + self.section(folder))
+            part.write_text(re.sub(r"\]\((?=[^)/]+\.png\))", f"]({PAGE}/", text))
         log.info("page: %s", page)
 
     def section(self, folder: Path) -> str:

@@ -11,6 +11,7 @@ from gaigs.benchmark import UNAVAILABLE, Context, Glance, Measured, Row, check_n
 from gaigs.benchmark import _rasterizer_page as page
 from gaigs.benchmark._limits import OPERATIONS_OF_FIELDS, WAYS, Ceiling, Product, operations
 from gaigs.benchmark._memory import peak_mb
+from gaigs.benchmark._page import load_now
 from gaigs.benchmark._passes import CAUSES, Passes, Times, compositor, in_turns, start
 from gaigs.benchmark._scenes import DRAWS_NO_MAP, SCENES, ApertureScene, Scene, cast
 from gaigs.benchmark._truth import Truth, errors_of, errors_of_gradients, errors_of_pooled, pooled, sum_densely
@@ -44,7 +45,7 @@ class RasterizerBenchmark(Measured):
     values = (
         "ms", "spread_ms", "least_ms", "repeats", "composited_ms", "pairs", "live_pairs", "pairs_per_second",
         "gigaops_limit", "share_of_limit", "floor_ms", "live_floor_ms", "error_max", "error_mean", "ssim", "error_db",
-        "pixels_checked", "peak_mb", "tile",
+        "pixels_checked", "peak_mb", "tile", "load",
     )  # fmt: skip
 
     def __init__(
@@ -118,7 +119,7 @@ class RasterizerBenchmark(Measured):
                 yield row | {"status": UNAVAILABLE + causes[name]}
                 continue
             yield row | found[name][way] | self._figures(times, name, way, scene, truth) | {
-                "peak_mb": peaks[name], "tile": tile_of(runs[name].rasterizer)
+                "peak_mb": peaks[name], "tile": tile_of(runs[name].rasterizer), "load": load_now()
             }  # fmt: skip
 
     def _turns(self, runs: Mapping[str, Passes], scene: Scene, device: str, dtype: torch.dtype) -> dict:
@@ -157,7 +158,7 @@ class RasterizerBenchmark(Measured):
             count = OPERATIONS_OF_FIELDS[way]
         else:
             count = operations(way, scene.signal.shape[-1], scene.attenuations is not None)
-        limit = 1 / statistics.median(times["limit"]["limit"])
+        limit = 1 / min(times["limit"]["limit"])
         figures = {
             "ms": 1e3 * seconds, "spread_ms": 1e3 * (high - low), "least_ms": 1e3 * min(own), "repeats": len(own),
             "pairs": truth.pairs, "live_pairs": truth.live, "pairs_per_second": truth.pairs / seconds,

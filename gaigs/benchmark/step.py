@@ -9,7 +9,7 @@ import lightning
 import torch
 
 from gaigs.benchmark import MEASURED, UNAVAILABLE, Context, Glance, Measured, Row, check_names, device_of, named
-from gaigs.benchmark._page import number, remarks, table
+from gaigs.benchmark._page import load_now, load_of, number, remarks, table
 from gaigs.benchmark._passes import CAUSES, start
 from gaigs.benchmark._scenes import cast, common
 from gaigs.benchmark._watch import PARTS, WARM_UP, Watch, divided
@@ -41,7 +41,7 @@ class StepBenchmark(Measured):
 
     name = "step"
     keys = ("device", "rasterizer", "overrides", "part")
-    values = ("ms", "spread_ms", "share", "repeats", "gaussians", "places")
+    values = ("ms", "spread_ms", "share", "repeats", "gaussians", "places", "load")
 
     def __init__(
         self, rasterizers: list[str], repeats: int = 30, minutes: float | None = None, device: str | None = None
@@ -78,7 +78,13 @@ class StepBenchmark(Measured):
             times = watch.wholes[name] if part == WHOLE else watch.parts[name].get(part, [0.0])
             low, _, high = statistics.quantiles(times, n=4) if len(times) > 1 else times * 3
             median = statistics.median(times)
-            figures = {"ms": median, "spread_ms": high - low, "share": median / whole, "repeats": len(times)}
+            figures = {
+                "ms": median,
+                "spread_ms": high - low,
+                "share": median / whole,
+                "repeats": len(times),
+                "load": load_now(),
+            }
             yield row | figures | sizes
 
     def tables(self, rows: Sequence[Row]) -> str:
@@ -98,7 +104,8 @@ class StepBenchmark(Measured):
                     cells = (column[part] for column in columns.values())
                     lines.append([part, *(text for cell in cells for text in _cells(cell))])
                 head = ["part", *(text for name in columns for text in (f"`{name}` [ms]", "spread", "share"))]
-                size = f"{here[0]['places']} places a step, {here[0]['gaussians']} Gaussians; medians of"
+                size = f"{here[0]['places']} places a step, {here[0]['gaussians']} Gaussians"
+                size += f"; load of the machine {load_of(here)}; medians of"
                 parts.append(f"{device}; {size} {here[0]['repeats']} steps:\n\n{table(head, lines)}")
         return "\n".join(parts) + remarks(rows, ("rasterizer",))
 

@@ -38,7 +38,7 @@ def run(capsys, monkeypatch, tmp_path):
 def test_a_benchmark_by_name(run, tmp_path):
     assert run("command=benchmark", "benchmark=rasterizer", *TINY) == (0, "")
     assert {path.name for path in (tmp_path / "run").glob("raster*")} == {
-        "rasterizer.csv", "rasterizer.md", "rasterizer.png"
+        "rasterizer.csv", "rasterizer.md", "rasterizer_common.png"
     }  # fmt: skip
 
 
@@ -80,7 +80,7 @@ class Part:
         time.sleep(self.seconds)
 
     def section(self, folder):
-        return "## A part\n"
+        return "## A part\n\n![a figure](part.png)\n"
 
     def glance(self, folder):
         return [Glance("this for that", "a map", "1 ms", "1e-7", "a machine")]
@@ -95,7 +95,7 @@ def test_parts_share_the_minutes_and_a_page(tmp_path, monkeypatch):
     page = (tmp_path / "speed-error.md").read_text()
     assert page.startswith("# Speed against error\n")
     assert "| this for that | a map | 1 ms | 1e-7 |\n" in page
-    assert page.count("## A part") == 3
+    assert page.count("## A part\n\n![a figure](speed-error/part.png)\n") == 3
 
 
 def test_all_has_parts():

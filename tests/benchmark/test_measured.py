@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from gaigs.benchmark import NOT_MEASURED, UNAVAILABLE, Context, Glance, Measured, Rows, check_names, device_of
-from gaigs.benchmark._page import best, number, remarks, table
+from gaigs.benchmark import NOT_MEASURED, UNAVAILABLE, Context, Glance, Measured, Rows, check_names, clock, device_of
+from gaigs.benchmark._page import best, load_now, load_of, number, remarks, table
 
 
 class Squares(Measured):
@@ -122,6 +122,24 @@ def test_a_device_that_is_not_there(monkeypatch):
 def test_devices_are_told_by_their_names(monkeypatch):
     monkeypatch.setattr("torch.cuda.get_device_name", lambda device: "a graphics card")
     assert device_of({"device": "a graphics card"}, Context(devices=("cpu", "cuda"))) == "cuda"
+
+
+def test_a_clock_waits_for_the_device(monkeypatch):
+    waited = []
+    monkeypatch.setattr("torch.cuda.synchronize", lambda: waited.append(True))
+    clock("cpu")()
+    assert not waited
+    clock("cuda")()
+    assert waited
+
+
+def test_the_load_of_the_machine(monkeypatch):
+    monkeypatch.setattr("os.getloadavg", lambda: (2.5, 1.0, 1.0))
+    assert load_now() == 2.5
+    monkeypatch.delattr("os.getloadavg")
+    assert load_now() is None
+    assert load_of([{"load": "2.51"}, {"load": ""}, {"load": "0.3"}]) == "0.3 to 2.5"
+    assert (load_of([{"load": "1"}]), load_of([{"load": ""}])) == ("1.0", "unknown")
 
 
 def test_names_of_an_option():

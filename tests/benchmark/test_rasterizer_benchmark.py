@@ -54,7 +54,7 @@ def test_what_a_rasterizer_does_not_do_is_a_row(rows):
     page = (folder / "rasterizer.md").read_text()
     assert "- unavailable: aperture, float32: aperture draws no map; see the scene aperture" in page
     assert "### common, 20 Gaussians, 8 x 12" in page
-    assert (folder / "rasterizer.png").is_file()
+    assert (folder / "rasterizer_common.png").is_file()
 
 
 def test_the_dense_sum_is_that_of_the_torch_rasterizer_in_float64():
@@ -117,6 +117,14 @@ def test_memory_of_a_pass_in_this_process(monkeypatch):
     assert told("common") is None or 0 <= told("common") < 500
     monkeypatch.setattr(_memory, "RESET", _memory.RESET.with_name("there-is-no-such-file") / "either")
     assert told("common") is None
+
+
+def test_memory_of_a_cuda_device(monkeypatch):
+    reset = []
+    monkeypatch.setattr("torch.cuda.reset_peak_memory_stats", lambda: reset.append(True))
+    monkeypatch.setattr("torch.cuda.memory_allocated", lambda: 7)
+    assert _memory._reset("cuda") == 7
+    assert reset
 
 
 @pytest.mark.parametrize(
