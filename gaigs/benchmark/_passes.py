@@ -87,11 +87,11 @@ def compositor(run: Passes) -> Callable[[], object]:
     return lambda: render.forward(differentiate=True)
 
 
-Times = dict[Hashable, list[float]]
+Times = dict[str, list[float]]
 """Seconds, or whatever a turn gives, by part."""
 
 
-def in_turns(turns: Mapping[str, Callable[[], Mapping[Hashable, float]]], repeats: int) -> dict[str, Times]:
+def in_turns(turns: Mapping[Hashable, Callable[[], Mapping[str, float]]], repeats: int) -> dict[Hashable, Times]:
     """Does each thing once to warm up, and then all of them in turns, so that other work slows all alike.
 
     Args:

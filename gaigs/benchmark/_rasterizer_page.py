@@ -9,7 +9,7 @@ from gaigs.benchmark._page import load_of, number, remarks, table
 from gaigs.benchmark._scenes import SCENES
 
 ABOUT = """Every rasterizer composites the same Gaussians, and is held against the dense sum over all pairs of splat and
-pixel in float64. The rasterizers of a table took turns, so that ratios within it hold on a busy machine, too; those
+pixel in float64. All of a table took turns, so that ratios within it hold on a busy machine, too; those
 between tables may not.
 
 | word | meaning |
@@ -37,7 +37,7 @@ a tile of `torch` is 16 x 16 pixels, one of `opencl` 16 x 8. A pass of over half
 Place = tuple[str, str, str, str]
 """Device, scene, Gaussians and grid."""
 
-PLACE = ("scene", "gaussians", "grid", "precision")
+PLACE = ("scene", "gaussians", "grid")
 """What a reader calls a cell."""
 
 

@@ -1,6 +1,7 @@
 """Rasterizers: error against a dense float64 sum, time, memory, share of what the arithmetic allows."""
 
 import functools
+import itertools
 import logging
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +13,7 @@ from gaigs.benchmark import _rasterizer_page as page
 from gaigs.benchmark._limits import OPERATIONS_OF_FIELDS, WAYS, Ceiling, Product, operations
 from gaigs.benchmark._memory import peak_mb
 from gaigs.benchmark._page import load_now
-from gaigs.benchmark._passes import CAUSES, Passes, Times, compositor, in_turns, start
+from gaigs.benchmark._passes import CAUSES, Passes, compositor, in_turns, start
 from gaigs.benchmark._scenes import DRAWS_NO_MAP, SCENES, ApertureScene, Scene, cast
 from gaigs.benchmark._truth import Truth, errors_of, errors_of_gradients, errors_of_pooled, pooled, sum_densely
 from gaigs.registry import register, registry
@@ -26,7 +27,7 @@ PRECISIONS = ("float64", "float32", "bfloat16", "float16")
 class RasterizerBenchmark(Measured):
     """Rasterizers x scenes x Gaussians x grids x precisions, forward and backward.
 
-    The rasterizers of a cell take turns, so that their ratios hold on a busy machine, too.
+    The rasterizers and precisions of a cell take turns, so that their ratios hold on a busy machine, too.
 
     Args:
         rasterizers: Names; None: all that are registered but ``fastest``, which is one of the others.
@@ -86,43 +87,43 @@ class RasterizerBenchmark(Measured):
                 for grid in grids
             ]
         for _, n, scene, (rows, columns) in sorted(places):
+            own = {"scene": scene, "gaussians": str(n), "grid": f"{rows} x {columns}"}
             for device in context.devices:
-                for precision in self.precisions:
-                    own = {"device": named(device), "precision": precision, "scene": scene, "gaussians": str(n)}
-                    own["grid"] = f"{rows} x {columns}"
-                    yield [own | {"rasterizer": name, "way": way} for name in self.rasterizers for way in WAYS]
+                yield [
+                    own | {"device": named(device), "rasterizer": name, "precision": precision, "way": way}
+                    for name, precision, way in itertools.product(self.rasterizers, self.precisions, WAYS)
+                ]
 
     def measure(self, cell: Sequence[Row], context: Context) -> Iterator[Row]:
         first = cell[0]
         device = device_of(first, context)
         grid = tuple(map(int, first["grid"].split(" x ")))
         place = first["scene"], int(first["gaussians"]), grid
-        dtype = getattr(torch, first["precision"])
-        if place[0] == DRAWS_NO_MAP and dtype.itemsize == 2:
-            told = f"{UNAVAILABLE}torch has no complex numbers in half precision"
-            yield from (row | {"status": told} for row in cell)
-            return
-        double, truth = _scene(*place, device)
-        scene = cast(double, device, dtype)
+        double = SCENES[place[0]](place[1], *grid)
+        truth = sum_densely(double, device)
         runs, causes = {}, {}
-        for name in dict.fromkeys(row["rasterizer"] for row in cell):
+        for key in dict.fromkeys((row["rasterizer"], row["precision"]) for row in cell):
+            name, precision = key
             try:
-                runs[name] = start(name, scene)
+                dtype = getattr(torch, precision)
+                if place[0] == DRAWS_NO_MAP and dtype.itemsize == 2:
+                    raise ValueError("torch has no complex numbers in half precision")
+                runs[key] = start(name, cast(double, device, dtype))
             except CAUSES as error:
-                causes[name] = " ".join(str(error).split())
-        times = in_turns(self._turns(runs, scene, device, dtype), self.repeats)
-        found = {name: _errors(run, truth, grid) for name, run in runs.items()}
-        peaks = {name: peak_mb(name, *place, first["precision"], device) for name in runs}
+                causes[key] = " ".join(str(error).split())
+        times = in_turns(self._turns(runs, device), self.repeats) if runs else {}
+        found = {key: _errors(run, truth, grid) for key, run in runs.items()}
+        peaks = {key: peak_mb(key[0], *place, key[1], device) for key in runs}
         for row in cell:
-            name, way = row["rasterizer"], row["way"]
-            if name in causes:
-                yield row | {"status": UNAVAILABLE + causes[name]}
+            key, way = (row["rasterizer"], row["precision"]), row["way"]
+            if key in causes:
+                yield row | {"status": UNAVAILABLE + causes[key]}
                 continue
-            yield row | found[name][way] | self._figures(times, name, way, scene, truth) | {
-                "peak_mb": peaks[name], "tile": tile_of(runs[name].rasterizer), "load": load_now()
+            yield row | found[key][way] | self._figures(times, key, way, runs[key].scene, truth) | {
+                "peak_mb": peaks[key], "tile": tile_of(runs[key].rasterizer), "load": load_now()
             }  # fmt: skip
 
-    def _turns(self, runs: Mapping[str, Passes], scene: Scene, device: str, dtype: torch.dtype) -> dict:
+    def _turns(self, runs: Mapping[tuple[str, str], Passes], device: str) -> dict:
         now = clock(device)
 
         def timed(name: str, run: Passes):
@@ -142,31 +143,32 @@ class RasterizerBenchmark(Measured):
 
             return turn
 
-        turns = {name: timed(name, run) for name, run in runs.items()}
-        product = Product(device, dtype)
-        turns["limit"] = lambda: {"limit": 1 / product.measure()}
-        if "opencl" in runs:
-            ceiling = _ceiling(scene.signal.shape[-1], scene.attenuations is not None)
+        turns: dict = {key: timed(key[0], run) for key, run in runs.items()}
+        precisions = dict.fromkeys(precision for _, precision in runs)
+        products = {precision: Product(device, getattr(torch, precision)) for precision in precisions}
+        turns["limit"] = lambda: {precision: 1 / product.measure() for precision, product in products.items()}
+        if run := runs.get(("opencl", "float32")):
+            ceiling = _ceiling(run.scene.signal.shape[-1], run.scene.attenuations is not None)
             turns["ceiling"] = lambda: {way: ceiling.measure(way) for way in WAYS}
         return turns
 
-    def _figures(self, times: Mapping[str, Times], name: str, way: str, scene: Scene, truth: Truth) -> Row:
-        own = times[name][way]
+    def _figures(self, times: Mapping, key: tuple[str, str], way: str, scene: Scene, truth: Truth) -> Row:
+        own = times[key][way]
         seconds = statistics.median(own)
         low, _, high = statistics.quantiles(own, n=4) if len(own) > 1 else own * 3
         if isinstance(scene, ApertureScene):
             count = OPERATIONS_OF_FIELDS[way]
         else:
             count = operations(way, scene.signal.shape[-1], scene.attenuations is not None)
-        limit = 1 / min(times["limit"]["limit"])
+        limit = 1 / min(times["limit"][key[1]])
         figures = {
             "ms": 1e3 * seconds, "spread_ms": 1e3 * (high - low), "least_ms": 1e3 * min(own), "repeats": len(own),
             "pairs": truth.pairs, "live_pairs": truth.live, "pairs_per_second": truth.pairs / seconds,
             "gigaops_limit": limit / 1e9, "share_of_limit": truth.pairs * count / seconds / limit,
         }  # fmt: skip
-        if composited := times[name].get("composited") if way == "forward" else None:
+        if composited := times[key].get("composited") if way == "forward" else None:
             figures["composited_ms"] = 1e3 * statistics.median(composited)
-        if "ceiling" in times:
+        if "ceiling" in times and key[1] == "float32":
             pair = 1e3 * statistics.median(times["ceiling"][way])
             figures |= {"floor_ms": pair * truth.pairs, "live_floor_ms": pair * truth.live}
         return figures
@@ -193,13 +195,6 @@ def tile_of(rasterizer) -> str | None:
 
             return f"{opencl.ROWS} x {opencl.COLUMNS}"
     return None
-
-
-@functools.lru_cache(1)
-def _scene(name: str, n: int, grid: tuple[int, int], device: str) -> tuple[Scene, Truth]:
-    """A scene in float64 and what it gives; the cells of several precisions come one after the other."""
-    scene = SCENES[name](n, *grid)
-    return scene, sum_densely(scene, device)
 
 
 _ceiling = functools.cache(Ceiling)
