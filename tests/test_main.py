@@ -199,12 +199,12 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         (["baselines=[3]"], "gaigs: baselines, entry 0, must be a mapping, got 3"),
         (["save_every=nan"], "gaigs: save_every must be a finite number, got nan"),
         (["save_every=-1"], "gaigs: save_every must be at least 0 s, got -1"),
-        (["+foo=3"], "gaigs: the configuration has no key 'foo'; there are: baselines, command"),
+        (["+foo=3"], "gaigs: the configuration has no key 'foo'; there are: baselines, benchmark, command"),
         (["+thread=3"], "gaigs: the configuration has no key 'thread' (did you mean 'threads'?)"),
         (["tokenizer.name=null"], "gaigs: tokenizer.name must be a string, got None"),
         (["seed=1.5"], "gaigs: seed must be a whole number, got 1.5"),
-        (["command=trian"], "gaigs: command must be train, agreement or devices, got 'trian'"),
-        (["~command"], "gaigs: command must be train, agreement or devices, got None"),
+        (["command=trian"], "gaigs: command must be train, benchmark, agreement or devices, got 'trian'"),
+        (["~command"], "gaigs: command must be train, benchmark, agreement or devices, got None"),
     ],
 )
 def test_what_a_user_can_mend_is_told_without_a_traceback(overrides, message, run):
