@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -85,6 +86,29 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
                     if row[name] and name not in ("step", "epoch"):
                         curves.setdefault(name, {})[float(row["step"])] = float(row[name])
     return {name: tuple(np.array(sorted(points.items())).T) for name, points in curves.items() if points}
+
+
+class Validated(NamedTuple):
+    """A validation of a training: after which step, after how many seconds (NaN where the log does not say), and the
+    mean score."""
+
+    step: int
+    seconds: float
+    score: float
+
+
+def read_validations(folder: Path, score: str) -> list[Validated]:
+    """The validations that a run's log tells of, in their order; none of a run without a training.
+
+    Args:
+        folder: Of the run.
+        score: Name of the score.
+    """
+    logs = sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime)
+    curves = read_curves(logs)
+    seconds = dict(zip(*curves.get("seconds", ((), ())), strict=True))
+    found = zip(*curves.get(f"validation/{score}", ((), ())), strict=True)
+    return [Validated(int(step), float(seconds.get(step, math.nan)), float(value)) for step, value in found]
 
 
 def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:

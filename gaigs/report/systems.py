@@ -1,6 +1,7 @@
 """Runs of several models as one table in the form of the paper's: published figures beside ours, times and sizes."""
 
 import csv
+import math
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,10 +16,10 @@ from rich.table import Table
 from gaigs.configuration import conf_dir, plugin_conf_dirs
 from gaigs.files import whole, write_text
 from gaigs.registry import registry
-from gaigs.report.curves import learning_curves, read_curves
+from gaigs.report.curves import learning_curves, read_validations
 from gaigs.report.runs import Run, Spread, as_baseline, train_seconds
 from gaigs.report.style import DPI
-from gaigs.report.table import stacked, written
+from gaigs.report.table import stacked, watched_names, written
 
 COSTS = {
     "train_seconds": "training [s]",
@@ -322,16 +323,11 @@ def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict:
     files = {name: file for name, file in files.items() if file.is_file()}
     if len(splits) == 1 and _are_of_the_same_links(files.values()):
         figures |= kind.compared(files, *splits)
-    watched = kind.watched if isinstance(kind.watched, str) else next(iter(known))
+    watched, mean = watched_names(task)
     curves = {}
     for name, run in firsts.items():
-        logs = sorted(run.folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime)
-        seconds, score = (read_curves(logs).get(key) for key in ("seconds", f"validation/{watched}"))
-        if seconds is not None and score is not None:
-            steps = dict(zip(*score, strict=True))
-            points = [(time, steps[step]) for step, time in zip(*seconds, strict=True) if step in steps]
+        if points := [(p.seconds, p.score) for p in read_validations(run.folder, watched) if math.isfinite(p.seconds)]:
             curves[name] = tuple(zip(*points, strict=True))
-    mean = next((name for name in (f"{watched}_mean", watched) if name in known), None)
     if curves and mean is not None and len(splits) == 1:
         own = {next(iter(firsts[name].metrics["models"])) for name in curves}
         own |= {f"{name}_trend" for name in own}  # a run's own model without its kriging

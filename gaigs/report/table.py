@@ -29,6 +29,14 @@ def metrics_of(metrics: Mapping) -> dict:
     return registry("task").get(metrics["task"]).metrics()
 
 
+def watched_names(task: str) -> tuple[str, str | None]:
+    """The score by which a task's best checkpoints are chosen, and which of its metrics is the mean of that, if any."""
+    kind = registry("task").get(task)
+    known = kind.metrics()
+    watched = kind.watched if isinstance(kind.watched, str) else next(iter(known))  # a property of the instance
+    return watched, next((name for name in (f"{watched}_mean", watched) if name in known), None)
+
+
 def written(value: float | int | str | None) -> str:
     """A value of a table as text; nothing where it is unknown."""
     if isinstance(value, float):
