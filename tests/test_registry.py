@@ -75,7 +75,7 @@ BUILT_IN = {
     "rasterizer": {"torch", "opencl", "fastest"},
     "pooling": {"spectrum", "softmax_attention", "mean_power", "element_sum"},
     "loss": {"absolute", "squared", "huber", "l1_ssim", "nmse"},
-    "benchmark": {"all", "guard", "rasterizer", "step"},
+    "benchmark": {"accuracy", "all", "budgets", "guard", "rasterizer", "step"},
     "model": {"gaigs", "mean", "knn", "path_loss", "friis", "gaussian_process", "kriging"},
     "training": {"descent", "adversarial"},
 }
