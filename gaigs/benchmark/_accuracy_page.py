@@ -102,7 +102,7 @@ def _part(place: Place, rows: Sequence[Row], fixed: Mapping, end: str) -> list[s
     for row in rows:
         axes.setdefault(row["axis"], []).append(row)
     look_ups, systems = axes.pop(LOOK_UPS, []), axes.pop(SYSTEMS, [])
-    told = f"### {place.task}, split {place.split}\n\n{place.device}, seed {rows[0]['seed']}; {place.trainer}\n"
+    told = f"### {place.task}, split {place.split}\n\n{_conditions(place, rows)}\n"
     command = " ".join(filter(None, ("python -m gaigs command=benchmark benchmark=accuracy", place.scene)))
     parts = [f"{told}\n```\n{command}\n```\n"]
     if systems:
@@ -118,6 +118,10 @@ def _part(place: Place, rows: Sequence[Row], fixed: Mapping, end: str) -> list[s
     if axes:
         parts.append(f"![Error over training by axis](accuracy_axes{end}.png)\n")
     return parts
+
+
+def _conditions(place: Place, rows: Sequence[Row]) -> str:
+    return "; ".join(filter(None, (place.device, f"runs with seed {rows[0]['seed']}", place.trainer)))
 
 
 def _times(rows: Sequence[Row], levels: Mapping[str, float], scale: Scale) -> str:
@@ -149,17 +153,8 @@ def _leaders(rows: Sequence[Row], scale: Scale) -> str:
 def _costs(rows: Sequence[Row], scale: Scale) -> str:
     ahead = on_front(rows, scale)
     more = [scale.compared] if scale.compared else []
-    head = [
-        "system",
-        scale.title,
-        *more,
-        "inference [ms]",
-        "rendering [ms]",
-        "training [s]",
-        "steps",
-        "parameters",
-        "MB",
-    ]
+    head = ["system", scale.title, *more, "inference [ms]", "rendering [ms]", "training [s]"]
+    head += ["steps", "parameters", "checkpoint [MB]"]
     lines = []
     for row in _ranked(rows, "test", scale):
         size = number(str(float(row["checkpoint_bytes"]) / 1e6)) if row["checkpoint_bytes"] else ""

@@ -90,17 +90,11 @@ def _name_ends(ax: Axes, ends: Mapping[str, tuple[float, float, str]]) -> None:
     names = sorted(ends, key=lambda name: ends[name][1])
     heights = (np.log([ends[name][1] for name in names]) - bottom) / (top - bottom)
     inches = ax.figure.get_size_inches()[1] / ax.get_subplotspec().get_gridspec().nrows - 0.6
-    for name, place in zip(names, _apart(heights, 0.125 / inches), strict=True):
+    for name, height in zip(names, _apart(heights, 0.125 / inches), strict=True):
         x, y, colour = ends[name]
-        ax.annotate(
-            name,
-            (x, y),
-            (1.04, place),
-            textcoords="axes fraction",
-            va="center",
-            fontsize=6.5,
-            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 1},
-        )
+        look = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "relpos": (0, 0.5), "shrinkA": 0, "shrinkB": 1}
+        place = {"xytext": (1.04, height), "textcoords": "axes fraction", "va": "center"}
+        ax.annotate(name, (x, y), **place, fontsize=6.5, arrowprops=look)
 
 
 def _apart(places: Float[ndarray, "k"], gap: float) -> Float[ndarray, "k"]:

@@ -82,10 +82,15 @@ class Trainings(Measured):
         """The command line's own configuration.
 
         Raises:
-            ValueError, OSError: Its data cannot be read: then no run would be of use.
+            ValueError, OSError: Its data cannot be read, or nothing of them validates: then no run would be of use.
         """
         config = context.compose()
-        load(config["data"], config["split"])
+        split = load(config["data"], config["split"]).split
+        if not len(split.validation):
+            raise ValueError(
+                f"benchmark={self.name} compares validation scores, and split {split.name} leaves no links to validate "
+                "on; set split.validation above 0"
+            )
         return config
 
     def cell(self, context: Context, device: str, of: Sequence[str], **keys: str) -> list[Row]:

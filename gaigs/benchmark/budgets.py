@@ -12,6 +12,9 @@ from gaigs.benchmark._scale import Scale, scale_of
 from gaigs.benchmark._trainings import Trainings
 from gaigs.registry import check_type, register
 
+RATIO = "ratio"
+"""What ``tolerance`` calls the unit of scores without one."""
+
 SEED = "seed"
 """The key of axes that tell how much scores scatter by chance."""
 
@@ -32,7 +35,7 @@ class Budgets(Trainings):
         axes: Likewise; an axis without values takes those of ``factors``. One with the key ``seed`` tells how much
             scores scatter.
         factors: Of the default.
-        tolerance: Below the best validation score, by the score's unit.
+        tolerance: Below the best validation score, by the score's unit: ``dB``, or ``ratio`` for none.
 
     Raises:
         TypeError, ValueError: An option does not have its form.
@@ -67,21 +70,19 @@ class Budgets(Trainings):
         entries = default if isinstance(default, list) else [default]
         if not all(type(entry) is int for entry in entries):
             return super().values_about(axis, default)
-        found = [[max(1, round(entry * factor)) for entry in entries] for factor in self.factors]
-        return [
-            value if isinstance(default, list) else value[0] for i, value in enumerate(found) if value not in found[:i]
-        ]
+        found = dict.fromkeys(tuple(max(1, round(entry * factor)) for entry in entries) for factor in self.factors)
+        return [[*value] if isinstance(default, list) else value[0] for value in found]
 
     def tables(self, rows: Sequence[Row]) -> str:
         parts = [INTRODUCTION]
         for place, own in places(rows).items():
             scale = scale_of(place.task)
-            tolerance = self.tolerance.get(scale.unit)
-            if tolerance is None:
+            unit = scale.unit or RATIO
+            if unit not in self.tolerance:
                 raise ValueError(
-                    f"benchmark.tolerance must have the unit {scale.unit!r} of {scale.title}, got {self.tolerance}"
+                    f"benchmark.tolerance must have the unit {unit!r} of {scale.title}, got {', '.join(self.tolerance)}"
                 )
-            parts.append(_part(place, own, tolerance, scale))
+            parts.append(_part(place, own, self.tolerance[unit], scale))
         return "\n".join([*parts, remarks(rows, ("key", "value", "of", "scene", "device"))]).rstrip() + "\n"
 
     def highlights(self, rows: Sequence[Row]) -> Sequence[Glance]:
@@ -94,7 +95,8 @@ def _part(place: Place, rows: Sequence[Row], tolerance: float, scale: Scale) -> 
         if row["validation"]:
             references.setdefault(row["of"], {}).setdefault(row["axis"], []).append(row)
     command = " ".join(filter(None, ("python -m gaigs command=benchmark benchmark=budgets", place.scene)))
-    parts = [f"### {place.task}, split {place.split}\n\n{place.device}; {place.trainer}\n\n```\n{command}\n```\n"]
+    conditions = "; ".join(filter(None, (place.device, place.trainer)))
+    parts = [f"### {place.task}, split {place.split}\n\n{conditions}\n\n```\n{command}\n```\n"]
     unit = f" {scale.unit}" if scale.unit else ""
     head = ["part", "key", f"{scale.title} of the validation links by value", f"smallest within {tolerance:g}{unit}"]
     head += ["default now", "inference [ms], smallest, default", "training [s], smallest, default"]

@@ -158,6 +158,11 @@ def test_data_that_are_not_there_end_it_at_once(tmp_path):
         benchmark().run(tmp_path, Context(("data=nerf2_spectrum", f"data.root={tmp_path / 'none'}")))
 
 
+def test_a_split_without_validation_links_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"benchmark=accuracy compares validation scores.* set split.validation"):
+        benchmark().run(tmp_path, Context((*TINY, "split.validation=0")))
+
+
 def test_the_command_line_says_how_long():
     trainings = benchmark()
     assert trainings.options(Context()) == ["trainer.max_time=00:00:01:00"]

@@ -21,7 +21,7 @@ def rows(scores, task="spectrum", axis="Gaussians", key="gaussians.count", defau
 
 
 def budgets(factors=(0.25, 1, 2), axes=None):
-    return Budgets({}, axes or {}, [*factors], {"": 0.005, "dB": 0.05})
+    return Budgets({}, axes or {}, [*factors], {"ratio": 0.005, "dB": 0.05})
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_test_links_have_no_say():
 
 def test_a_unit_without_a_tolerance_is_refused():
     with pytest.raises(ValueError, match=r"benchmark.tolerance must have the unit 'dB' of MAE \[dB\]"):
-        Budgets({}, {}, [1], {"": 0.005}).tables(rows({"30": 4.0}, "rssi"))
+        Budgets({}, {}, [1], {"ratio": 0.005}).tables(rows({"30": 4.0}, "rssi"))
 
 
 @pytest.mark.parametrize(
