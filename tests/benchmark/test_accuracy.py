@@ -1,17 +1,19 @@
 """Whole trainings as cells: of two tiny systems end to end; tables and figures of rows that were made up."""
 
 import csv
+import sys
 import time
 
 import numpy as np
 import pytest
 from matplotlib.text import Text
 
+from gaigs import __main__ as command_line
 from gaigs import evaluation, experiment
 from gaigs.benchmark import Context
 from gaigs.benchmark._accuracy_page import LOOK_UPS, SYSTEMS, figures, highlights, tables
 from gaigs.benchmark._scale import scale_of
-from gaigs.benchmark._trainings import overrides, scene, written
+from gaigs.benchmark._trainings import COSTS, facts, overrides, scene, written
 from gaigs.benchmark.accuracy import Accuracy, installed
 
 TINY = (
@@ -209,11 +211,42 @@ def test_a_row_says_what_its_run_has():
     assert overrides(row | {"value": "gaigs"}) == ["model=gaigs", "kriging=true"]
 
 
+def test_kriging_is_the_last_point_of_a_curve(tmp_path):
+    (tmp_path / "log/version_0").mkdir(parents=True)
+    log = "step,seconds,validation/ssim\n9,2.0,\n9,,0.5\n19,4.0,\n19,,0.6\n29,,0.61\n"
+    (tmp_path / "log/version_0/metrics.csv").write_text(log)
+    scores = {"ssim_median": 0.8, "ssim_mean": 0.7}
+    metrics = dict.fromkeys(COSTS) | {"task": "spectrum", "split": "official", "seed": 0, "train_seconds": 5.0}
+    metrics |= {
+        "models": {"mirrored": scores, "mean": scores},
+        "validation": {"mirrored": scores | {"ssim_mean": 0.75}},
+    }
+    assert facts(metrics, tmp_path)["curve"] == "2.0:0.5 4.0:0.6", "a point without its time is left out"
+    found = facts(metrics | {"kriging": {"seconds": 3.0}}, tmp_path)
+    assert found["curve"] == "2.0:0.5 4.0:0.6 8.0:0.75"
+    assert (found["train_seconds"], found["steps"], found["test"], found["compared"]) == (8.0, 30, 0.7, 0.8)
+
+
 def test_pages_show_no_places():
     assert (
         scene(["data=nerf2_rssi", "data.root=/a/b/flat", "data.file=~/x.csv"])
         == "data=nerf2_rssi data.root=flat data.file=x.csv"
     )
+
+
+def test_the_command_line_composes_runs(tmp_path, monkeypatch, capsys):
+    axes = ("placement", "kriging", "tokenizer", "anchors", "Gaussians", "planes")
+    words = [
+        "benchmark.systems=[]",
+        "baselines=[]",
+        "data.transmitters=20",
+        *(f"~benchmark.axes.{axis}" for axis in axes),
+    ]
+    folder = [f"hydra.run.dir={tmp_path}", "hydra/job_logging=none"]
+    monkeypatch.setattr(sys, "argv", ["gaigs", "command=benchmark", "benchmark=accuracy", *words, *folder])
+    command_line.main()
+    assert capsys.readouterr().err == ""
+    assert (tmp_path / "accuracy.md").read_text().startswith("## Accuracy against time")
 
 
 # --- pages of rows that were made up ---
