@@ -259,6 +259,8 @@ def compose_and_run() -> None:
 def main() -> None:
     """The console script ``gaigs``."""
     configuration.install()
+    if "command=benchmark" in sys.argv and not any(word.lstrip("+").startswith("benchmark=") for word in sys.argv):
+        sys.argv.append("benchmark=all")  # before Hydra composes, so that its options may be given, too
     logging.raiseExceptions = False  # a log that finds no room tells nothing that the run's own files do not
     signals = []
 

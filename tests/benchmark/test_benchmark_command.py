@@ -59,7 +59,7 @@ def test_without_a_name_all_are_run_and_make_one_page(run, monkeypatch):
         (("command=benchmark", "benchmark=step", "benchmark.repeats=0"), "benchmark.repeats must be at least 1, got 0"),
         (("command=benchmark", "benchmark=step", "benchmark.repeats=x"), "option 'repeats' must be a whole number"),
         (("command=benchmark", "benchmark=step", "benchmark.minutes=-1"), "benchmark.minutes must be above 0"),
-        (("command=bench",), "command must be train, benchmark or devices, got 'bench'"),
+        (("command=bench",), "command must be train, benchmark, agreement or devices, got 'bench'"),
     ],
 )
 def test_what_does_not_suit_is_told_in_a_sentence(run, arguments, told):
