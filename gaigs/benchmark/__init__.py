@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from gaigs import configuration
 from gaigs.benchmark._rows import MEASURED, NOT_MEASURED, UNAVAILABLE, Row, Rows, text_of
 from gaigs.evaluation import device_name
-from gaigs.files import whole
+from gaigs.files import whole, write_text
 from gaigs.registry import suggest
 
 if TYPE_CHECKING:
@@ -177,8 +177,7 @@ class Measured(Benchmark):
         for name, figure in self.figures(rows.all()).items():
             with whole(folder / f"{name}.png") as part:
                 figure.savefig(part, dpi=DPI)
-        with whole(folder / f"{self.name}.md") as part:
-            part.write_text(self.tables(rows.all()))
+        write_text(folder / f"{self.name}.md", self.tables(rows.all()))
 
     def section(self, folder: Path) -> str:
         return self.tables(self._rows(folder).all())

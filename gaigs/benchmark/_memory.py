@@ -45,7 +45,8 @@ def _reset(device: str) -> int | None:
         torch.cuda.reset_peak_memory_stats()
         return torch.cuda.memory_allocated()
     try:
-        RESET.write_text("5")
+        with RESET.open("w") as file:
+            file.write("5")
     except OSError:  # not on Linux, or not allowed
         return None
     return _status("VmRSS")

@@ -9,7 +9,7 @@ import torch
 
 from gaigs.benchmark import Benchmark, Context, Glance
 from gaigs.benchmark._page import table
-from gaigs.files import whole
+from gaigs.files import write_text
 from gaigs.registry import register, registry
 
 log = logging.getLogger(__name__)
@@ -57,8 +57,7 @@ class All(Benchmark):
             part.run(beside, context.within(share / 60))
         page = folder / f"{PAGE}.md"
         text = INTRODUCTION + self._table(beside) + "\n" + self.section(beside)
-        with whole(page) as part:
-            part.write_text(re.sub(r"\]\((?=[^)/]+\.png\))", f"]({PAGE}/", text))
+        write_text(page, re.sub(r"\]\((?=[^)/]+\.png\))", f"]({PAGE}/", text))
         log.info("page: %s", page)
 
     def section(self, folder: Path) -> str:

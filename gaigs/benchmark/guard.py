@@ -17,7 +17,7 @@ from gaigs.benchmark._page import number, remarks, table
 from gaigs.benchmark._passes import CAUSES, Passes, compositor, start
 from gaigs.benchmark._scenes import SCENES, Scene, cast
 from gaigs.benchmark._truth import Truth, errors_of, errors_of_gradients, sum_densely
-from gaigs.files import whole
+from gaigs.files import write_text
 from gaigs.registry import register
 
 log = logging.getLogger(__name__)
@@ -93,8 +93,7 @@ class Guard(Measured):
         if self.record:
             known = read_baselines(self.baseline)
             known[machine()] = {row["quantity"]: float(row["found"]) for row in rows}
-            with whole(self.baseline) as part:
-                part.write_text(json.dumps(known, indent=2, sort_keys=True) + "\n")
+            write_text(self.baseline, json.dumps(known, indent=2, sort_keys=True) + "\n")
             log.info("recorded for %s: %s", machine(), self.baseline)
         elif losses := [text for row in rows if (text := told(row))]:
             raise ValueError(
