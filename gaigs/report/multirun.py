@@ -12,11 +12,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from gaigs.files import whole, write_text
+from gaigs.report.claims import write_claims
 from gaigs.report.curves import speed_against_error
 from gaigs.report.runs import Run, Spread, read_runs, train_seconds
 from gaigs.report.style import DPI
 from gaigs.report.systems import write_systems
-from gaigs.report.table import metrics_of, stacked, written
+from gaigs.report.table import markdown, metrics_of, stacked, written
 
 COSTS = {
     "train_seconds": "training [s]",
@@ -112,21 +113,29 @@ def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
 
 def report(folder: Path) -> Group:
     """Writes ``ablation.csv``, ``ablation.md`` and, unless none has ended, ``speed_against_error.png`` there. Runs of
-    several models are also set side by side, by ``gaigs.report.systems.write_systems``.
+    several models are also set side by side, by ``gaigs.report.systems.write_systems``. Runs of variants are also held
+    against the paper's claims, by ``gaigs.report.claims.write_claims``; that is all where they are of several tasks.
 
     Args:
         folder: Of a Hydra multirun, or one above several.
 
     Returns:
         The tables, for a terminal of 80 columns: the runs and, if there are any, the groups of runs that differ in the
-        seed alone; and the systems, where there are several. Metrics that are not brief are in the files only, and so
-        is what tells no run from another.
+        seed alone; the systems, where there are several; and the claims, where variants were run. Metrics that are not
+        brief are in the files only, and so is what tells no run from another.
 
     Raises:
         FileNotFoundError: The folder holds no run.
         ValueError: The runs make no table.
     """
     runs = read_runs(folder)
+    claims = write_claims(folder, runs)
+    tasks = {run.metrics["task"]: run.name for run in runs if run.metrics is not None}
+    if len(tasks) > 1:
+        if claims is not None:
+            return Group(claims)
+        listed = ", ".join(f"{task} in {name}" for task, name in tasks.items())
+        raise ValueError(f"the runs of a table must be of one task, got {listed}; pass a folder with runs of one")
     known = next((metrics_of(run.metrics) for run in runs if run.metrics is not None), {})
     titles = {name: metric.title for name, metric in known.items()} | COSTS
     rows, shared = ablation(runs)
@@ -139,10 +148,10 @@ def report(folder: Path) -> Group:
         writer.writeheader()
         writer.writerows(written_rows)
     failures = [f"{run.name}: {run.failure}" for run in runs if run.failure is not None]
-    markdown = f"{_markdown(rows, titles)}\n{caption}\n" + "".join(f"- without a result: {why}\n" for why in failures)
+    page = f"{_markdown(rows, titles)}\n{caption}\n" + "".join(f"- without a result: {why}\n" for why in failures)
     if groups:
-        markdown += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
-    write_text(folder / "ablation.md", markdown)
+        page += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
+    write_text(folder / "ablation.md", page)
     if any(run.metrics is not None for run in runs):
         with whole(folder / "speed_against_error.png") as part:
             _speed(runs, rows, shared, titles).savefig(part, dpi=DPI)
@@ -161,6 +170,8 @@ def report(folder: Path) -> Group:
     systems = write_systems(folder, runs, baselines, shared, known)
     if systems is not None:
         tables.append(systems)
+    if claims is not None:
+        tables.append(claims)
     return Group(*tables)
 
 
@@ -188,8 +199,7 @@ def _text(value: float | int | str | Spread | None, between: str) -> str:
 def _markdown(rows: list[dict], titles: Mapping[str, str]) -> str:
     columns = _columns(rows)
     cells = [[_text(row.get(column), ", ") for column in columns] for row in rows]
-    lines = [[titles.get(column, column) for column in columns], ["---"] * len(columns), *cells]
-    return "".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |\n" for line in lines)
+    return markdown([[titles.get(column, column) for column in columns], *cells])
 
 
 def _table(title: str, rows: list[dict], titles: Mapping[str, str], hidden: set[str], caption: str) -> Table:

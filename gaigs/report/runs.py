@@ -123,7 +123,7 @@ def read_runs(folder: Path) -> list[Run]:
 
     Raises:
         FileNotFoundError: The folder holds no run.
-        ValueError: One was started anew with another configuration, they are of several tasks, or a file is damaged.
+        ValueError: One was started anew with another configuration, or a file is damaged.
     """
     runs = []
     for path in folder.glob("**/.hydra/overrides.yaml"):
@@ -157,10 +157,6 @@ def read_runs(folder: Path) -> list[Run]:
     # Text and numbers take turns, so that like is compared with like.
     parts = lambda name: [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
     runs.sort(key=lambda run: parts(run.name))
-    tasks = {run.metrics.get("task"): run.name for run in runs if run.metrics is not None}
-    if len(tasks) > 1:
-        listed = ", ".join(f"{task} in {name}" for task, name in tasks.items())
-        raise ValueError(f"the runs of a table must be of one task, got {listed}; pass a folder with runs of one")
     return runs
 
 

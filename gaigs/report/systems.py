@@ -19,7 +19,7 @@ from gaigs.registry import registry
 from gaigs.report.curves import learning_curves, read_validations
 from gaigs.report.runs import Run, Spread, as_baseline, train_seconds
 from gaigs.report.style import DPI
-from gaigs.report.table import stacked, watched_names, written
+from gaigs.report.table import latex, markdown, stacked, tex, watched_names, written
 
 COSTS = {
     "train_seconds": "training [s]",
@@ -33,12 +33,6 @@ COSTS = {
 
 BRIEF = ("train_seconds", "inference_ms", "num_parameters")
 """The costs for which a terminal has room."""
-
-TEX = str.maketrans(
-    {sign: f"\\{sign}" for sign in "&%_#${}"}
-    | {"±": r"$\pm$", "–": "--", "²": r"\textsuperscript{2}"}
-    | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
-)
 
 
 class Published(NamedTuple):
@@ -200,21 +194,17 @@ def _texts(column: Column) -> list[tuple[str, bool]]:
 
 def _markdown(rows: Sequence[System], columns: Sequence[Column]) -> str:
     cells = [[f"**{text}**" if best else text for text, best in _texts(column)] for column in columns]
-    lines = [["system", *(column.title for column in columns)], ["---"] * (len(columns) + 1)]
-    lines += [[row.name, *texts] for row, *texts in zip(rows, *cells, strict=True)]
-    return "".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |\n" for line in lines)
+    lines = ([row.name, *texts] for row, *texts in zip(rows, *cells, strict=True))
+    return markdown([["system", *(column.title for column in columns)], *lines])
 
 
 def _tex(rows: Sequence[System], columns: Sequence[Column]) -> str:
-    """A ``tabular`` with the rules of the package booktabs."""
     cells = []
     for column in columns:
-        texts = ((text.translate(TEX), best) for text, best in _texts(column))
+        texts = ((tex(text), best) for text, best in _texts(column))
         cells.append([rf"\textbf{{{text}}}" if best else text or "--" for text, best in texts])
-    head = " & ".join(["Method", *(column.title.translate(TEX) for column in columns)])
-    lines = [rf"\begin{{tabular}}{{l{'c' * len(columns)}}}", r"\toprule", rf"{head} \\", r"\midrule"]
-    lines += [" & ".join([row.name.translate(TEX), *texts]) + r" \\" for row, *texts in zip(rows, *cells, strict=True)]
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
+    lines = ([tex(row.name), *texts] for row, *texts in zip(rows, *cells, strict=True))
+    return latex([["Method", *(tex(column.title) for column in columns)], *lines])
 
 
 def _csv(file: Path, rows: Sequence[System], columns: Sequence[Column]) -> None:
@@ -269,8 +259,8 @@ def write_systems(
         for column in part.get(task, ())
     ]
     notes += [f"- without a result: {failure}" for failure in failed]
-    markdown = [*(_markdown(rows, table) for table in tables), "\n".join(notes) + "\n"]
-    texts = {"systems.md": markdown, "systems.tex": [_tex(rows, table) for table in tables]}
+    pages = [*(_markdown(rows, table) for table in tables), "\n".join(notes) + "\n"]
+    texts = {"systems.md": pages, "systems.tex": [_tex(rows, table) for table in tables]}
     for name, parts in texts.items():
         write_text(folder / name, "\n".join(parts))
     for name, figure in _figures(done, task, known).items():

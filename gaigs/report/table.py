@@ -1,6 +1,6 @@
 """The scores of a run, beside those of its baselines on the same split."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.console import Group
 from rich.markup import escape
@@ -10,6 +10,12 @@ from gaigs.registry import registry
 
 FITTING = 5
 """Most metrics that a terminal has room for; of more, only the brief ones are shown."""
+
+TEX = str.maketrans(
+    {sign: f"\\{sign}" for sign in "&%_#${}"}
+    | {"±": r"$\pm$", "–": "--", "²": r"\textsuperscript{2}"}
+    | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
+)
 
 
 def metrics_of(metrics: Mapping) -> dict:
@@ -44,6 +50,25 @@ def written(value: float | int | str | None) -> str:
     if isinstance(value, int):
         return f"{value:,}"
     return value or ""
+
+
+def tex(text: str) -> str:
+    """A text as LaTeX sets it."""
+    return text.translate(TEX)
+
+
+def markdown(lines: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown, of which the first line is the head."""
+    head, *rows = lines
+    ruled = [head, ["---"] * len(head), *rows]
+    return "".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |\n" for line in ruled)
+
+
+def latex(lines: Sequence[Sequence[str]]) -> str:
+    """A ``tabular`` with the rules of the package booktabs, of cells in LaTeX; the first line is the head."""
+    head, *rows = (" & ".join(line) + r" \\" for line in lines)
+    start = rf"\begin{{tabular}}{{l{'c' * (len(lines[0]) - 1)}}}"
+    return "\n".join([start, r"\toprule", head, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
 def stacked(title: str) -> str:
