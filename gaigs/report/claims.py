@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 from scipy.stats import t
 
-from gaigs.configuration import conf_dir
+from gaigs.configuration import HARMLESS, conf_dir
 from gaigs.files import whole
 from gaigs.registry import check_type
 from gaigs.report.runs import Run
@@ -110,9 +110,10 @@ def interval(gains: Sequence[float]) -> tuple[float, float] | None:
 def compare(runs: Sequence[Run], claims: Sequence[Claim]) -> list[Finding]:
     """What runs say to claims, in the order of the claims; those of which a variant has no run are left out.
 
-    Runs are of one setting where all but variant and seed was asked for alike. A seed that was run twice counts once.
+    Runs are of one setting where all was asked for alike but variant, seed and what changes no result. A seed that was
+    run twice counts once.
     """
-    keys = dict.fromkeys(key for run in runs for key in run.overrides if key not in ("variant", "seed"))
+    keys = dict.fromkeys(key for run in runs for key in run.overrides if key not in ("variant", "seed", *HARMLESS))
     varied = [key for key in keys if len({run.overrides.get(key) for run in runs}) > 1]
     settings: dict[str, dict[str, dict[int, Run]]] = {}
     for run in runs:

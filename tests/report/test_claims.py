@@ -130,7 +130,7 @@ def test_runs_of_several_settings_are_not_mixed_and_seeds_in_pieces_are(tmp_path
         for data, gap in (("room", 0.1), ("rfid", -0.1)):
             part = tmp_path / f"{data}{seed // 2}"  # the last seed came later, elsewhere
             write_run(part, "paper", 0.8 + 0.01 * seed, seed, data=data)
-            write_run(part, "ga", 0.8 - gap, seed, data=data)
+            write_run(part, "ga", 0.8 - gap, seed, data=data, threads=1 + seed)  # which changes no result
     write_run(tmp_path / "run twice", "paper", 0.1, 0, data="room")  # the one first by name counts
     report(tmp_path)
     found = {row["setting"]: row for row in read(tmp_path)}
