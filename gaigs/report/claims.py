@@ -14,7 +14,7 @@ from rich.table import Table
 from scipy.stats import t
 
 from gaigs.configuration import HARMLESS, conf_dir
-from gaigs.files import whole
+from gaigs.files import whole, write_text
 from gaigs.registry import check_type
 from gaigs.report.runs import Run
 from gaigs.report.table import latex, markdown, metrics_of, tex, written
@@ -156,10 +156,8 @@ def write_claims(folder: Path, runs: Sequence[Run]) -> Table | None:
     head, *lines = _cells(found)
     failed = [f"{run.name}: {run.failure or 'unfinished'}" for run in runs if run.metrics is None]
     notes = [NOTE, "", *(f"- {text}" for text in _sources(found)), *(f"- without a result: {text}" for text in failed)]
-    with whole(folder / "claims.md") as part:
-        part.write_text(f"{markdown([head, *lines])}\n" + "".join(f"{note}\n" for note in notes))
-    with whole(folder / "claims.tex") as part:
-        part.write_text(latex([[tex(cell) for cell in line] for line in (head, *lines)]))
+    write_text(folder / "claims.md", f"{markdown([head, *lines])}\n" + "".join(f"{note}\n" for note in notes))
+    write_text(folder / "claims.tex", latex([[tex(cell) for cell in line] for line in (head, *lines)]))
     _csv(folder / "claims.csv", found)
 
     missing = "".join(f"{failure}\n" for failure in failed)
