@@ -13,7 +13,8 @@ from gaigs.scene import Array
 
 CROWD = 100_000
 PLANE = Plane(torch.linspace(-0.1, 0.1, 5)[None], torch.linspace(-0.1, 0.1, 4)[:, None], 2 * math.pi)
-DRAWING = [name for name in registry("rasterizer").names() if name != "aperture"]
+DRAWING = [name for name in registry("rasterizer").names() if name not in ("aperture", "fastest")]
+"""Those that draw maps; ``fastest`` is one of the others."""
 
 
 def drawn(name, dtype, opacity, attenuation, alike):

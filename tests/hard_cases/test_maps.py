@@ -30,7 +30,8 @@ ASIDE = torch.tensor([0.7, 1.0, 0.4], dtype=torch.float64)
 LOOSE = {"beside the receiver": 0.1, "exactly on the axis": 0.05}
 """Gradients of footprints of a hundred thousand radians, and of pixels half a turn away from a splat at azimuth 0."""
 
-DRAWING = [name for name in registry("rasterizer").names() if name != "aperture"]
+DRAWING = [name for name in registry("rasterizer").names() if name not in ("aperture", "fastest")]
+"""Those that draw maps; ``fastest`` is one of the others."""
 ON = Pose(torch.tensor([1.0, -2.0, 0.5]), torch.eye(3))
 
 
@@ -228,11 +229,11 @@ def test_a_map_is_that_of_float64(case, projection, rasterizer):
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("projection", registry("projection").names())
 def test_a_map_in_float64_is_the_formulas(case, projection):
-    """Of each rasterizer that takes it; ``opencl`` does not, and ``fastest`` hands it to ``torch``."""
+    """Of each rasterizer that takes it; ``opencl`` does not."""
     gaussians, projection = CASES[case](), build_projection(projection)
     true, true_left, _, splats, plane = draw(gaussians, projection, rasterize_densely, torch.float64)
     sure = ~near_a_jump(splats, gaussians.opacities, plane)
-    for name in set(DRAWING) - {"fastest", "opencl"}:
+    for name in set(DRAWING) - {"opencl"}:
         found, left, leaves, *_ = draw(gaussians, projection, build_rasterizer(name), torch.float64)
         for value, truth in ((found, true), (left, true_left)):
             assert value.isfinite().all()

@@ -13,7 +13,8 @@ from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN
 from gaigs.registry import registry
 from gaigs.testing.rasterizer import rasterize_densely
 
-DRAWING = [name for name in registry("rasterizer").names() if name != "aperture"]
+DRAWING = [name for name in registry("rasterizer").names() if name not in ("aperture", "fastest")]
+"""Those that draw maps; ``fastest`` is one of the others."""
 
 
 @functools.cache
