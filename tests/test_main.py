@@ -178,7 +178,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ),
         (["sede=3"], "gaigs: the configuration has no key 'sede' (did you mean 'seed'?); it has: baselines, command"),
         (["tokenizer=gaa"], "gaigs: tokenizer has no file 'gaa' (did you mean 'ga'?); it has: euclidean, "),
-        (["+experiment=foo"], "gaigs: experiment has no file 'foo'; it has: csi, mirrored, "),
+        (["+experiment=foo"], "gaigs: experiment has no file 'foo'; it has: claims, claims_rssi, csi, mirrored, "),
         (["seed=["], "gaigs: Hydra cannot read it: no viable alternative at input '['"),
         (["~nothing"], "gaigs: Hydra cannot read it: Could not delete from config. 'nothing' does not exist."),
         (["density=null"], "gaigs: a word on the command line that chooses a file must be its name (Config group"),

@@ -301,7 +301,7 @@ def test_planes_are_written_as_wavefront_obj(links, build, tmp_path):
 
 
 def test_planes_are_written_whole_or_not_at_all(links, build, tmp_path, monkeypatch):
-    def fill(path, text):
+    def fill(path, text, **_):
         path.write_bytes(text[:9].encode())
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
