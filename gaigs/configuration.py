@@ -94,6 +94,8 @@ def check(config: dict) -> None:
             f"benchmark={config['benchmark'].get('name')} needs command=benchmark, got command={config['command']}; "
             "add command=benchmark, or leave out the benchmark"
         )
+    if config.get("benchmark") is None and config["command"] == "benchmark":
+        raise ValueError("command=benchmark needs a benchmark, and it was left out; add benchmark=all")
     for kind in KINDS[: KINDS.index("benchmark")]:
         check_type(f"{kind}.name", config[kind].get("name"), str)
     check_type("task.baselines", config["task"].get("baselines", []), list[dict])
