@@ -85,7 +85,7 @@ class Trainings(Measured):
             ValueError, OSError: Its data cannot be read, or nothing of them validates: then no run would be of use.
         """
         config = context.compose()
-        split = load(config["data"], config["split"]).split
+        split = load(config["data"], config["split"], config["task"]["name"]).split
         if not len(split.validation):
             raise ValueError(
                 f"benchmark={self.name} compares validation scores, and split {split.name} leaves no links to validate "

@@ -154,13 +154,13 @@ def train(config: dict, watch: Watch, repeats: int, device: str) -> dict[str, in
             "rasterizer=fastest projection=mercator"
         )
     lightning.seed_everything(config["seed"], verbose=False)
-    links = load(config["data"], config["split"])
+    links = load(config["data"], config["split"], config["task"]["name"])
     model = registry("model").build(config["model"], scene=links.scene)
     model.fit(links)
     context = {"model": model, "loss": registry("loss").build(config["loss"], task=links.task)}
     module = registry("training").build(config["training"], **context, identity={}, seed=config["seed"])
     steps = (WARM_UP + repeats) * len(watch.turns)
-    options = config["trainer"] | {"max_steps": steps, "enable_progress_bar": False}
+    options = config["trainer"] | {"max_steps": steps, "max_time": None, "enable_progress_bar": False}
     options["accelerator"] = "gpu" if device == "cuda" else "cpu"
     context = {"callbacks": [watch], "logger": False, "enable_checkpointing": False}
     trainer = call("trainer", lightning.Trainer, options, **context)

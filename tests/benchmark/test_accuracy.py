@@ -160,6 +160,11 @@ def test_data_that_are_not_there_end_it_at_once(tmp_path):
         benchmark().run(tmp_path, Context(("data=nerf2_spectrum", f"data.root={tmp_path / 'none'}")))
 
 
+def test_data_of_another_task_end_it_at_once(tmp_path):
+    with pytest.raises(ValueError, match=r"labels of data 'synthetic' are of task 'spectrum'.*; add task=spectrum"):
+        benchmark().run(tmp_path, Context(("data.transmitters=20", "data.order=0", "task=rssi")))
+
+
 def test_a_split_without_validation_links_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"benchmark=accuracy compares validation scores.* set split.validation"):
         benchmark().run(tmp_path, Context((*TINY, "split.validation=0")))

@@ -21,8 +21,9 @@ def configured():
     configuration.install()
 
 
-def test_a_step_is_divided(tmp_path):
-    context = Context(overrides=BRIEF)
+@pytest.mark.parametrize("overrides", [(), ("trainer.max_steps=-1", "trainer.max_time=00:00:00:00")])
+def test_a_step_is_divided(tmp_path, overrides):
+    context = Context(overrides=(*BRIEF, *overrides))
     StepBenchmark(["torch", "aperture"], repeats=2).run(tmp_path, context)
     with open(tmp_path / "step.csv", newline="") as file:
         rows = {(row["rasterizer"], row["part"]): row for row in csv.DictReader(file)}
@@ -33,7 +34,7 @@ def test_a_step_is_divided(tmp_path):
     parts = {part: float(row["ms"]) for part, row in own.items()}
     assert all(milliseconds > 0 for milliseconds in parts.values())
     page = (tmp_path / "step.md").read_text()
-    assert f"python -m gaigs command=benchmark benchmark=step {' '.join(BRIEF)}\n" in page
+    assert f"python -m gaigs command=benchmark benchmark=step {' '.join((*BRIEF, *overrides))}\n" in page
     assert "| backward: rasterizer |" in page
     assert eager._Tiles.__init__.__qualname__ == "_Tiles.__init__"
 
@@ -43,6 +44,11 @@ def test_a_model_without_maps_is_told(tmp_path):
         ValueError, match=r"benchmark=step needs a model .* got model=mirrored with rasterizer=aperture"
     ):
         StepBenchmark(["torch"]).run(tmp_path, Context(overrides=("+experiment=mirrored",)))
+
+
+def test_data_of_another_task_are_told(tmp_path):
+    with pytest.raises(ValueError, match=r"labels of data 'synthetic' are of task 'spectrum'.*; add task=spectrum"):
+        StepBenchmark(["torch"]).run(tmp_path, Context(overrides=(*BRIEF[:2], "task=rssi")))
 
 
 @pytest.mark.parametrize(
