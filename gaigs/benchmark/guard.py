@@ -106,6 +106,11 @@ class Guard(Measured):
 
     def measure(self, cell: Sequence[Row], context: Context) -> Iterator[Row]:
         known = {} if self.record else read_baselines(self.baseline).get(machine(), {})
+        if not known and not self.record:
+            log.warning(
+                "%s has no baseline of this machine (%s), so nothing is compared; benchmark.record=true writes one",
+                self.baseline, machine(),
+            )  # fmt: skip
         found, causes = watch(known, self.repeats)
         for row in cell:
             quantity = row["quantity"]

@@ -85,8 +85,9 @@ def test_a_baseline_is_recorded_and_a_slower_or_wrong_kernel_is_seen(tmp_path, m
         compare.run(tmp_path, Context())
 
 
-def test_elsewhere_nothing_fails(tmp_path, torch_alone):
+def test_elsewhere_nothing_fails_and_that_is_told(tmp_path, torch_alone, caplog):
     Guard(str(tmp_path / "none.json"), repeats=1).run(tmp_path, Context())
+    assert "none.json has no baseline of this machine" in caplog.text
 
 
 @pytest.mark.parametrize("content", ["{", "[]", '{"a": 1}', '{"a": {"b": "c"}}'])
