@@ -54,6 +54,13 @@ class Budgets(Trainings):
     ):
         super().__init__(trainer, axes, minutes, device)
         check_type("benchmark.tolerance", tolerance, dict[str, float])
+        for name, axis in axes.items():
+            for value in axis.get("values") or ():
+                entries = value if isinstance(value, list) else [value]
+                if not entries or not all(type(entry) in (int, float) for entry in entries):
+                    raise TypeError(
+                        f"benchmark.axes.{name}.values must be sizes, numbers or lists of them, got {value!r}"
+                    )
         self.factors, self.tolerance = factors, tolerance
 
     def cells(self, context: Context) -> Iterator[list[Row]]:

@@ -79,6 +79,12 @@ def test_defaults_that_are_no_numbers_need_values():
         budgets(axes={"tokenizer": {"of": [], "key": "tokenizer"}}).values_about("tokenizer", "multiview")
 
 
+@pytest.mark.parametrize("value", ["ga", None, True, [], [4, "wide"]])
+def test_values_that_are_no_sizes_are_refused_before_any_training(value):
+    with pytest.raises(TypeError, match=r"benchmark\.axes\.part\.values must be sizes, numbers or lists of them, got"):
+        budgets(axes={"part": {"of": [], "key": "gaussians.count", "values": [3, value]}})
+
+
 @pytest.mark.parametrize(("value", "number"), [("300", 300), ("[4,8]", 32), ("0.5", 0.5)])
 def test_sizes_of_values(value, number):
     assert size(value) == number
