@@ -1,5 +1,7 @@
 """Radio maps: where their points lie, whose they are, and that they survive a file."""
 
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -66,6 +68,22 @@ def test_a_slow_model_draws_a_coarser_map_of_the_same_points(monkeypatch):
     np.testing.assert_allclose(
         coarse.values[:, rows_there][..., columns_there], fine.values[:, rows][..., columns], atol=1e-3
     )
+
+
+def test_what_the_first_prediction_loads_makes_no_map_coarser(monkeypatch):
+    class Loading(Slope):
+        """A model whose first prediction takes a minute, by a clock that it winds on itself."""
+
+        seconds = 0.0
+
+        def forward(self, batch):
+            self.seconds += 0 if self.seconds else 60
+            return super().forward(batch)
+
+    model = Loading(scene())
+    monkeypatch.setattr(time, "perf_counter", lambda: model.seconds + 1e-3 * next(ticks))
+    ticks = iter(range(10**6))
+    assert len(radio_map(model).x) == len(radio_map(Slope(scene())).x)
 
 
 def test_map_covers_transmitters_gateways_and_the_margin_with_multiples_of_the_pitch():
