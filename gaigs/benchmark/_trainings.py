@@ -99,7 +99,11 @@ class Trainings(Measured):
         return [common | {"of": shlex.join(of), "default": "", "device": named(device)} | keys]
 
     def cells_of_axes(self, context: Context, device: str) -> Iterator[list[Row]]:
-        """Those of the axes whose key the reference has."""
+        """Those of the axes whose key the reference has.
+
+        Raises:
+            ValueError: A key is a group of options, and no component.
+        """
         common = self.common(context, device)
         for name, axis in self.axes.items():
             config = context.compose(*common, *axis["of"])
@@ -108,7 +112,12 @@ class Trainings(Measured):
                 log.info("%s: %s is left out, as there is no %s here", self.name, name, axis["key"])
                 continue
             if OmegaConf.is_config(default):  # a list, or a component
-                default = [*default] if OmegaConf.is_list(default) else default["name"]
+                default = [*default] if OmegaConf.is_list(default) else default.get("name")
+                if default is None:
+                    raise ValueError(
+                        f"benchmark.axes.{name}.key must be one option or a component, and {axis['key']} has options "
+                        "of its own; take one of them"
+                    )
             values = self.values_about(name, default) if axis.get("values") is None else axis["values"]
             for value in values if default in values else [*values, default]:
                 keys = {"axis": name, "key": axis["key"], "value": written(value), "default": written(default)}

@@ -194,6 +194,11 @@ def test_all_that_train_are_found():
         ({"a": {"key": "seed", "of": "model=gaigs", "values": [1]}}, TypeError, "benchmark.axes.a.of must be a list"),
         ({"a": {"key": "seed", "of": [], "values": 3}}, TypeError, "benchmark.axes.a.values must be a list"),
         ({"a": {"key": "seed", "of": []}}, ValueError, "benchmark.axes.a needs values"),
+        (
+            {"a": {"key": "training.learning_rates", "of": [], "values": [1]}},
+            ValueError,
+            "benchmark.axes.a.key must be one option or a component, and training.learning_rates has options",
+        ),
     ],
 )
 def test_axes_without_their_form_are_refused(axes, error, told):
