@@ -132,7 +132,7 @@ class Soak:
         self.seconds = time.monotonic() - start
         self.work = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
         if process.code:
-            raise SystemExit(f"the undisturbed run must end well, and says {process.told}")
+            raise SystemExit(f"the undisturbed run must end well, and says {' '.join(process.told)}")
         self.sizes = sorted(path.stat().st_size for path in self.reference.rglob("*") if path.is_file())
 
     def start(self, folder: Path, before: Callable = lambda: None) -> Process:
@@ -160,7 +160,7 @@ class Soak:
         trial = Trial(self.fault, phase, process.end, lost)
         is_clear = all(line.startswith("gaigs: ") for line in process.told) and len(process.told) == (process.code > 0)
         if process.code not in codes or not is_clear or "no message" in process.end:
-            trial.wrong.append(f"exit code {process.code}, {process.told}")
+            trial.wrong.append(f"exit code {process.code}, {' '.join(process.told)}")
         self.trials.append(trial)
         return trial
 
@@ -176,7 +176,7 @@ class Soak:
         process = self.start(folder)
         process.wait()
         if process.code:
-            trial.wrong.append(f"going on: exit code {process.code}, {process.told}")
+            trial.wrong.append(f"going on: exit code {process.code}, {' '.join(process.told)}")
         else:
             trial.wrong += self.differences(folder)
         print(trial, flush=True)
@@ -286,17 +286,18 @@ class Soak:
         """Two jobs at a time, one of them the undisturbed run's; SIGKILL goes to all processes."""
         for number in (signal.SIGKILL, signal.SIGTERM):
             top, kind = self.new_folder(), self.fault
-            words = [*self.overrides, "-m", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1"]
+            words = ["-m", *self.overrides, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1"]
             words += [f"hydra.sweep.dir={top}", "hydra.sweep.subdir=${hydra.job.num}"]
             process = Process(words, self.top / top.name)
             process.wait(lambda top=top: any(top.glob("*/last.ckpt")))
-            (os.killpg if number == signal.SIGKILL else os.kill)(process.id, number)
+            if process.code is None:
+                (os.killpg if number == signal.SIGKILL else os.kill)(process.id, number)
             process.wait()
             self.fault = kind + number.name
             trial = self.judge(process, "training, kriging", None, (143, -number))
             again = Process(words, self.top / top.name)
             again.wait()
-            trial.wrong += [f"going on: exit code {again.code}, {again.told}"] if again.code else []
+            trial.wrong += [f"going on: exit code {again.code}, {' '.join(again.told)}"] if again.code else []
             self.fault = kind
             self.go_on(top / "0", trial)
 
@@ -345,7 +346,7 @@ def page(soak: Soak, seed: int) -> str:
     return PAGE.format(
         table="\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body)),
         verdict=f"{good} of {len(soak.trials)} lost nothing",
-        wrong="".join(f"{line}\n" for line in wrong(soak.trials)),
+        wrong="".join(f"{line}\n" for line in wrong(soak.trials)).replace(str(soak.top), "DIR"),
         command=shlex.join(["python", *sys.argv]),
         **{"seconds": soak.seconds, "work": soak.work, "seed": seed, "device": device},
     )

@@ -207,7 +207,7 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
         return f"{folder} must stay there while a run is at work, and was removed; the same command begins anew"
     if isinstance(error, OSError):
         return files.sentence(error, folder)
-    if isinstance(error, ValueError | TypeError | ImportError | RuntimeError):
+    if isinstance(error, ValueError | TypeError | ImportError | RuntimeError | OmegaConfBaseException):
         return str(error)
     from lightning.pytorch.utilities.exceptions import MisconfigurationException  # slow to import
 

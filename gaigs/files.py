@@ -6,6 +6,9 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Errors of the system that only writing meets."""
+
 
 @contextlib.contextmanager
 def whole(path: str | Path) -> Iterator[Path]:
@@ -24,7 +27,11 @@ def whole(path: str | Path) -> Iterator[Path]:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
         yield part
         with open(part, "r+b") as written:
-            os.fsync(written.fileno())
+            try:
+                os.fsync(written.fileno())
+            except OSError as error:
+                if error.errno != errno.EINVAL:  # a file system that knows no such thing
+                    raise
         part.replace(path)
     except BaseException as error:
         with contextlib.suppress(OSError):
@@ -54,7 +61,13 @@ def sentence(error: OSError, folder: Path) -> str:
     """
     if error.errno is None or error.strerror != os.strerror(error.errno):
         return str(error.strerror or error)
-    return _unwritten(error.filename or f"a file in {folder}", error)
+    path = error.filename or f"a file in {folder}"
+    if error.errno in UNWRITTEN:
+        return _unwritten(path, error)
+    return (
+        f"{path} could not be read or written ({error.strerror}); see that its folder is there, that both may be used, "
+        "and try again"
+    )
 
 
 def _unwritten(path: object, error: OSError) -> str:

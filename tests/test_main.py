@@ -349,7 +349,9 @@ def test_a_run_folder_that_hydra_cannot_make_is_told_in_one_line(run, tmp_path):
     code, err = run(*SMALL, "hydra.run.dir=taken/run")
     assert code == 1
     assert "Traceback" not in err
-    assert re.match(r"gaigs: .*taken/run could not be written \(Not a directory\); see that its folder is there", err)
+    assert re.match(
+        r"gaigs: .*taken/run could not be read or written \(Not a directory\); see that its folder is there", err
+    )
 
 
 def test_another_configuration_in_the_same_folder(run):

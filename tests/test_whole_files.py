@@ -107,7 +107,14 @@ def test_a_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
     ("error", "begins"),
     [
         (FULL, "a file in run could not be written (No space left on device); see that its folder"),
-        (OSError(errno.ENOENT, os.strerror(errno.ENOENT), "log/metrics.csv"), "log/metrics.csv could not be written"),
+        (
+            OSError(errno.ENOENT, os.strerror(errno.ENOENT), "log/metrics.csv"),
+            "log/metrics.csv could not be read or written",
+        ),
+        (
+            OSError(errno.EACCES, os.strerror(errno.EACCES), "data"),
+            "data could not be read or written (Permission denied)",
+        ),
         (OSError(errno.ENOSPC, "run/best.ckpt could not"), "run/best.ckpt could not"),
         (FileNotFoundError("nowhere must be the folder of a data set"), "nowhere must be"),
     ],

@@ -4,14 +4,12 @@ import os
 from collections.abc import Iterable, Sequence
 
 from gaigs.benchmark._rows import NOT_MEASURED, UNAVAILABLE, Row
+from gaigs.report.table import markdown
 
 
 def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     """Markdown; nothing for no lines."""
-    if not lines:
-        return ""
-    whole = [head, ["---"] * len(head), *lines]
-    return "".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |\n" for line in whole)
+    return markdown([head, *lines]) if lines else ""
 
 
 def number(text: str) -> str:

@@ -54,7 +54,7 @@ class Rows:
         for row in new:
             row["status"] = row["status"] or MEASURED
             self._rows[self._key(row)] = row
-        with open(self.file, "a", newline="") as opened:
+        with open(self.file, "a", newline="", encoding="utf-8") as opened:
             csv.DictWriter(opened, self.columns).writerows(new)
 
     def mark(self, rows: Iterable[Row]) -> None:
@@ -69,7 +69,7 @@ class Rows:
 
     def write(self) -> None:
         """Writes the file anew, each row once."""
-        with whole(self.file) as part, open(part, "w", newline="") as opened:
+        with whole(self.file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
             writer = csv.DictWriter(opened, self.columns)
             writer.writeheader()
             writer.writerows(self.all())
@@ -86,7 +86,7 @@ def read(file: Path, columns: Sequence[str]) -> list[Row]:
     """
     told = "; move it elsewhere, or choose another folder with hydra.run.dir=DIR"
     try:
-        text = file.read_text()
+        text = file.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(f"{file} must be a CSV file of a benchmark, and is no text{told}") from error
     ends = text.endswith("\n")

@@ -1,6 +1,7 @@
 """Benchmarks whose cells are whole runs: each in a folder of its own, one after the other, in this process."""
 
 import gc
+import hashlib
 import logging
 import math
 import re
@@ -16,6 +17,7 @@ from gaigs import experiment
 from gaigs.benchmark import MEASURED, NOT_MEASURED, UNAVAILABLE, Context, Measured, Row, device_of, named
 from gaigs.configuration import run_folder
 from gaigs.data import load
+from gaigs.processes import lacks_memory
 from gaigs.registry import check_type
 from gaigs.report.curves import read_validations
 from gaigs.report.runs import read_metrics, train_seconds
@@ -157,7 +159,8 @@ class Trainings(Measured):
         try:
             metrics = experiment.run(config, folder)
         except Exception as error:  # of whatever system: the next one goes on
-            if isinstance(error, OSError) and not isinstance(error, BAD):
+            is_of_machine = isinstance(error, OSError) and not isinstance(error, BAD)
+            if is_of_machine or lacks_memory(error) or not folder.is_dir():
                 raise
             log.error("%s: %s", " ".join(words), sentence(error))
             log.debug("", exc_info=True)  # with hydra.verbose=true
@@ -192,11 +195,14 @@ def facts(metrics: Mapping, folder: Path) -> dict:
 
 
 def scene(words: Iterable[str]) -> str:
-    """The command line's overrides as a page may show them: of places the last part."""
+    """The command line's overrides as a page may show them: of places the last part, and what tells them apart."""
     shown = []
     for word in words:
         key, equals, value = word.partition("=")
-        shown.append(key + equals + (Path(value).name if value.startswith(("/", "~", ".")) else value))
+        if value.startswith(("/", "~", ".")):
+            place = Path(value).expanduser().absolute()
+            value = f"{place.name}#{hashlib.sha256(str(place).encode()).hexdigest()[:6]}"
+        shown.append(key + equals + value)
     return " ".join(shown)
 
 

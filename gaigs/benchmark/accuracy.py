@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import yaml
 
-from gaigs.benchmark import Context, Glance, Row
+from gaigs.benchmark import Context, Glance, Row, check_names
 from gaigs.benchmark._accuracy_page import LOOK_UPS, SYSTEMS, figures, highlights, tables
 from gaigs.benchmark._trainings import Trainings, written
 from gaigs.configuration import conf_dir, plugin_conf_dirs
@@ -43,6 +43,8 @@ class Accuracy(Trainings):
         super().__init__(trainer, axes, minutes, device)
         for score, found in levels.items():
             check_type(f"benchmark.levels.{score}", found, list[float])
+        if systems is not None:
+            check_names("systems", systems, registry("model").names())
         self.levels, self.systems = levels, systems
 
     def cells(self, context: Context) -> Iterator[list[Row]]:

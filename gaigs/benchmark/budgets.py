@@ -64,7 +64,7 @@ class Budgets(Trainings):
         self.factors, self.tolerance = factors, tolerance
 
     def cells(self, context: Context) -> Iterator[list[Row]]:
-        self.reference(context)
+        self._tolerance_of(scale_of(self.reference(context)["task"]["name"]))
         for device in context.devices:
             yield from self.cells_of_axes(context, device)
 
@@ -84,13 +84,16 @@ class Budgets(Trainings):
         parts = [INTRODUCTION]
         for place, own in places(rows).items():
             scale = scale_of(place.task)
-            unit = scale.unit or RATIO
-            if unit not in self.tolerance:
-                raise ValueError(
-                    f"benchmark.tolerance must have the unit {unit!r} of {scale.title}, got {', '.join(self.tolerance)}"
-                )
-            parts.append(_part(place, own, self.tolerance[unit], scale))
+            parts.append(_part(place, own, self._tolerance_of(scale), scale))
         return "\n".join([*parts, remarks(rows, ("key", "value", "of", "scene", "device"))]).rstrip() + "\n"
+
+    def _tolerance_of(self, scale: Scale) -> float:
+        unit = scale.unit or RATIO
+        if unit not in self.tolerance:
+            raise ValueError(
+                f"benchmark.tolerance must have the unit {unit!r} of {scale.title}, got {', '.join(self.tolerance)}"
+            )
+        return self.tolerance[unit]
 
     def highlights(self, rows: Sequence[Row]) -> Sequence[Glance]:
         return ()  # what is small enough is no error against a time

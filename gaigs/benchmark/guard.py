@@ -79,6 +79,8 @@ class Guard(Measured):
         super().__init__(minutes, device)
         if repeats < 1:
             raise ValueError(f"benchmark.repeats must be at least 1, got {repeats}")
+        if device not in (None, "cpu"):
+            raise ValueError(f"benchmark.device must be cpu or null, as the guard knows no other, got {device!r}")
         self.baseline, self.record, self.repeats = Path(baseline), record, repeats
 
     def run(self, folder: Path, context: Context) -> None:
@@ -274,7 +276,7 @@ def read_baselines(file: Path) -> dict[str, dict[str, float]]:
     if not file.is_file():
         return {}
     try:
-        content = json.loads(file.read_text())
+        content = json.loads(file.read_text(encoding="utf-8"))
         return {key: {name: float(value) for name, value in own.items()} for key, own in content.items()}
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from gaigs.files import whole, write_text
 from gaigs.report.style import COLUMN, DPI, LINES, STYLE
+from gaigs.report.table import markdown
 
 
 class Cell(NamedTuple):
@@ -71,13 +72,14 @@ def write(
     heads = ["distance [m]", *map(_apart, columns)]
     inline = filled(lambda cell: f"{median(cell)} ({interval(cell)}), {cell.pairs:,}")
     parts = [f"{about}, by the distance of their places and by how many measurements apart they are:"]
-    parts.append(_markdown(heads, [[_distance(d), *line] for d, line in zip(distances, inline, strict=True)]))
+    parts.append(markdown([heads, *([_distance(d), *line] for d, line in zip(distances, inline, strict=True))]))
     scored = [[name, *(_number(row[key], title) for key, title in titles.items())] for name, row in rows.items()]
     if rows:
-        parts += [f"What that lets expect on split {split}:", _markdown(["predicted by", *titles.values()], scored)]
+        parts += [f"What that lets expect on split {split}:", markdown([["predicted by", *titles.values()], *scored])]
     compared = [cell.compared for cell in cells if cell.compared < cell.pairs]
     drawn = [f"of a cell with more, {max(compared):,} random pairs are compared"] if compared else []
     remarks = [*remarks, *drawn]
+    parts = [part.rstrip("\n") for part in parts]
     parts.append("\n".join(f"- {remark}" for remark in remarks))
     write_text(folder / "agreement.md", "\n\n".join(parts) + "\n")
     _write_csv(folder / "agreement.csv", cells)
@@ -139,18 +141,12 @@ def figure(score: str, cells: Sequence[Cell]):
 def _write_csv(path: Path, cells: Sequence[Cell]) -> None:
     """A line for each cell; what has no end is left out."""
     names = "distance_from_m", "distance_below_m", "separation_from", "separation_to", "pairs", "compared"
-    with whole(path) as part, open(part, "w", newline="") as file:
+    with whole(path) as part, open(part, "w", newline="", encoding="utf-8") as file:
         lines = csv.writer(file)
         lines.writerow((*names, "p10", "median", "p90"))
         for cell in cells:
             bounds = ("" if math.isinf(value) else value for value in (*cell.distance, *cell.separation))
             lines.writerow((*bounds, cell.pairs, cell.compared, *(f"{value:.6g}" for value in cell.quantiles)))
-
-
-def _markdown(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A table; a bar in a title, as of an absolute value, ends no cell."""
-    told = ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (heads, *lines)]
-    return "\n".join([told[0], "|" + "---|" * len(heads), *told[1:]])
 
 
 def _number(value: float, title: str) -> str:

@@ -203,7 +203,7 @@ def _sources(found: Sequence[Finding]) -> list[str]:
 
 
 def _csv(file: Path, found: Sequence[Finding]) -> None:
-    with whole(file) as part, open(part, "w", newline="") as opened:
+    with whole(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
         writer = csv.writer(opened)
         writer.writerow(
             [

@@ -70,7 +70,7 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
     """
     curves: dict[str, dict[float, float]] = {}
     for path in paths:
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             reader = csv.DictReader(line for line in file if line.endswith("\n"))
             if reader.fieldnames is None:
                 continue

@@ -143,7 +143,7 @@ def report(folder: Path) -> Group:
     caption = ", ".join(f"{key}={value}" for key, value in shared.items())
 
     written_rows = rows + [_flat(row) for row in groups]
-    with whole(folder / "ablation.csv") as part, open(part, "w", newline="") as file:
+    with whole(folder / "ablation.csv") as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, _columns(written_rows))
         writer.writeheader()
         writer.writerows(written_rows)

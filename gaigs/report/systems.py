@@ -208,7 +208,7 @@ def _tex(rows: Sequence[System], columns: Sequence[Column]) -> str:
 
 
 def _csv(file: Path, rows: Sequence[System], columns: Sequence[Column]) -> None:
-    with whole(file) as part, open(part, "w", newline="") as opened:
+    with whole(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
         writer = csv.writer(opened)
         spread = [any(isinstance(value, Spread) for value in column.values) for column in columns]
         head = ([c.title, f"{c.title}, sd"] if wide else [c.title] for c, wide in zip(columns, spread, strict=True))

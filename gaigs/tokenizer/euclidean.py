@@ -72,9 +72,11 @@ class EuclideanTokenizer(nn.Module):
         self.scene = scene
         self.register_buffer("receivers_middle", scene.positions(scene.lower).mean(0))
         self.register_buffer("transmitters_middle", (scene.lower + scene.upper) / 2)
-        self.register_buffer("gaussian_frequencies", octaves("tokenizer.gaussian_octaves", *gaussian_octaves))
+        self.register_buffer("gaussian_frequencies", octaves("tokenizer option gaussian_octaves", *gaussian_octaves))
         transmitter_octaves = transmitter_octaves or learnable_octaves(scene)
-        self.register_buffer("transmitter_frequencies", octaves("tokenizer.transmitter_octaves", *transmitter_octaves))
+        self.register_buffer(
+            "transmitter_frequencies", octaves("tokenizer option transmitter_octaves", *transmitter_octaves)
+        )
         self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
         features = 3 * (1 + 2 * len(self.transmitter_frequencies))
         if scene.has_band:
