@@ -159,8 +159,8 @@ class Trainings(Measured):
         try:
             metrics = experiment.run(config, folder)
         except Exception as error:  # of whatever system: the next one goes on
-            is_of_machine = isinstance(error, OSError) and not isinstance(error, BAD)
-            if is_of_machine or lacks_memory(error) or not folder.is_dir():
+            is_of_data = isinstance(error, BAD) and folder.is_dir()  # which a removed folder is not
+            if lacks_memory(error) or (isinstance(error, OSError) and not is_of_data):
                 raise
             log.error("%s: %s", " ".join(words), sentence(error))
             log.debug("", exc_info=True)  # with hydra.verbose=true

@@ -43,7 +43,7 @@ class Accuracy(Trainings):
         super().__init__(trainer, axes, minutes, device)
         for score, found in levels.items():
             check_type(f"benchmark.levels.{score}", found, list[float])
-        if systems is not None:
+        if systems:
             check_names("systems", systems, registry("model").names())
         self.levels, self.systems = levels, systems
 

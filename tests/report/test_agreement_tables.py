@@ -20,7 +20,7 @@ MARKDOWN = r"""Median |difference| [dB] of two labels, 10th to 90th percentile, 
 of their places and by how many measurements apart they are:
 
 | distance [m] | within 3 | 4 to 30 | over 30 |
-|---|---|---|---|
+| --- | --- | --- | --- |
 | same place | 5.00 (5.00 to 5.00), 1 |  |  |
 | under 0.01 | 1.25 (0.50 to 2.00), 3,466 |  | 2.50 (-1.00 to 4.00), 113 |
 | 0.01 to 0.02 |  | 2.00 (0.00 to 3.00), 20 |  |
@@ -28,7 +28,7 @@ of their places and by how many measurements apart they are:
 What that lets expect on split made:
 
 | predicted by | MAE [dB] | share of \|h\| |
-|---|---|---|
+| --- | --- | --- |
 | one label as near | 1.00 | 0.500 |
 
 - a remark
