@@ -15,6 +15,9 @@ def window_means(images: Float[Tensor, "*batch rows columns"], window: int) -> F
     Args:
         images: At least as many rows and columns as the window has.
         window: Its edge [pixels].
+
+    Raises:
+        RuntimeError: An image is smaller than the window.
     """
     return _WindowMeans.apply(images, window)
 

@@ -153,6 +153,11 @@ class GaussianSplatting(Model):
         return self.trend is not None
 
     def forward(self, batch: Batch) -> Prediction:
+        """As of every model.
+
+        Raises:
+            ValueError: In half precision.
+        """
         own = next(self.parameters())
         if torch.is_autocast_enabled(own.device.type) or torch.finfo(own.dtype).bits < 32:
             raise ValueError(
