@@ -15,7 +15,9 @@ POCL_THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 
 OUT_OF_MEMORY = ("allocate memory", "unable to allocate", "not enough memory", "out of memory", "bad_alloc")
 OUT_OF_MEMORY += ("bad allocation", "failed to map segment", "can't start new thread", "mem_object_allocation_failure")
-"""Words of torch, C++, the loader of libraries, Python and OpenCL for it, in small letters."""
+OUT_OF_MEMORY += ("could not create a primitive", "error return without exception set")
+"""Words of torch, C++, the loader of libraries, Python, OpenCL and oneDNN for it, in small letters; the last ones are
+Python's where there was no memory for the error itself."""
 
 received: list[int] = []
 """Signals at which runs of this process have stopped: a launcher's worker starts no other then."""

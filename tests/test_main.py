@@ -313,11 +313,13 @@ TORCH = "[enforce fail at alloc_cpu.cpp:124] DefaultCPUAllocator: can't allocate
     [
         (MemoryError(), "there must be enough memory, and there is not (MemoryError)"),
         (RuntimeError(TORCH), f"there must be enough memory, and there is not ({TORCH})"),
+        (RuntimeError("could not create a primitive"), "there must be enough memory, and there is not (could not"),
+        (SystemError("error return without exception set"), "there must be enough memory, and there is not (error"),
         (ValueError("no model"), "there must be enough memory, and there is not (no model)"),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), "run could not be written (No space left on device); see"),
         (OSError(errno.ENOSPC, "run/best.ckpt could not be written"), "run/best.ckpt could not be written\n"),
     ],
-    ids=["python", "torch", "cause", "disk", "told already"],
+    ids=["python", "torch", "oneDNN", "no room for the error", "cause", "disk", "told already"],
 )
 def test_faults_of_the_machine_are_told_in_one_line(error, told, run, monkeypatch):
     def fail(*_):
