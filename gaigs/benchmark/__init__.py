@@ -92,16 +92,16 @@ class Benchmark(ABC):
 
     Args:
         minutes: Nothing is begun later than this; what is left is done by the same command in the same folder.
-            None: no limit.
+            0: tables and figures of what is measured already; None: no limit.
         device: "cpu", "cuda", or None for each that there is.
 
     Raises:
-        ValueError: ``minutes`` is not above 0, or there is no such device.
+        ValueError: ``minutes`` is negative, or there is no such device.
     """
 
     def __init__(self, minutes: float | None = None, device: str | None = None):
-        if minutes is not None and not minutes > 0:
-            raise ValueError(f"benchmark.minutes must be above 0, or null for no limit, got {minutes}")
+        if minutes is not None and not minutes >= 0:
+            raise ValueError(f"benchmark.minutes must be at least 0, or null for no limit, got {minutes}")
         if device not in (None, "cpu", "cuda"):
             raise ValueError(f"benchmark.device must be cpu, cuda, or null for each that there is, got {device!r}")
         if device == "cuda" and not torch.cuda.is_available():

@@ -192,7 +192,7 @@ def _ranked(rows: Sequence[Row], key: str, scale: Scale) -> list[Row]:
 
 def figures(rows: Sequence[Row]) -> dict:
     """Error over the time of training of all systems and of each axis, and against the time of a prediction."""
-    from gaigs.benchmark import _errors  # matplotlib is slow to import
+    from gaigs.benchmark import _figures  # matplotlib is slow to import
 
     found = {}
     for index, (place, own) in enumerate(places(rows).items(), 1):
@@ -206,11 +206,11 @@ def figures(rows: Sequence[Row]) -> dict:
             r["value"]: scale.error(float(r["validation"])) for r in own if r["axis"] == LOOK_UPS and r["validation"]
         }
         if SYSTEMS in panels:
-            found[f"accuracy_time{end}"] = _errors.errors_over_time(
+            found[f"accuracy_time{end}"] = _figures.errors_over_time(
                 {"": panels.pop(SYSTEMS)}, scale.error_title, look_ups
             )
         if panels:
-            found[f"accuracy_axes{end}"] = _errors.errors_over_time(panels, scale.error_title, look_ups)
+            found[f"accuracy_axes{end}"] = _figures.errors_over_time(panels, scale.error_title, look_ups)
         groups = {axis: [row for row in own if row["axis"] == axis] for axis in (SYSTEMS, LOOK_UPS)}
         names = {axis: [name_of(row) for row in group] for axis, group in groups.items() if group}
         shown = [row for group in groups.values() for row in group]
@@ -220,7 +220,7 @@ def figures(rows: Sequence[Row]) -> dict:
         if sizes:
             costs["checkpoint [MB]"] = sizes
         if shown:
-            figure = _errors.errors_against_costs(names, errors, costs, scale.error_title)
+            figure = _figures.errors_against_costs(names, errors, costs, scale.error_title)
             found[f"accuracy_inference{end}"] = figure
     return found
 

@@ -99,7 +99,7 @@ def _errors(own: Mapping[tuple[str, str, str], Row]) -> str:
 
 def figures(rows: Sequence[Row]) -> dict:
     """Error against time of both passes, by device and scene; a panel a number of Gaussians, on the largest grid."""
-    from gaigs.benchmark._pareto import pareto  # matplotlib is slow to import
+    from gaigs.benchmark._figures import pareto  # matplotlib is slow to import
 
     panels: dict[tuple[str, str], dict[int, dict[str, list[tuple[float, float]]]]] = {}
     for (device, scene, gaussians, _), own in sorted(_places(rows).items(), key=lambda item: _order(item[0])):

@@ -58,7 +58,7 @@ def test_without_a_name_all_are_run_and_make_one_page(run, monkeypatch):
         (("benchmark=step",), "benchmark=step needs command=benchmark, got command=train; add command=benchmark"),
         (("command=benchmark", "benchmark=step", "benchmark.repeats=0"), "benchmark.repeats must be at least 1, got 0"),
         (("command=benchmark", "benchmark=step", "benchmark.repeats=x"), "option 'repeats' must be a whole number"),
-        (("command=benchmark", "benchmark=step", "benchmark.minutes=-1"), "benchmark.minutes must be above 0"),
+        (("command=benchmark", "benchmark=step", "benchmark.minutes=-1"), "benchmark.minutes must be at least 0"),
         (("command=benchmark", "~benchmark"), "command=benchmark needs a benchmark, and it was left out"),
         (("command=bench",), "command must be train, benchmark, agreement or devices, got 'bench'"),
     ],

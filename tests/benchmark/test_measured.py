@@ -78,6 +78,15 @@ def test_time_is_up(tmp_path):
     assert again.measured == [2, 3]
 
 
+def test_without_a_minute_the_page_is_of_what_is_there(tmp_path):
+    Squares([1]).run(tmp_path, Context())
+    (tmp_path / "squares.md").unlink()
+    again = Squares([1, 2], minutes=0)
+    again.run(tmp_path, Context())
+    assert again.measured == []
+    assert "- not measured, as time was up: 2\n" in (tmp_path / "squares.md").read_text()
+
+
 def test_a_part_has_no_more_time_than_the_whole():
     whole = Context(deadline=time.monotonic() + 60)
     assert whole.within(minutes=5).seconds_left() <= 60 < Context().within(minutes=5).seconds_left()
@@ -104,7 +113,7 @@ def test_a_file_of_something_else_is_told_and_kept(tmp_path, content, told):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"minutes": 0}, r"benchmark\.minutes must be above 0, or null for no limit, got 0"),
+        ({"minutes": -1}, r"benchmark\.minutes must be at least 0, or null for no limit, got -1"),
         ({"device": "tpu"}, r"benchmark\.device must be cpu, cuda, or null for each that there is, got 'tpu'"),
     ],
 )

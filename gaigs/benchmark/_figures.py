@@ -9,15 +9,18 @@ from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy import ndarray
 from scipy.optimize import isotonic_regression
 
 from gaigs.benchmark._page import best
-from gaigs.report.style import LINES, PAGE, STYLE
+from gaigs.report.style import LINES, MARKERS, PAGE, STYLE
 
 Curve = tuple[Float[ndarray, "k"], Float[ndarray, "k"]]
 """Costs and errors in the order of the costs."""
+
+Points = Mapping[str, Sequence[tuple[float, float]]]
+"""(time, error) of each setting, by the component's name."""
 
 FRONT = {"color": "0.8", "linewidth": 5, "solid_capstyle": "butt", "zorder": 0}
 """The look of a front: a wide band below everything else."""
@@ -157,3 +160,34 @@ def _round_ticks(ax: Axes) -> None:
     for axis, subs in ((ax.xaxis, (1, 2, 5)), (ax.yaxis, (1, 2, 3, 5, 7))):
         axis.set(major_locator=LogLocator(subs=subs), minor_locator=NullLocator())
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def pareto(panels: Mapping[str, Points], time: str, error: str) -> Figure:
+    """Error against time, both logarithmic; the settings that none beats in both are joined by a line.
+
+    Args:
+        panels: Points by title.
+        time, error: Labels of the axes, with units.
+    """
+    with rc_context(STYLE):
+        figure = Figure(figsize=(PAGE, 2.5), layout="constrained")
+        axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+        names = [*dict.fromkeys(name for points in panels.values() for name in points)]
+        looks = {name: MARKERS[6 * i % len(MARKERS)] for i, name in enumerate(names)}  # in marker and colour
+        for ax, (title, points) in zip(axes, panels.items(), strict=True):
+            for name, found in points.items():
+                ax.plot(*zip(*found, strict=True), linestyle="", markersize=5, label=name, **looks[name])
+            front = best([point for found in points.values() for point in found])
+            ax.plot(*zip(*front, strict=True), color="0.45", linewidth=0.9, zorder=0, label="none is better in both")
+            ax.set(title=title, xscale="log", yscale="log")
+            times = [time for found in points.values() for time, _ in found]
+            subs = (1, 2, 5) if max(times) < 30 * min(times) else (1,)
+            ax.xaxis.set(major_locator=LogLocator(subs=subs), major_formatter="{x:g}", minor_formatter=NullFormatter())
+            ax.grid()
+        axes[0].set_ylabel(error)
+        figure.supxlabel(time, fontsize=8)
+        labels = {}
+        for ax in axes:
+            labels |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+        figure.legend(labels.values(), labels.keys(), loc="outside upper center", ncols=min(len(labels), 5))
+    return figure
