@@ -32,6 +32,8 @@ KEYS = {
 }  # fmt: skip
 """What stands at the top of a configuration, and of which type it is."""
 
+TASK_KEYS = {"name": str, "trend": dict | None, "baselines": list[dict]}
+"""The same under ``task``, of which all but the name may be missing."""
 
 LONGEST = 200
 """Bytes in the name of a job's folder; most file systems end at 255."""
@@ -98,7 +100,10 @@ def check(config: dict) -> None:
         raise ValueError("command=benchmark needs a benchmark, and it was left out; add benchmark=all")
     for kind in KINDS[: KINDS.index("benchmark")]:
         check_type(f"{kind}.name", config[kind].get("name"), str)
-    check_type("task.baselines", config["task"].get("baselines", []), list[dict])
+    for key, value in config["task"].items():
+        if key not in TASK_KEYS:
+            raise ValueError(f"task has no key {suggest(key, TASK_KEYS)}; it has: {', '.join(TASK_KEYS)}")
+        check_type(f"task.{key}", value, TASK_KEYS[key])
     if not 0 <= config["seed"] < 2**32:
         raise ValueError(f"seed must be in 0..{2**32 - 1}, got {config['seed']}")
     if config["save_every"] < 0:

@@ -473,6 +473,9 @@ def test_tensorboard_logs_beside_the_csv(tmp_path):
         (["+training.learning_rates.netwrk=1"], r"rates has 'netwrk' \(did you mean 'network'\?\), and the model"),
         (["+training.schedule.warm=1"], r"training.schedule has no option 'warm' \(did you mean 'warmup'\?\)"),
         (["+foo=3"], r"the configuration has no key 'foo'"),
+        (["+task.foo=3"], r"task has no key 'foo'; it has: name, trend, baselines"),
+        (["+task.tren.name=mean"], r"task has no key 'tren' \(did you mean 'trend'\?\)"),
+        (["task.trend=friis"], r"task.trend must be a mapping or null, got 'friis'"),
         (["baselines=[{name: mean}, {name: mean}]"], r"baselines must have different names, got 'mean' twice"),
         (["baselines=[{name: gaigs2}]"], r"unknown model 'gaigs2'"),
         (

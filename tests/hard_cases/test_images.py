@@ -95,7 +95,7 @@ def test_placed(name, task, planes, places):
 @pytest.mark.parametrize("planes", [name for name in PLANES if name != "as they start"])
 @pytest.mark.parametrize("places", PLACES)
 def test_ways_of_words(order, planes, places):
-    """Folded paths are as long as the straight line to the image wherever they exist."""
+    """Folded paths are as long as the straight line to the image wherever they exist, and stay near elsewhere."""
     words = all_words(len(PLANES[planes]), order)
     normals = functional.normalize(torch.tensor([normal for normal, _ in PLANES[planes]]), dim=1)
     offsets = torch.tensor([offset for _, offset in PLANES[planes]])
@@ -116,6 +116,9 @@ def test_ways_of_words(order, planes, places):
         assert all(gradient.isfinite().all() for gradient in gradients)
         straight = (seen[-1] - receivers[:, None]).norm(dim=-1)
         legs = (folded.end - folded.start).norm(dim=-1)
+        # A line is bent between its ends, and its far end then moves from one image to the next.
+        reach = max((image - receivers[:, None]).norm(dim=-1).max().item() for image in seen)
+        assert legs.max() <= 1.001 * (1 + 2 * order) * reach
         ways = torch.zeros_like(straight).index_add(1, folded.path, legs)
         bound = 1e-3 if dtype == torch.float32 else 1e-6
         assert (ways - straight)[folded.exists].abs().max() <= bound * max(1.0, straight.max().item())

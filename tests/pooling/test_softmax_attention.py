@@ -45,6 +45,15 @@ def image():
 
 
 @LEARN
+def test_levels_far_beyond_the_temperature_do_not_overflow(learn):
+    image = torch.full((1, 1, 6, 9), 1e33)
+    image[0, 0, 2, 3] = 2e33
+    label, gradient = graded(attention(1e-6, 1e-3, learn), image)
+    assert label.item() == pytest.approx(10 * 2e33 * 0.999 + 10 * 1e33 * (55 / 54) * 1e-3, rel=1e-5)
+    assert gradient.isfinite().all()
+
+
+@LEARN
 @pytest.mark.parametrize(("temperature", "prior"), [(0.434, 0.1), (3.0, 0.0), (0.05, 0.7)])
 def test_it_is_the_formula_of_the_paper(image, temperature, prior, learn):
     if learn and prior == 0:
