@@ -108,6 +108,21 @@ def equal_depths() -> Scene:
     return scene
 
 
+def depths_of_either_sign() -> Scene:
+    scene = random_scene()
+    scene.splats.depths.sub_(2.5)
+    return scene
+
+
+def points_on_pixels() -> Scene:
+    """Each acts on the one pixel it is centred on: those at the edges of tiles among them."""
+    plane = replace(grid(Mercator(0.1)), period=None)
+    scene = random_scene(n=60, plane=plane, spread=(1e-9, 1e-9), opacities=(0.5, 0.9))
+    scene.splats.means2d.copy_(torch.stack((plane.u[0], plane.v[torch.arange(60) % 37, 0]), -1))
+    scene.splats.visible.fill_(True)
+    return scene
+
+
 def invisible_garbage() -> Scene:
     scene = random_scene()
     scene.splats.factors[:, ~scene.splats.visible] = torch.nan
@@ -165,6 +180,8 @@ SCENES = {
     "nothing visible": lambda: random_scene(opacities=(0.0, 0.0)),
     "invisible garbage": invisible_garbage,
     "equal depths": equal_depths,
+    "depths of either sign": depths_of_either_sign,
+    "points on pixels": points_on_pixels,
     "empty tiles": lambda: random_scene(n=5, spread=(0.03, 0.05)),
     "narrower than a pixel": lambda: random_scene(n=150, spread=(0.005, 0.05)),
     "wider than the plane": lambda: random_scene(spread=(3.0, 30.0)),
@@ -276,6 +293,7 @@ def test_two_runs_give_the_same_bits(own):
 def test_what_is_broken_shows(name, own):
     scene = random_scene(own=own, attenuations=(0.5, 1.0))
     nearest = torch.where(scene.splats.visible, scene.splats.depths, torch.inf).argmin()
+    scene.opacities[2, nearest] = 0  # one that is heard of nothing hides none that is broken
     broken = scene.parameters()[name]
     (broken[nearest] if name == "means2d" else broken[1 if own or len(broken) > 1 else 0, nearest]).fill_(torch.nan)
     image, _, gradients = render(opencl.OpenCLRasterizer(), scene, torch.ones(3, *scene.plane.shape))
