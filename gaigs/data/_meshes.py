@@ -1,6 +1,6 @@
 """Meshes of rooms as files, Wavefront OBJ and PLY: what is wrong is told with its file, line and value."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -104,15 +104,28 @@ def read_ply(file: Path) -> tuple[np.ndarray, list[Face]]:
         raise ValueError(
             f"{file} must be a whole .ply file of vertices x, y, z and of faces or none: {told}"
         ) from error
+    check_mesh(points, faces, str(file))
+    return vertices, faces
+
+
+def check_mesh(points: Float[np.ndarray, "v 3"], faces: Sequence[Face], source: str) -> None:
+    """Sees to it that vertices [m] are near enough, and faces made of them.
+
+    Args:
+        points, faces: Of a mesh.
+        source: What errors call it.
+
+    Raises:
+        ValueError: A vertex is too far away or no number, or a face takes vertices that there are not.
+    """
     if not (np.abs(points) < FAR).all():
         row = int((~(np.abs(points) < FAR)).any(1).argmax())
-        raise ValueError(f"{file} must hold {NEAR}, got {points[row].tolist()} at vertex {row + 1}")
+        raise ValueError(f"{source} must hold {NEAR}, got {points[row].tolist()} at vertex {row + 1}")
     for number, face in enumerate(faces, 1):
         if len(face) < 3 or not all(0 <= corner < len(points) for corner in face):
             raise ValueError(
-                f"{file}, face {number}, must be of three vertices or more of the {len(points)} there are, got {face}"
+                f"{source}, face {number}, must be of three vertices or more of the {len(points)} there are, got {face}"
             )
-    return vertices, faces
 
 
 def _indices(content: PlyData) -> Iterable:

@@ -449,6 +449,33 @@ def test_other_files_are_refused(tmp_path, tracer):
             rooms.find_meshes("none", str(tmp_path / name))
 
 
+WALL = '<bsdf type="itu-radio-material" id="wall"><string name="type" value="{}"/></bsdf>'
+LEAF = '<shape type="{}" id="leaf">{}<ref id="wall" name="bsdf"/></shape>'
+PLY = """ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z
+element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n{} 0 0\n0 1 0\n3 0 1 2\n"""
+
+
+@pytest.mark.parametrize(
+    ("material", "shape", "message"),
+    [
+        ("wood", LEAF.format("rectangle", ""), r"room\.xml, shape '.*', must be a mesh of type ply or obj"),
+        ("gold", LEAF.format("rectangle", ""), r"room\.xml must be a scene that Sionna RT reads, and is not: .*gold"),
+        ("wood", "<shape>", r"room\.xml must be a scene that Sionna RT reads, and is not: "),
+        (
+            "wood",
+            LEAF.format("ply", '<string name="filename" value="far.ply"/>'),
+            r"shape '.*', must hold positions",
+        ),
+    ],
+)
+def test_a_damaged_scene_is_told_in_one_line(tmp_path, tracer, material, shape, message):
+    (tmp_path / "far.ply").write_text(PLY.format("1e9"))
+    (tmp_path / "room.xml").write_text(f'<scene version="2.1.0">{WALL.format(material)}{shape}</scene>')
+    with pytest.raises(ValueError, match=message) as caught:
+        module("rooms").find_meshes("none", str(tmp_path / "room.xml"))
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gaigs.data import synthetic
-from gaigs.data._meshes import NO_NAME, parse_obj, read_ply
+from gaigs.data._meshes import NO_NAME, check_mesh, parse_obj, read_ply
 from gaigs.data._meshes import read_obj as read_mesh
 from gaigs.data.sionna import ROOMS, tracing
 from gaigs.data.sionna.meshes import THICKNESS, Mesh
@@ -130,14 +130,22 @@ def _read_scene(file: Path) -> list[Mesh]:
 
     try:
         scene = rt.load_scene(str(file))
-    except Exception as error:  # whatever Mitsuba's parser raises
-        raise ValueError(f"{file} must be a scene that Sionna RT reads, and is not ({error})") from error
+    except Exception as error:  # whatever Mitsuba's parser raises, with a traceback in it where a material is wrong
+        told, traceback, calls = str(error).partition("Traceback (most recent call last):")
+        cause = calls.strip().rpartition("\n")[2] if traceback else ""
+        words = " ".join(f"{told} {cause}".split())
+        raise ValueError(f"{file} must be a scene that Sionna RT reads, and is not: {words}") from error
     meshes = []
     for name, shape in scene.objects.items():
         parameters = mitsuba.traverse(shape.mi_mesh)
-        vertices = parameters["vertex_positions"].numpy().reshape(-1, 3).astype(float).tolist()
+        if "vertex_positions" not in parameters:  # as of a rectangle, which has no vertices of its own
+            raise ValueError(
+                f"{file}, shape {name!r}, must be a mesh of type ply or obj; export it as one, as Blender does"
+            )
+        points = parameters["vertex_positions"].numpy().reshape(-1, 3).astype(float)
         faces = [tuple(face) for face in parameters["faces"].numpy().reshape(-1, 3).tolist()]
-        meshes.append(_mesh(name, shape.radio_material.name, vertices, faces))
+        check_mesh(points, faces, f"{file}, shape {name!r},")
+        meshes.append(_mesh(name, shape.radio_material.name, points.tolist(), faces))
     return meshes
 
 
@@ -145,6 +153,4 @@ def _mesh(name: str, material: str, vertices: Sequence, faces: Sequence[tuple[in
     """A mesh of those vertices alone that its faces have."""
     numbers = {corner: k for k, corner in enumerate(dict.fromkeys(itertools.chain(*faces)))}
     corners = tuple(tuple(vertices[corner]) for corner in numbers)
-    if not np.isfinite(corners).all():
-        raise ValueError(f"the vertices of {name!r} must be finite")
     return Mesh(name, material, corners, tuple(tuple(numbers[corner] for corner in face) for face in faces))
