@@ -52,9 +52,9 @@ RUN = (
     "gaussians.count=30",
     "training.thinning.stride=16",
     "training.batch_size=8",
-    "trainer.max_steps=24",
-    "trainer.val_check_interval=8",
-    "trainer.log_every_n_steps=2",
+    "trainer.max_steps=240",
+    "trainer.val_check_interval=40",
+    "trainer.log_every_n_steps=10",
     "baselines=[{name: mean}, {name: knn, k: 3, power: 2.0}]",
 )
 

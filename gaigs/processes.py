@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,9 @@ OUT_OF_MEMORY += ("bad allocation", "failed to map segment", "can't start new th
 OUT_OF_MEMORY += ("could not create a primitive", "error return without exception set")
 """Words of torch, C++, the loader of libraries, Python, OpenCL and oneDNN for it, in small letters; the last ones are
 Python's where there was no memory for the error itself."""
+
+AGAIN = 0.05
+"""Until a signal comes once more that was passed over [s]."""
 
 received: list[int] = []
 """Signals at which runs of this process have stopped: a launcher's worker starts no other then."""
@@ -109,6 +113,8 @@ def only_run(folder: Path) -> Iterator[None]:
 def stopping(waits: bool = False) -> Iterator[None]:
     """Has SIGTERM stop a run as Ctrl-C does; what handlers there were come back.
 
+    Python passes over what is raised while it destroys an object; such a signal comes once more.
+
     Args:
         waits: Whether the process waits for another run then. SIGTERM does not end it while it does, as its launcher
             would wait for it for ever.
@@ -121,12 +127,25 @@ def stopping(waits: bool = False) -> Iterator[None]:
     def stop(number: int, _) -> None:
         raise Stopped("stopped", number)
 
+    timers, hook = [], sys.unraisablehook
+
+    def repeat(lost) -> None:
+        if not isinstance(lost.exc_value, KeyboardInterrupt):
+            hook(lost)
+            return
+        timers.append(threading.Timer(AGAIN, os.kill, (os.getpid(), getattr(lost.exc_value, "number", signal.SIGINT))))
+        timers[-1].start()
+
     signal.signal(signal.SIGTERM, stop)
+    sys.unraisablehook = repeat
     try:
         if received:  # between two runs of a process that waits
             raise Stopped("stopped", received[0])
         yield
     finally:
+        for timer in timers:
+            timer.cancel()
+        sys.unraisablehook = hook
         for number, handler in handlers.items():
             signal.signal(number, handler)
         if waits:

@@ -150,6 +150,23 @@ def test_a_launchers_process_that_waits_for_a_run_outlives_sigterm(monkeypatch):
         signal.signal(signal.SIGTERM, before)
 
 
+@pytest.mark.parametrize("number", processes.STOPPING)
+def test_a_signal_that_python_passes_over_stops_a_run_all_the_same(number):
+    class Dying:
+        def __del__(self):
+            signal.raise_signal(number)
+
+    def work():
+        Dying()  # whose end passes over the error
+        time.sleep(20)
+
+    hook = sys.unraisablehook
+    with pytest.raises(KeyboardInterrupt) as stop, processes.stopping():
+        work()
+    assert getattr(stop.value, "number", signal.SIGINT) == number
+    assert sys.unraisablehook is hook
+
+
 def test_sigterm_stops_all_jobs_of_a_launcher(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs gaigs[parallel]")
     jobs = ("seed=0,1,2", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "save_every=0.2")
