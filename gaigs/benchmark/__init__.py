@@ -123,7 +123,7 @@ class Benchmark(ABC):
 
     @abstractmethod
     def glance(self, folder: Path) -> Sequence[Glance]:
-        """The lines that the first table of the whole page has of it."""
+        """The lines that the first tables of the whole page have of it."""
 
 
 class Measured(Benchmark):

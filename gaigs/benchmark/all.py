@@ -19,7 +19,7 @@ PAGE = "speed-error"
 
 INTRODUCTION = """# Speed against error
 
-What do you pay in error for which speed, with which component, on which machine? The first table says it at a glance;
+What do you pay in error for which speed, with which component, on which machine? The first tables say it at a glance;
 each section below has the measurements behind it. One command gives all of this page and its figures on your machine:
 
 ```
@@ -67,9 +67,12 @@ class All(Benchmark):
         return [line for part in self.parts for line in part.glance(folder)]
 
     def _table(self, folder: Path) -> str:
-        """The table at a glance."""
-        lines = self.glance(folder)
-        devices = [*dict.fromkeys(line.device for line in lines)]
-        head = ["choice", "where", "time", "error", *(["device"] if len(devices) > 1 else [])]
-        told = table(head, [line[: len(head)] for line in lines])
-        return f"On {'; '.join(devices)}, torch {torch.__version__}:\n\n{told}" if devices else ""
+        """The table at a glance, one for each device."""
+        by_device: dict[str, list[Glance]] = {}
+        for line in self.glance(folder):
+            by_device.setdefault(line.device, []).append(line)
+        parts = []
+        for device, lines in by_device.items():
+            told = table(["choice", "where", "time", "error"], [line[:-1] for line in lines])
+            parts.append(f"On {device}, torch {torch.__version__}:\n\n{told}")
+        return "\n".join(parts)

@@ -73,8 +73,8 @@ def test_what_does_not_suit_is_told_in_a_sentence(run, arguments, told):
 class Part:
     """A benchmark that notes its time."""
 
-    def __init__(self, seconds):
-        self.seconds, self.had = seconds, None
+    def __init__(self, seconds, device="a machine"):
+        self.seconds, self.device, self.had = seconds, device, None
 
     def run(self, folder, context):
         self.had = context.seconds_left()
@@ -84,18 +84,20 @@ class Part:
         return "## A part\n\n![a figure](part.png)\n"
 
     def glance(self, folder):
-        return [Glance("this for that", "a map", "1 ms", "1e-7", "a machine")]
+        return [Glance("this for that", "a map", "1 ms", "1e-7", self.device)]
 
 
 def test_parts_share_the_minutes_and_a_page(tmp_path, monkeypatch):
     whole = All({"step": {"name": "step", "rasterizers": ["torch"]}}, minutes=0.6 / 60)
-    whole.parts = [Part(0), Part(0.1), Part(0)]
+    whole.parts = [Part(0), Part(0.1, "another"), Part(0)]
     whole.run(tmp_path, Context())
     first, second, third = (part.had for part in whole.parts)
     assert first <= 0.2 < second <= 0.3 < third <= 0.5
     page = (tmp_path / "speed-error.md").read_text()
     assert page.startswith("# Speed against error\n")
-    assert "| this for that | a map | 1 ms | 1e-7 |\n" in page
+    line = "| this for that | a map | 1 ms | 1e-7 |\n"
+    first, second = page.partition("On a machine, ")[2].split("On another, ")
+    assert (first.count(line), second.count(line)) == (2, 1)
     assert page.count("## A part\n\n![a figure](speed-error/part.png)\n") == 3
 
 
