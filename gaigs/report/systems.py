@@ -323,5 +323,6 @@ def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict:
         own |= {f"{name}_trend" for name in own}  # a run's own model without its kriging
         validation = next((run.metrics["validation"] for run in firsts.values() if run.metrics.get("validation")), {})
         lines = {name: scores[mean] for name, scores in validation.items() if name not in own}
-        figures["curves"] = learning_curves(curves, f"{known[mean].title}, validation", lines)
+        score = known[mean]
+        figures["curves"] = learning_curves(curves, f"{score.title}, validation", lines, score.larger_is_better)
     return figures

@@ -187,10 +187,11 @@ def test_figures_show_the_first_seed_of_each_system(sweep, monkeypatch):
         "yagi": "model=yagi,seed=0",
     }
     assert asked["split"] == "official"
-    curves, label, baselines = asked["curves"]
+    curves, label, baselines, larger_is_better = asked["curves"]
     assert curves == {"NeRF²": ((15.0, 30.5), (0.3, 0.8)), "GAI-GS": ((15.0, 30.5), (0.3, 0.9))}
     assert label == "mean SSIM, validation"
     assert baselines == {"mean": 0.49, "knn": 0.49}
+    assert larger_is_better
     assert {path.name for path in sweep.glob("systems_*")} == {
         "systems_cdf.png",
         "systems_spectra.png",
@@ -314,9 +315,10 @@ def test_a_spectrum_and_what_systems_predict():
     assert [ax.get_xlabel() != "" for ax in panels] == [False] * 3 + [True] * 4
 
 
-def test_learning_curves():
+@pytest.mark.parametrize(("larger_is_better", "scale"), [(True, "linear"), (False, "log")])
+def test_learning_curves(larger_is_better, scale):
     curves = {"GAI-GS": ((1, 2, 3), (0.1, 0.5, 0.6)), "NeRF²": ((2, 4), (0.2, 0.3))}
-    figure = learning_curves(curves, "mean SSIM, validation", {"mean": 0.4})
+    figure = learning_curves(curves, "mean SSIM, validation", {"mean": 0.4}, larger_is_better)
     (ax,) = figure.axes
     for line, (name, points) in zip(ax.lines, curves.items(), strict=False):
         assert line.get_label() == name
@@ -324,6 +326,12 @@ def test_learning_curves():
     assert ax.lines[2].get_ydata() == [0.4, 0.4]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("training [s]", "mean SSIM, validation")
     assert len(figure.legends[0].get_texts()) == 3
+    assert ax.get_yscale() == scale
+
+
+def test_errors_of_zero_have_no_logarithm():
+    figure = learning_curves({"GAI-GS": ((1, 2), (0.1, 0.0))}, "error", {}, larger_is_better=False)
+    assert figure.axes[0].get_yscale() == "linear"
 
 
 @pytest.mark.parametrize(
