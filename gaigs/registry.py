@@ -327,8 +327,8 @@ def _scan(kind: str, folder: Path, package: str, root: Path | None = None) -> tu
                 holders += [Holder(name, where, target, root=source) for name, target in _entry_points(kind, file)]
             else:
                 holders += [Holder(name, where, module, file, root) for name in _decorated(kind, file)]
-        except (SyntaxError, ValueError, OSError) as error:
-            unreadable.append(f"{where}: {error}")
+        except (SyntaxError, ValueError, OSError, RecursionError, MemoryError) as error:  # the last ones of the parser
+            unreadable.append(f"{where}: {str(error) or type(error).__name__}")
     return holders, unreadable
 
 
@@ -355,9 +355,20 @@ def _sources(folder: Path) -> list[Path]:
 
 
 def _entry_points(kind: str, file: Path) -> Iterable[tuple[str, str]]:
-    """Names and targets that a pyproject.toml declares."""
-    project = tomllib.loads(file.read_text(encoding="utf-8")).get("project", {})
-    return project.get("entry-points", {}).get(f"gaigs.{kind}", {}).items()
+    """Names and targets that a pyproject.toml declares.
+
+    Raises:
+        ValueError: It is no TOML, or declares something else in their place.
+    """
+    points = tomllib.loads(file.read_text(encoding="utf-8"))
+    for key in ("project", "entry-points", f"gaigs.{kind}"):
+        points = points.get(key, {})
+        if not isinstance(points, dict):
+            raise ValueError(f"{key} must be a table, got {points!r}")
+    for name, target in points.items():
+        if not isinstance(target, str):
+            raise ValueError(f"entry point {name!r} must be a string module:attribute, got {target!r}")
+    return points.items()
 
 
 def _decorated(kind: str, file: Path) -> Iterator[str]:

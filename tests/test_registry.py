@@ -426,6 +426,27 @@ def test_files_that_cannot_be_read_hurt_only_who_finds_no_name(plugins):
     assert "invalid syntax (typo.py, line 6)" in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("file", "content", "cause"),
+    [
+        ("odd/pyproject.toml", "project = 3", "project must be a table, got 3"),
+        ("odd/pyproject.toml", "[project]\nentry-points = 3", "entry-points must be a table, got 3"),
+        ("odd/pyproject.toml", "[project.entry-points]\n'gaigs.model' = 3", "gaigs.model must be a table, got 3"),
+        (
+            "odd/pyproject.toml",
+            "[project.entry-points.'gaigs.model']\nodd = 3",
+            "entry point 'odd' must be a string module:attribute, got 3",
+        ),
+        ("odd.py", f"x = {100_000 * '-'}1\n", r"odd\.py: MemoryError"),  # Python's for what it cannot parse
+    ],
+)
+def test_files_that_say_something_else_hurt_only_who_finds_no_name(file, content, cause, plugins):
+    plugins(file, content)
+    registry("model").get("mean")
+    with pytest.raises(ValueError, match=f"unknown model 'odd'.*; cannot read plugins.*{cause}"):
+        registry("model").get("odd")
+
+
 def test_a_dropped_file_may_not_take_a_name(plugins):
     plugins("map.py", component("projection", "mercator"))
     with pytest.raises(ValueError, match=r"'mercator' is held by gaigs.*mercator\.py, and plugins.map\.py asks for it"):
