@@ -243,7 +243,8 @@ def compose_and_run() -> None:
     except Exception as error:
         if asked == "1":
             raise
-        if isinstance(error, HydraException | OmegaConfBaseException | ValueError):
+        told = isinstance(error, HydraException | OmegaConfBaseException | ValueError)
+        if told or configuration.is_composing(error):
             print(f"gaigs: {configuration.explain(error)}", file=sys.stderr)
         elif isinstance(error, OSError | MemoryError):  # of one of Hydra's own files
             print(f"gaigs: {advice(error, Path.cwd(), 'the same command goes on')}", file=sys.stderr)

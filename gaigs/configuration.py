@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import traceback
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -110,6 +111,22 @@ def check(config: dict) -> None:
         raise ValueError(f"save_every must be at least 0 s, got {config['save_every']}")
 
 
+def is_composing(error: Exception) -> bool:
+    """Whether an error came up while Hydra read configuration files and joined them, and not in a job."""
+    return any(frame.name == "load_configuration" for frame in traceback.extract_tb(error.__traceback__))
+
+
+def unreadable() -> str | None:
+    """What is wrong with the first configuration file that cannot be read, in one sentence; None where all can."""
+    for file in (file for folder in (conf_dir(), *plugin_conf_dirs()) for file in sorted(folder.rglob("*.yaml"))):
+        try:
+            OmegaConf.load(file)
+        except Exception as error:  # whatever YAML meets
+            cause = " ".join(str(error).split())
+            return f"{file} must be a YAML file in UTF-8, and is none ({cause}); mend it, or take it away"
+    return None
+
+
 def explain(error: Exception) -> str:
     """What is wrong with a command line of which Hydra makes no configuration, in one sentence."""
     cause = error.__cause__
@@ -128,6 +145,11 @@ def explain(error: Exception) -> str:
         case HydraException(), _:
             words = " ".join(f"{error} {cause or ''}".split())
             return f"Hydra cannot read it: {words}"
+        case _ if not str(error).startswith("Config group"):
+            words = " ".join(str(error).split())
+            about = "; its files may not choose each other in a circle" if isinstance(error, RecursionError) else ""
+            cannot = f"Hydra cannot join the files of the configuration ({words}){about}; mend those of your own"
+            return unreadable() or cannot
         case _:  # of null, or a number, for a group
             return f"a word on the command line that chooses a file must be its name ({error}); ~density chooses none"
 

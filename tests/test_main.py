@@ -214,6 +214,43 @@ def test_what_a_user_can_mend_is_told_without_a_traceback(overrides, message, ru
     assert "Traceback" not in err
 
 
+UNREADABLE = {
+    "a list without its end": (b"name: [odd\n", "odd.yaml must be a YAML file in UTF-8, and is none (while parsing"),
+    "a tab": (b"name:\todd\n", "odd.yaml must be a YAML file in UTF-8, and is none (while scanning"),
+    "a key twice": (
+        b"name: odd\nname: odd\n",
+        "odd.yaml must be a YAML file in UTF-8, and is none (while constructing",
+    ),
+    "code": (b"name: !!python/object/apply:os.system ['true']\n", "odd.yaml must be a YAML file in UTF-8, and is none"),
+    "lists in lists": (
+        b"name: " + 2000 * b"[",
+        "odd.yaml must be a YAML file in UTF-8, and is none (maximum recursion",
+    ),
+    "UTF-16": ("name: odd".encode("utf-16"), "odd.yaml must be a YAML file in UTF-8, and is none ('utf-8' codec"),
+    "no list of defaults": (
+        b"defaults: x\n",
+        "Hydra cannot join the files of the configuration (Invalid defaults list in",
+    ),
+    "half a header": (b"# @package\nname: odd\n", "Hydra cannot join the files of the configuration (Expected header"),
+    "a circle": (
+        b"defaults: [odd]\nname: odd\n",
+        "its files may not choose each other in a circle; mend those of your",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_a_configuration_file_that_hydra_cannot_read_is_named(case, run, tmp_path):
+    content, message = UNREADABLE[case]
+    folder = tmp_path / "plugins" / "conf" / "model"
+    folder.mkdir(parents=True)
+    (folder / "odd.yaml").write_bytes(content)
+    code, err = run(*HERE, "model=odd")
+    assert code == 1
+    assert message in err
+    assert "Traceback" not in err
+
+
 def test_whoever_wants_the_traceback_gets_it_before_the_message(run):
     code, err = run(*SMALL, *HERE, "tokenizer.width=0", "hydra.verbose=true")
     assert code == 1
