@@ -105,7 +105,14 @@ def claim(folder: Path, config: dict) -> None:
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         store(config, folder)
         return
-    differing = differences(OmegaConf.to_container(OmegaConf.load(file)), config)
+    try:
+        there = OmegaConf.to_container(OmegaConf.load(file))
+    except Exception as error:  # whatever a file meets that is YAML, but no configuration
+        raise ValueError(
+            f"{file} must be what a run wrote, and is damaged ({' '.join(str(error).split())}); take another copy of "
+            "it, or choose another folder with hydra.run.dir=DIR"
+        ) from error
+    differing = differences(there, config)
     if differing:
         told = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
         listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in told)

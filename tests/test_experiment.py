@@ -346,6 +346,19 @@ def test_a_folder_that_was_removed_and_made_anew_gets_its_configuration_again(fi
     assert yaml.safe_load((own / "config.yaml").read_text()) == config
 
 
+@pytest.mark.parametrize(
+    "text", ["model: 3\ndata: ${x.y\n", "model: &a {x: *a}\ndata: {}\n", "model: {null: 2}\ndata: {}\n"]
+)
+def test_a_damaged_configuration_in_the_folder_is_named(text, finished, tmp_path):
+    config, folder, _ = finished
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(
+        ValueError, match=r"config\.yaml must be what a run wrote, and is damaged .*; take another copy"
+    ):
+        experiment.run(config, tmp_path)
+
+
 def test_a_folder_that_lost_its_configuration_is_refused(finished, tmp_path):
     config, folder, _ = finished
     shutil.copy(folder / "metrics.json", tmp_path)
