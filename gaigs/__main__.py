@@ -150,6 +150,7 @@ def going_on_later(work: Callable):
     goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
     try:
         with mendable(goes_on), stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
+            processes.check_ranks()
             importlib.import_module("lightning.pytorch")  # slow: here, once the configuration has proved good
             for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
                 logging.getLogger(name).setLevel(logging.WARNING)

@@ -148,7 +148,7 @@ def explain(error: Exception) -> str:
         case _ if not str(error).startswith("Config group"):
             words = " ".join(str(error).split())
             about = "; its files may not choose each other in a circle" if isinstance(error, RecursionError) else ""
-            cannot = f"Hydra cannot join the files of the configuration ({words}){about}; mend those of your own"
+            cannot = f"Hydra cannot join command line and configuration files ({words}){about}; mend what is your own"
             return unreadable() or cannot
         case _:  # of null, or a number, for a group
             return f"a word on the command line that chooses a file must be its name ({error}); ~density chooses none"

@@ -23,6 +23,9 @@ Python's where there was no memory for the error itself."""
 AGAIN = 0.05
 """Until a signal comes once more that was passed over [s]."""
 
+RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "NODE_RANK", "GROUP_RANK")
+"""Environment variables that number processes and machines."""
+
 received: list[int] = []
 """Signals at which runs of this process have stopped: a launcher's worker starts no other then."""
 
@@ -71,6 +74,18 @@ def lacks_memory(error: BaseException | None) -> bool:
             return True
         error = error.__cause__
     return False
+
+
+def check_ranks() -> None:
+    """Sees to it that what numbers processes are numbers; to be called before Lightning is imported, which reads them.
+
+    Raises:
+        ValueError: One is none.
+    """
+    for name in RANKS:
+        value = os.environ.get(name, "0")
+        if not value.isdecimal():
+            raise ValueError(f"{name} must be a whole number in the environment, got {value!r}; unset it")
 
 
 def is_first() -> bool:

@@ -22,7 +22,7 @@ import yaml
 import gaigs
 from gaigs import __main__ as command_line
 from gaigs import agreement, evaluation, experiment
-from gaigs.processes import Stopped
+from gaigs.processes import RANKS, Stopped
 from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
 
@@ -229,14 +229,25 @@ UNREADABLE = {
     "UTF-16": ("name: odd".encode("utf-16"), "odd.yaml must be a YAML file in UTF-8, and is none ('utf-8' codec"),
     "no list of defaults": (
         b"defaults: x\n",
-        "Hydra cannot join the files of the configuration (Invalid defaults list in",
+        "Hydra cannot join command line and configuration files (Invalid defaults list in",
     ),
-    "half a header": (b"# @package\nname: odd\n", "Hydra cannot join the files of the configuration (Expected header"),
+    "half a header": (
+        b"# @package\nname: odd\n",
+        "Hydra cannot join command line and configuration files (Expected header",
+    ),
     "a circle": (
         b"defaults: [odd]\nname: odd\n",
-        "its files may not choose each other in a circle; mend those of your",
+        "its files may not choose each other in a circle; mend what is your",
     ),
 }
+
+
+@pytest.mark.parametrize("name", RANKS)
+def test_a_process_without_a_number_is_told_so(name, run, monkeypatch):
+    monkeypatch.setenv(name, "first")
+    code, err = run(*SMALL, *HERE)
+    assert code == 1
+    assert f"gaigs: {name} must be a whole number in the environment, got 'first'; unset it" in err
 
 
 @pytest.mark.parametrize("case", UNREADABLE)
