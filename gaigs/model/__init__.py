@@ -1,18 +1,20 @@
 """Models predict a task's value from who sends, who hears, at which frequency and, for spectra, in which directions."""
 
+import math
 import reprlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.data._files import NEAR
-from gaigs.directions import Directions
+from gaigs.directions import Directions, Rays
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import FAR
 from gaigs.query import Batch, Query
@@ -165,7 +167,7 @@ class Model(nn.Module):
             ValueError: The positions are not (..., 3) real numbers, or one is not finite or too far away; there is no
                 such receiver; a frequency is not positive, is another than the training links' only one, or is missing
                 where they have several; the batch size is less than 1; directions are asked for where the label has
-                none; or a query is given with a receiver or a frequency beside it.
+                none, or are no angles in radians; or a query is given with a receiver or a frequency beside it.
         """
         query, shape, directions = self._ask(transmitters, receiver, frequency, batch_size, directions)
         parts = [*query.parts(batch_size)] or [query]
@@ -225,6 +227,7 @@ class Model(nn.Module):
             )
         if directions is not None and own is None:
             raise ValueError(f"labels of task {self.scene.task.name!r} have no directions; leave directions out")
+        directions = own if directions is None else as_directions(directions)
         transmitters = as_numbers("transmitters", transmitters, "(..., 3) positions [m]")
         if not transmitters.ndim or transmitters.shape[-1] != 3:
             raise ValueError(f"transmitters must be (..., 3) positions [m], got shape {tuple(transmitters.shape)}")
@@ -237,7 +240,6 @@ class Model(nn.Module):
         receivers = self._index(receiver, shape).to(points.device)
         query = Query(points, receivers, self._frequencies(frequency, shape))
         device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
-        directions = own if directions is None else directions
         return query.to(device), shape, None if directions is None else directions.to(device)
 
     def _frequencies(self, frequency, shape: tuple[int, ...]) -> Float[Tensor, "b"] | None:
@@ -296,11 +298,33 @@ def as_numbers(what: str, values: object, expected: str) -> Tensor:
     """
     try:
         tensor = torch.as_tensor(values)
-        if tensor.is_complex() or tensor.dtype == torch.bool:
+        if tensor.is_complex() or tensor.dtype == torch.bool or np.ma.is_masked(values):
             raise TypeError(str(tensor.dtype))
     except (TypeError, ValueError, RuntimeError, OverflowError):  # whatever torch meets in words, or in ragged lists
         raise ValueError(f"{what} must be {expected} in real numbers, got {reprlib.repr(values)}") from None
     return tensor.to(torch.float32)
+
+
+def as_directions(directions: Directions) -> Directions:
+    """Directions that a model can be asked for, in float32.
+
+    Raises:
+        ValueError: An angle is no number, or too large to be one in radians; or rays have not one of either each.
+    """
+    angles = {}
+    for name, most in (("elevations", math.pi / 2), ("azimuths", 2 * math.pi)):
+        expected = f"{name} must be a list of angles from {-most:.4f} to {most:.4f} rad"
+        angles[name] = values = as_numbers(name, getattr(directions, name), expected.partition("be ")[2])
+        if values.ndim != 1:
+            raise ValueError(f"{expected}, got shape {tuple(values.shape)}")
+        if len(wrong := values[~(values.abs() <= most + 1e-4)]):
+            raise ValueError(f"{expected}, got {wrong[0]:g}; Grid.degrees takes degrees")
+    counts = [len(values) for values in angles.values()]
+    if isinstance(directions, Rays) and counts[0] != counts[1]:
+        raise ValueError(
+            f"rays must have as many elevations as azimuths, got {counts[0]} and {counts[1]}; Grid has rows"
+        )
+    return type(directions)(**angles)
 
 
 def build_trend(config: dict, scene: Scene) -> Model:

@@ -1,5 +1,6 @@
 """What all models share, asked of the splatting pipeline: directions, chunks, questions of every kind, carriers."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -140,6 +141,7 @@ def test_predict_takes_directions(build, links):
         ([[1.0, 2, 3]], 1.0, "must be one of 0 = gateway0, 1 = gateway1, got 1.0"),
         ([[1.0, 2, 3]], 10**30, "must be one of 0 = gateway0, 1 = gateway1, got 1000"),
         ([[1.0, 2, 3]], torch.tensor([0.0]), r"must be one of .*, got \(1,\) of torch.float32"),
+        (np.ma.array([[1.0, 2, 3]], mask=[[True, False, False]]), 0, "in real numbers, got masked_array"),
         ([[1.0, 2, 3]] * 3, np.array([0, 7, 1]), "must be one of 0 = gateway0, 1 = gateway1, got 7"),
         ([[1.0, 2, 3]], torch.tensor([[0]]), r"one for each of the \(1,\) positions, got \(1, 1\)"),
     ],
@@ -159,6 +161,16 @@ def test_impossible_questions_are_refused(build, transmitters, receiver, message
         ({"batch_size": 2.5}, TypeError, "batch_size must be a whole number, got 2.5"),
         ({"batch_size": None}, TypeError, "batch_size must be a whole number, got None"),
         ({"directions": 30}, TypeError, r"must be a gaigs\.directions\.Grid or gaigs\.directions\.Rays, .* got int"),
+        (
+            {"directions": Rays([0.5], [90.0])},
+            ValueError,
+            "azimuths must be .* rad, got 90; Grid.degrees takes degrees",
+        ),
+        ({"directions": Rays([-2.0], [0.0])}, ValueError, "elevations must be .* -1.5708 to 1.5708 rad, got -2; Grid"),
+        ({"directions": Rays([math.nan], [0.0])}, ValueError, "elevations must be .* rad, got nan"),
+        ({"directions": Rays(["up"], [0.0])}, ValueError, r"elevations must be .* in real numbers, got \['up'\]"),
+        ({"directions": Rays(0.5, [0.0])}, ValueError, r"elevations must be .* rad, got shape \(\)"),
+        ({"directions": Rays([0.5, 0.6], [0.0])}, ValueError, "as many elevations as azimuths, got 2 and 1"),
     ],
 )
 def test_options_of_predict_that_cannot_be_are_refused(build, options, error, message):
