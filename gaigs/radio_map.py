@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gaigs.files import whole
+from gaigs.registry import check_type
 
 PITCH = 0.1
 """Distance between the points of a map [m], unless the room is large."""
@@ -23,6 +24,9 @@ POINTS = 128
 
 SECONDS = 60.0
 """About how long a map takes at most, unless a pitch is asked for."""
+
+MOST = 10**8
+"""Points that a map has whatever pitch is asked for: more fill the memory."""
 
 FEWEST = 200
 """Points that a map has however slow the model is."""
@@ -74,13 +78,21 @@ class RadioMap:
 
         Raises:
             FileNotFoundError: There is no such file.
+            ValueError: It holds something else, or is damaged.
         """
-        with np.load(path) as file:
-            words = {name: str(file[name]) for name in ("quantity", "unit") if name in file.files}
-            values = file[_key(words.get("unit", cls.unit))]
-            frequency = float(file["frequency"]) if "frequency" in file.files else None
-            place = file["x"], file["y"], float(file["height"])
-            return cls(values, *place, tuple(file["receivers"].tolist()), **words, frequency=frequency)
+        try:
+            with np.load(path) as file:
+                words = {name: str(file[name]) for name in ("quantity", "unit") if name in file.files}
+                values = file[_key(words.get("unit", cls.unit))]
+                frequency = float(file["frequency"]) if "frequency" in file.files else None
+                place = file["x"], file["y"], float(file["height"])
+                return cls(values, *place, tuple(file["receivers"].tolist()), **words, frequency=frequency)
+        except FileNotFoundError:
+            raise
+        except Exception as error:  # whatever numpy meets in another file
+            raise ValueError(
+                f"{path} must be a file of RadioMap.save, and is damaged or another one ({error}); make the map anew"
+            ) from error
 
 
 def _key(unit: str) -> str:
@@ -108,8 +120,19 @@ def radio_map(
         frequency: Of the carrier [Hz]; None is that of the training links, of several the middle one.
 
     Raises:
+        TypeError: The model is none, or an option is not of its type.
         ValueError: The model predicts something else, an option is out of range, or there is no such receiver.
     """
+    if not hasattr(model, "scene"):
+        raise TypeError(f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint first")
+    for name, value, kind in (
+        ("pitch", pitch, float | None),
+        ("height", height, float | None),
+        ("margin", margin, float),
+    ):
+        if not isinstance(value, float):  # whose range is looked at below
+            check_type(name, value, kind)
+    check_type("receivers", receivers, Sequence[str] | str | None)
     scene = model.scene
     if scene.task.shape != () or scene.task.dtype.is_complex:
         raise ValueError(
@@ -149,6 +172,8 @@ def radio_map(
         most = BATCH * SECONDS / (time.perf_counter() - start)  # points
         while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, FEWEST):
             pitch *= 2
+    if math.prod(((upper - lower) / pitch).tolist()) > MOST:
+        raise ValueError(f"a radio map takes a pitch of at most {MOST:.0e} points, got {pitch} m; take a larger one")
     x, y = _axes(lower, upper, pitch)
     values = predict(np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1))
     values = np.ascontiguousarray(np.moveaxis(values, -1, 0))

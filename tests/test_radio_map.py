@@ -131,6 +131,37 @@ def test_what_makes_no_map_is_refused(options, message):
 
 
 @pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"pitch": "1"}, "pitch must be a number or null, got '1'"),
+        ({"pitch": True}, "pitch must be a number or null, got True"),
+        ({"margin": None}, "margin must be a number, got None"),
+        ({"height": [1, 2]}, r"height must be a number or null, got \[1, 2\]"),
+        ({"receivers": 0}, "receivers must be a list or a string or null, got 0"),
+        ({"receivers": [0]}, "receivers, entry 0, must be a string, got 0"),
+        ({"model": "runs/room/best.ckpt"}, "model must be one that gaigs.load gives, got 'runs/room/best.ckpt'; load"),
+    ],
+)
+def test_options_of_another_type_are_refused(options, message):
+    with pytest.raises(TypeError, match=message):
+        radio_map(**{"model": Slope(scene()), **options})
+
+
+@pytest.mark.parametrize("pitch", [1e-9, 1e-300])
+def test_a_map_that_no_memory_holds_is_refused(pitch):
+    with pytest.raises(ValueError, match=f"pitch of at most 1e.08 points, got {pitch} m; take a larger one"):
+        radio_map(Slope(scene()), pitch=pitch)
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"PK", "another"])
+def test_another_file_is_no_map(content, tmp_path):
+    file = tmp_path / "map.npz"
+    np.savez(file, y=3) if content == "another" else file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"map\.npz must be a file of RadioMap\.save, and is damaged or another one"):
+        RadioMap.load(file)
+
+
+@pytest.mark.parametrize(
     ("task", "message"),
     [
         (Spectrum(*vars(Grid.degrees()).values(), ""), r"'spectrum', whose labels are \(90, 360\) of torch.float32"),
