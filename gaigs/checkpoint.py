@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import io
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from zipfile import ZipFile
@@ -16,7 +17,7 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 from gaigs.files import whole
 from gaigs.model import Model
 from gaigs.processes import lacks_memory
-from gaigs.registry import registry
+from gaigs.registry import check_type, registry
 from gaigs.scene import Scene
 
 KEY = "gaigs"
@@ -66,11 +67,13 @@ def read(path: str | Path) -> dict:
     check sums are looked at that torch writes, and does not look at.
 
     Raises:
+        TypeError: The path is none.
         FileNotFoundError: There is no such file.
         ValueError: It is no checkpoint of gaigs, not a whole one, or of a later version.
     """
+    check_type("the path of a checkpoint", path, Path)
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # Path.is_file raises where a name is too long
         raise FileNotFoundError(f"no checkpoint at {path}; a run leaves best.ckpt and last.ckpt in its folder")
     data = path.read_bytes()
     try:

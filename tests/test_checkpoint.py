@@ -120,6 +120,17 @@ def test_many_spectra_go_to_a_file_as_the_page_shows(folder, tmp_path, monkeypat
     assert torch.equal(torch.tensor(stored), names["model"].predict(names["positions"], batch_size=2))
 
 
+@pytest.mark.parametrize("path", [None, 3, b"best.ckpt"])
+def test_what_is_no_path_is_refused(path):
+    with pytest.raises(TypeError, match=f"the path of a checkpoint must be a path, got {path!r}"):
+        gaigs.load(path)
+
+
+def test_a_name_that_no_file_can_have_is_that_of_none():
+    with pytest.raises(FileNotFoundError, match="no checkpoint at xxxx"):
+        gaigs.load("x" * 5000)
+
+
 def test_a_missing_checkpoint(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*best\.ckpt; a run leaves best\.ckpt and last"):
         gaigs.load(tmp_path / "best.ckpt")

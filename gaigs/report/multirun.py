@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gaigs.files import whole, write_text
+from gaigs.registry import check_type
 from gaigs.report.claims import write_claims
 from gaigs.report.curves import speed_against_error
 from gaigs.report.runs import Run, Spread, read_runs, train_seconds
@@ -111,7 +112,7 @@ def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
     return rows
 
 
-def report(folder: Path) -> Group:
+def report(folder: str | Path) -> Group:
     """Writes ``ablation.csv``, ``ablation.md`` and, unless none has ended, ``speed_against_error.png`` there. Runs of
     several models are also set side by side, by ``gaigs.report.systems.write_systems``. Runs of variants are also held
     against the paper's claims, by ``gaigs.report.claims.write_claims``; that is all where they are of several tasks.
@@ -125,9 +126,12 @@ def report(folder: Path) -> Group:
         brief are in the files only, and so is what tells no run from another.
 
     Raises:
+        TypeError: The folder is none.
         FileNotFoundError: The folder holds no run.
         ValueError: The runs make no table.
     """
+    check_type("folder", folder, Path)
+    folder = Path(folder)
     runs = read_runs(folder)
     claims = write_claims(folder, runs)
     tasks = {run.metrics["task"]: run.name for run in runs if run.metrics is not None}

@@ -286,6 +286,13 @@ def test_none_has_ended(tmp_path):
     assert not (tmp_path / "speed_against_error.png").exists()
 
 
+def test_a_folder_may_be_a_string(tmp_path):
+    with pytest.raises(FileNotFoundError, match=f"{re.escape(str(tmp_path))} must hold runs"):
+        report(str(tmp_path))
+    with pytest.raises(TypeError, match="folder must be a path, got 3"):
+        report(3)
+
+
 def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=f"{re.escape(str(tmp_path))} must hold runs"):
         report(tmp_path)
