@@ -1,0 +1,135 @@
+"""Who holds the names of a kind, found without importing anybody's code."""
+
+import ast
+import functools
+import re
+import tomllib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1]
+"""Of gaigs."""
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who holds a name, known before any of their code runs.
+
+    Attributes:
+        name: The registered name.
+        where: The file or distribution, as errors call it.
+        target: ``module``, which registers the component by decorator, or ``module:attribute``, which is the component.
+        file: The module's file, where the name was read from it.
+        root: Folder that must be on ``sys.path`` for the import, where it may not be yet.
+    """
+
+    name: str
+    where: str
+    target: str
+    file: Path | None = None
+    root: Path | None = None
+
+    @property
+    def package(self) -> str:
+        """The top-level package of the target."""
+        return re.split("[.:]", self.target)[0]
+
+    def owns(self, component: object) -> bool:
+        """Whether a component comes from the holder's file or, for an entry point, from the package it points into."""
+        module = getattr(component, "__module__", "")
+        return module == self.target if self.file else module.split(".")[0] == self.package
+
+
+def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
+    """Who holds the names of a kind, or one name: gaigs itself first, then installed packages, then ./plugins.
+
+    Returns:
+        The holders, and the files that cannot be read, each with the cause.
+    """
+    cwd = Path.cwd()
+    built_in, unreadable = _scan(kind, PACKAGE / kind, f"gaigs.{kind}")
+    points = metadata.entry_points(group=f"gaigs.{kind}")
+    installed = [Holder(p.name, f"distribution {p.dist.name} {p.dist.version}", p.value) for p in points]
+    dropped, causes = _scan(kind, cwd / "plugins", "plugins", root=cwd)
+    targets = {(holder.name, holder.target) for holder in installed}
+    # A package in ./plugins that is installed as well is no rival of itself.
+    holders = built_in + installed + [holder for holder in dropped if (holder.name, holder.target) not in targets]
+    return [holder for holder in holders if name in (None, holder.name)], unreadable + causes
+
+
+def _scan(kind: str, folder: Path, package: str, root: Path | None = None) -> tuple[list[Holder], list[str]]:
+    """Holders in a folder's files, and the files that cannot be read."""
+    holders, unreadable = [], []
+    for module, file in _files(folder, package):
+        where = str(file.relative_to(root or PACKAGE.parent))
+        try:
+            if file.name == "pyproject.toml":
+                source = _source(file.parent)
+                holders += [Holder(name, where, target, root=source) for name, target in _entry_points(kind, file)]
+            else:
+                holders += [Holder(name, where, module, file, root) for name in _decorated(kind, file)]
+        except (SyntaxError, ValueError, OSError, RecursionError, MemoryError) as error:  # the last ones of the parser
+            unreadable.append(f"{where}: {str(error) or type(error).__name__}")
+    return holders, unreadable
+
+
+def _files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
+    """Modules and their files in a folder and its packages, and of an installable project its pyproject.toml."""
+    for path in sorted(folder.glob("[!_.]*")):
+        if path.suffix == ".py":
+            yield f"{package}.{path.stem}", path
+        elif (path / "pyproject.toml").is_file():
+            yield path.name, path / "pyproject.toml"
+        elif (path / "__init__.py").is_file():
+            yield f"{package}.{path.name}", path / "__init__.py"
+            yield from _files(path, f"{package}.{path.name}")
+
+
+def _source(project: Path) -> Path:
+    """Where an installable project's packages lie: in src where there is one, else beside the pyproject.toml."""
+    return project / "src" if (project / "src").is_dir() else project
+
+
+def sources(folder: Path) -> list[Path]:
+    """Where the packages of all installable projects in a folder lie."""
+    return [_source(file.parent) for file in sorted(folder.glob("[!_.]*/pyproject.toml"))]
+
+
+def _entry_points(kind: str, file: Path) -> Iterable[tuple[str, str]]:
+    """Names and targets that a pyproject.toml declares.
+
+    Raises:
+        ValueError: It is no TOML, or declares something else in their place.
+    """
+    points = tomllib.loads(file.read_text(encoding="utf-8"))
+    for key in ("project", "entry-points", f"gaigs.{kind}"):
+        points = points.get(key, {})
+        if not isinstance(points, dict):
+            raise ValueError(f"{key} must be a table, got {points!r}")
+    for name, target in points.items():
+        if not isinstance(target, str):
+            raise ValueError(f"entry point {name!r} must be a string module:attribute, got {target!r}")
+    return points.items()
+
+
+def _decorated(kind: str, file: Path) -> list[str]:
+    """Names of a kind that a file's top-level ``@register(kind, name)`` decorators claim."""
+    stat = file.stat()
+    return [name for own, name in _claims(file, stat.st_mtime_ns, stat.st_size) if own == kind]
+
+
+@functools.cache  # a file is asked for the names of each kind
+def _claims(file: Path, _changed: int, _size: int) -> list[tuple[str, str]]:
+    """Kinds and names that the decorators of a file claim, as it stands now."""
+    found = []
+    for node in ast.parse(file.read_bytes(), file.name).body:
+        for decorator in getattr(node, "decorator_list", ()):
+            match decorator:
+                case ast.Call(
+                    func=ast.Name(id="register") | ast.Attribute(attr="register"),
+                    args=[ast.Constant(value=str(kind)), ast.Constant(value=str(name))],
+                ):
+                    found.append((kind, name))
+    return found
