@@ -22,7 +22,8 @@ INTRODUCTION = """## Budgets
 
 Here you find how small each part may be before accuracy suffers: the smallest value whose mean validation score is
 within the tolerance of the best value's. One key changes at a time, all others are as in the reference. Test links have
-no say. Where scores scatter over seeds by more than the tolerance, a difference of that size says nothing.
+no say. Where scores scatter over seeds by more than the tolerance, a difference of that size says nothing. Where it is
+the largest tried, a larger one may be better still.
 """
 
 
@@ -126,7 +127,8 @@ def _line(name: str, rows: Sequence[Row], tolerance: float, scale: Scale) -> lis
     default = next((row for row in rows if row["value"] == row["default"]), None)
     pair = lambda key: ", ".join(number(row[key]) if row else "not measured" for row in (smallest, default))
     costs = [pair("inference_ms"), pair("train_seconds")]
-    return [name, f"`{rows[0]['key']}`", scores, f"**{smallest['value']}**", rows[0]["default"], *costs]
+    told = f"**{smallest['value']}**" + (", the largest tried" if smallest is rows[-1] else "")
+    return [name, f"`{rows[0]['key']}`", scores, told, rows[0]["default"], *costs]
 
 
 def smallest_within(rows: Sequence[Row], tolerance: float, scale: Scale) -> Row:

@@ -55,6 +55,10 @@ def test_dbs_have_a_tolerance_of_their_own():
     assert "| 30: 4.04, 60: 4.00 | **30** | 60 |" in text
 
 
+def test_the_largest_tried_is_told():
+    assert "| **600**, the largest tried | 300 |" in budgets().tables(rows({"300": 0.9, "600": 0.92}))
+
+
 def test_test_links_have_no_say():
     scores = rows({"75": 0.8, "300": 0.9})
     scores[0]["test"], scores[1]["test"] = "0.99", "0.1"
