@@ -46,6 +46,13 @@ RESUMED = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "epoch", "
 """What a training goes on from, beside the weights: the most in the words of Lightning."""
 
 
+LIMITS = {
+    "limit_train_batches": "trainer.max_steps ends a training",
+    "limit_val_batches": "all validation links decide on the best step",
+}
+"""Options of Lightning that would leave batches out, and why none may be."""
+
+
 def run(config: dict, folder: Path) -> dict | None:
     """Trains, tests, and writes the run folder; goes on where an earlier run of the same configuration stopped there.
 
@@ -304,8 +311,13 @@ def check_trainer(trainer: lightning.Trainer) -> None:
     """
     if trainer.accumulate_grad_batches > 1:
         raise ValueError("trainer.accumulate_grad_batches must be 1; set training.batch_size instead")
-    if trainer.limit_val_batches != 1.0:
-        raise ValueError("trainer.limit_val_batches must be left out, as all validation links decide on the best step")
+    for name in ("fast_dev_run", "overfit_batches"):  # which set the others
+        if getattr(trainer, name):
+            raise ValueError(f"trainer.{name} must be left out; set trainer.max_steps to end a training early")
+    for name, reason in LIMITS.items():
+        share = getattr(trainer, name)
+        if isinstance(share, int) or share != 1:  # 1 is one batch, 1.0 all of them
+            raise ValueError(f"trainer.{name} must be left out, as {reason}")
     strategy, launcher = trainer.strategy, trainer.strategy.launcher
     starts_scripts = launcher is None or "Subprocess" in type(launcher).__name__
     if not isinstance(strategy, DDPStrategy | SingleDeviceStrategy) or not starts_scripts:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import lightning
 import torch
+from lightning.pytorch.callbacks import Timer
 
 from gaigs.benchmark import MEASURED, UNAVAILABLE, Context, Glance, Measured, Row, check_names, device_of, named
 from gaigs.benchmark._page import load_now, load_of, number, remarks, table
@@ -14,9 +15,10 @@ from gaigs.benchmark._passes import CAUSES, start
 from gaigs.benchmark._scenes import cast, common
 from gaigs.benchmark._watch import PARTS, WARM_UP, Watch, divided
 from gaigs.data import load
-from gaigs.experiment import count_gaussians
+from gaigs.experiment import check_trainer, count_gaussians
 from gaigs.registry import call, register, registry
 from gaigs.training.batches import Batches
+from gaigs.training.budget import make_budget
 
 WHOLE = "whole step"
 """The part that is not divided."""
@@ -163,7 +165,8 @@ def train(config: dict, watch: Watch, repeats: int, device: str) -> dict[str, in
     options = config["trainer"] | {"max_steps": steps, "max_time": None, "enable_progress_bar": False}
     options["accelerator"] = "gpu" if device == "cuda" else "cpu"
     context = {"callbacks": [watch], "logger": False, "enable_checkpointing": False}
-    trainer = call("trainer", lightning.Trainer, options, **context)
+    trainer = call("trainer", lightning.Trainer, make_budget(options, Timer())[0], **context)
+    check_trainer(trainer)
     batches = Batches(links, links.split.train, module.batch_size, config["seed"], steps)
     with warnings.catch_warnings(), divided(watch):
         for message in (".*LeafSpec", "You defined a `validation_step` but have no `val_dataloader`"):

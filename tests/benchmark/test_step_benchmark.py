@@ -52,6 +52,19 @@ def test_data_of_another_task_are_told(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("+trainer.limit_train_batches=0", "trainer.limit_train_batches must be left out"),
+        ("+trainer.fast_dev_run=true", "trainer.fast_dev_run must be left out"),
+        ("trainer.max_epochs=0", "trainer.max_epochs must be -1"),
+    ],
+)
+def test_options_that_would_leave_steps_out_are_refused(word, told, tmp_path):
+    with pytest.raises(ValueError, match=told):
+        StepBenchmark(["torch"], 1).run(tmp_path, Context(overrides=(*BRIEF, word)))
+
+
+@pytest.mark.parametrize(
     ("options", "told"),
     [
         ({"rasterizers": []}, r"benchmark\.rasterizers must have at least one of "),
