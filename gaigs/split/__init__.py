@@ -43,18 +43,19 @@ def part(
     """
     check_fractions(test, validation)
     generator = generator_of(seed)
-    train, testing = hold_out(torch.arange(len(links)), groups, test, generator)
-    train, validating = hold_out(train, groups, validation, generator)
+    train, testing = hold_out("test", torch.arange(len(links)), groups, test, generator)
+    train, validating = hold_out("validation", train, groups, validation, generator)
     words = [name, f"test {test:g}", *([f"validation {validation:g}"] if validation else []), f"seed {seed}"]
     return Split(", ".join(words), train, validating, testing)
 
 
 def hold_out(
-    links: Int[Tensor, "k"], groups: Int[Tensor, "n"], fraction: float, generator: torch.Generator
+    name: str, links: Int[Tensor, "k"], groups: Int[Tensor, "n"], fraction: float, generator: torch.Generator
 ) -> tuple[Int[Tensor, "kept"], Int[Tensor, "held"]]:
     """Parts links into those kept and those held out: random whole groups, as near to the fraction as they come.
 
     Args:
+        name: Of the option that says how many, as errors call it.
         links: Numbers of the links to part, ascending.
         groups: Number of the group of every link there is.
         fraction: Of ``links`` to hold out; 0 for none.
@@ -67,9 +68,10 @@ def hold_out(
         return links, links[:0]
     present, sizes = torch.unique(groups[links], return_counts=True)
     if len(present) < 2:
+        without = ", or set split.validation=0" if name == "validation" else ""
         raise ValueError(
-            f"to hold out {fraction:g} of {len(links)} links takes two groups of them or more, got {len(present)}; "
-            "choose smaller runs or cubes, or fewer parts"
+            f"split.{name}={fraction:g} holds out whole rows, runs or cubes, so there must be two of them or more, got "
+            f"{len(present)} with {len(links)} links; choose smaller runs or cubes, add measurements{without}"
         )
     order = torch.randperm(len(present), generator=generator)
     surplus = sizes[order].cumsum(0)[:-1] - fraction * len(links)
@@ -92,7 +94,7 @@ def folds(links: Links, count: int, seed: int) -> list[Split]:
     split = links.split
     present, row = torch.unique(rows_of(links)[split.train], return_inverse=True)
     if len(present) < count:
-        raise ValueError(f"{count} folds take as many rows of training links or more, got {len(present)}")
+        raise ValueError(f"kriging_folds must be at most {len(present)}, the rows of training links, got {count}")
     fold = (torch.randperm(len(present), generator=torch.Generator().manual_seed(seed)) % count)[row]
     return [
         Split(

@@ -24,7 +24,7 @@ def official(links: Links, length: int = 1, validation: float = 0.1, seed: int =
     check("validation", validation, 0 <= validation < 1, "in [0, 1)")
     generator = generator_of(seed)
     train, test = (part.sort().values for part in links.official())
-    train, validating = hold_out(train, runs, validation, generator)
+    train, validating = hold_out("validation", train, runs, validation, generator)
     words = ["official"]
     if validation:
         words += [f"validation {validation:g}{f' in runs of {length}' if length > 1 else ''}", f"seed {seed}"]

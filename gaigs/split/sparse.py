@@ -23,11 +23,11 @@ def sparse(links: Links, train: int, test: float = TEST, validation: float = 0.1
     """
     check_fractions(test, validation)
     rows, generator = rows_of(links), generator_of(seed)
-    training, testing = hold_out(torch.arange(len(links)), rows, test, generator)
+    training, testing = hold_out("test", torch.arange(len(links)), rows, test, generator)
     present = rows[training].unique()
     check("train", train, 1 <= train <= len(present), f"in 1..{len(present)}, the rows that do not test")
     chosen = present[torch.randperm(len(present), generator=generator)[:train]]
     training = training[torch.isin(rows[training], chosen)]
-    training, validating = hold_out(training, rows, validation, generator)
+    training, validating = hold_out("validation", training, rows, validation, generator)
     words = [f"sparse {train}", f"test {test:g}", *([f"validation {validation:g}"] if validation else [])]
     return Split(", ".join([*words, f"seed {seed}"]), training, validating, testing)

@@ -184,14 +184,14 @@ def test_names_say_the_numbers(links, options, name):
         ({"name": "sparse", "train": 5, "validation": 1}, "split.validation must be"),
         ({"name": "official", "validation": 1.5}, "split.validation must be"),
         ({"name": "official", "length": 0}, "split.length must be a whole number of rows"),
-        ({"name": "official", "length": N}, "takes two groups of them or more, got 1"),
+        ({"name": "official", "length": N}, r"split.validation=0\.1 holds out whole .* two of them or more, got 1"),
         ({"name": "runs", "length": 0}, "split.length must be a whole number of rows"),
         ({"name": "blocks", "edge": 0}, r"split.edge must be from 1e-06 to 1e\+06 m, got 0"),
         *(({"name": "blocks", "edge": edge}, "split.edge must be from") for edge in (1e-300, 1e300, -0.5)),
         *((options | {"seed": -1}, "split.seed must be a whole number from 0 to") for options in SPLITS),
         ({"name": "sparse", "train": 321}, r"split.train must be in 1\.\.320"),
-        ({"name": "blocks", "edge": 50.0}, "takes two groups of them or more, got 1"),
-        ({"name": "runs", "length": 250, "validation": 0.1}, "takes two groups"),
+        ({"name": "blocks", "edge": 50.0}, r"split.test=0\.2 holds out whole .* two of them or more, got 1 with 400"),
+        ({"name": "runs", "length": 250, "validation": 0.1}, "split.validation=0.* got 1 .*or set split.validation=0"),
     ],
 )
 def test_unusable_options_are_refused(links, options, message):
@@ -326,5 +326,5 @@ def test_folds_part_the_training_links_by_whole_rows(links, count):
 def test_more_folds_than_rows_are_refused(links):
     links = replace(links, rows=torch.arange(N) // 100)
     links = replace(links, split=part(links, name="random", test=0.25, validation=0.0))
-    with pytest.raises(ValueError, match="4 folds take as many rows of training links or more, got 3"):
+    with pytest.raises(ValueError, match="kriging_folds must be at most 3, the rows of training links, got 4"):
         folds(links, 4, seed=0)
