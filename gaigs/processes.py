@@ -26,6 +26,9 @@ AGAIN = 0.05
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "NODE_RANK", "GROUP_RANK")
 """Environment variables that number processes and machines."""
 
+COUNTS = ("SLURM_NTASKS", "SLURM_NTASKS_PER_NODE", "SLURM_NNODES")
+"""Environment variables that count processes and machines."""
+
 received: list[int] = []
 """Signals at which runs of this process have stopped: a launcher's worker starts no other then."""
 
@@ -80,12 +83,19 @@ def check_ranks() -> None:
     """Sees to it that what numbers processes are numbers; to be called before Lightning is imported, which reads them.
 
     Raises:
-        ValueError: One is none.
+        ValueError: One is none, or SLURM's say not how many processes a machine has.
     """
-    for name in RANKS:
+    for name in (*RANKS, *COUNTS):
         value = os.environ.get(name, "0")
         if not value.isdecimal():
             raise ValueError(f"{name} must be a whole number in the environment, got {value!r}; unset it")
+    count = int(os.environ.get("SLURM_NTASKS", 1))
+    is_shell = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # where one process runs alone
+    if count > 1 and not is_shell and "SLURM_NTASKS_PER_NODE" not in os.environ:
+        raise ValueError(
+            f"SLURM_NTASKS_PER_NODE must be in the environment where SLURM_NTASKS is more than 1, got {count}; give "
+            "srun --ntasks-per-node in place of --ntasks, or unset SLURM_NTASKS for one process"
+        )
 
 
 def is_first() -> bool:

@@ -1,5 +1,6 @@
 """The command line as a user meets it; what a run computes is in test_experiment.py."""
 
+import contextlib
 import csv
 import errno
 import json
@@ -22,7 +23,7 @@ import yaml
 import gaigs
 from gaigs import __main__ as command_line
 from gaigs import agreement, evaluation, experiment
-from gaigs.processes import RANKS, Stopped
+from gaigs.processes import COUNTS, RANKS, Stopped, check_ranks
 from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
 
@@ -242,12 +243,23 @@ UNREADABLE = {
 }
 
 
-@pytest.mark.parametrize("name", RANKS)
+@pytest.mark.parametrize("name", [*RANKS, *COUNTS])
 def test_a_process_without_a_number_is_told_so(name, run, monkeypatch):
     monkeypatch.setenv(name, "first")
     code, err = run(*SMALL, *HERE)
     assert code == 1
     assert f"gaigs: {name} must be a whole number in the environment, got 'first'; unset it" in err
+
+
+@pytest.mark.parametrize("job", ["train", "bash", "interactive"])
+def test_processes_that_slurm_counts_for_no_machine_are_told_so(job, monkeypatch):
+    monkeypatch.setenv("SLURM_NTASKS", "4")
+    monkeypatch.setenv("SLURM_JOB_NAME", job)
+    told = pytest.raises(ValueError, match=r"SLURM_NTASKS_PER_NODE must be in the environment .* more than 1, got 4;")
+    with told if job == "train" else contextlib.nullcontext():
+        check_ranks()
+    monkeypatch.setenv("SLURM_NTASKS_PER_NODE", "4")
+    check_ranks()
 
 
 @pytest.mark.parametrize("case", UNREADABLE)
