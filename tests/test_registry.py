@@ -175,6 +175,19 @@ def test_a_name_is_a_string(models, name):
         models.build({"name": name}, scene="room")
 
 
+@pytest.mark.parametrize("name", [None, 3, ["horn"], True])
+def test_a_name_to_register_is_a_string(models, name):
+    with pytest.raises(
+        TypeError, match=rf"^the name of a model to register must be a string, got {re.escape(repr(name))}$"
+    ):
+        models.register(name)
+
+
+def test_what_is_registered_can_be_called(models):
+    with pytest.raises(TypeError, match=r"^model 'mast' must be a class or a function, got 3$"):
+        models.register("mast")(3)
+
+
 @pytest.mark.parametrize("config", ["horn", ["horn"], OmegaConf.create(["horn"]), None])
 def test_build_needs_a_mapping(models, config):
     with pytest.raises(TypeError, match="must be a mapping with the key 'name', got"):

@@ -61,10 +61,14 @@ class Registry:
         """The decorator that ``gaigs.register`` gives for this kind.
 
         Raises:
+            TypeError: The name is no string, or the component cannot be called.
             ValueError: The name is taken by another component.
         """
+        check_type(f"the name of a {self.kind} to register", name, str)
 
         def decorate(component):
+            if not callable(component):
+                raise TypeError(f"{self.kind} {name!r} must be a class or a function, got {component!r}")
             held = self._registered.get(name)
             if held is not None and _origin(held) != _origin(component):  # the same origin: a module loaded anew
                 raise self._taken(name, _origin(held), _origin(component))
@@ -166,6 +170,7 @@ def register(kind: str, name: str, /) -> Callable:
     from the source before anything is imported.
 
     Raises:
+        TypeError: The name is no string, or the component cannot be called.
         ValueError: There is no such kind, or the name is taken by another component.
     """
     return registry(kind).register(name)
