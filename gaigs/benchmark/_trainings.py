@@ -104,12 +104,18 @@ class Trainings(Measured):
         """Those of the axes whose key the reference has.
 
         Raises:
-            ValueError: A key is a group of options, and no component.
+            ValueError: A key is a group of options, and no component; or an axis cannot be read.
         """
         common = self.common(context, device)
         for name, axis in self.axes.items():
-            config = context.compose(*common, *axis["of"])
-            default = OmegaConf.select(OmegaConf.create(config), axis["key"])
+            try:
+                config = context.compose(*common, *axis["of"])
+                default = OmegaConf.select(OmegaConf.create(config), axis["key"])
+            except (HydraException, OmegaConfBaseException) as error:
+                raise ValueError(
+                    f"benchmark.axes.{name} must have overrides and a key of a run, and the command line with "
+                    f"{' '.join(axis['of'])} and {axis['key']} cannot be read ({sentence(error)}); mend them"
+                ) from error
             if default is None:
                 log.info("%s: %s is left out, as there is no %s here", self.name, name, axis["key"])
                 continue

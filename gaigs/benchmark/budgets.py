@@ -67,7 +67,10 @@ class Budgets(Trainings):
     def cells(self, context: Context) -> Iterator[list[Row]]:
         self._tolerance_of(scale_of(self.reference(context)["task"]["name"]))
         for device in context.devices:
-            yield from self.cells_of_axes(context, device)
+            for cell in self.cells_of_axes(context, device):
+                for row in cell:
+                    _check_size(row)
+                yield cell
 
     def values_about(self, axis: str, default: object) -> list:
         """Multiples of the default, of a list of each entry; at least 1.
@@ -144,6 +147,21 @@ def size(value: str) -> float:
     """Of a value: its number, or the product of a list's."""
     found = yaml.safe_load(value)
     return math.prod(found) if isinstance(found, list) else float(found)
+
+
+def _check_size(row: Row) -> None:
+    """Sees to it that the default of a row's key is a size.
+
+    Raises:
+        ValueError: It is none, so that no value is smaller than it.
+    """
+    try:
+        size(row["default"])
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"benchmark.axes.{row['axis']}.key must be that of a size, a number or a list of them, and {row['key']} is "
+            f"{row['default']}; take another key"
+        ) from None
 
 
 def _over_seeds(rows: Sequence[Row], tolerance: float, scale: Scale) -> str:

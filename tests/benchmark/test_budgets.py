@@ -89,6 +89,23 @@ def test_values_that_are_no_sizes_are_refused_before_any_training(value):
         budgets(axes={"part": {"of": [], "key": "gaussians.count", "values": [3, value]}})
 
 
+@pytest.mark.parametrize("key", ["tokenizer", "trainer.precision", "data.name"])
+def test_defaults_that_are_no_sizes_are_refused_before_any_training(key, tmp_path):
+    benchmark = budgets(axes={"part": {"of": [], "key": key, "values": [1]}})
+    with pytest.raises(ValueError, match=rf"benchmark\.axes\.part\.key must be that of a size, .* and {key} is "):
+        benchmark.run(tmp_path, Context(("data.transmitters=20",)))
+    assert not (tmp_path / "budgets").exists()
+
+
+@pytest.mark.parametrize("axis", [{"key": ".."}, {"of": ["modl=gaigs"]}, {"of": ["model=["]}], ids=str)
+def test_an_axis_that_cannot_be_read_is_named(axis, tmp_path):
+    benchmark = budgets(axes={"part": {"of": [], "key": "gaussians.count", "values": [1]} | axis})
+    with pytest.raises(
+        ValueError, match=r"^benchmark\.axes\.part must have overrides and a key of a run, .* mend them$"
+    ):
+        benchmark.run(tmp_path, Context(("data.transmitters=20",)))
+
+
 @pytest.mark.parametrize(("value", "number"), [("300", 300), ("[4,8]", 32), ("0.5", 0.5)])
 def test_sizes_of_values(value, number):
     assert size(value) == number
