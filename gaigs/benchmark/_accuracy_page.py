@@ -36,6 +36,11 @@ class Place(NamedTuple):
     task: str
     split: str
 
+    @property
+    def title(self) -> str:
+        """Of the section."""
+        return ", ".join(filter(None, (self.task, self.scene, f"split {self.split}")))
+
 
 def places(rows: Sequence[Row]) -> dict[Place, list[Row]]:
     """Measured rows by what they have in common."""
@@ -102,7 +107,7 @@ def _part(place: Place, rows: Sequence[Row], fixed: Mapping, end: str) -> list[s
     for row in rows:
         axes.setdefault(row["axis"], []).append(row)
     look_ups, systems = axes.pop(LOOK_UPS, []), axes.pop(SYSTEMS, [])
-    told = f"### {place.task}, split {place.split}\n\n{_conditions(place, rows)}\n"
+    told = f"### {place.title}\n\n{_conditions(place, rows)}\n"
     command = " ".join(filter(None, ("python -m gaigs command=benchmark benchmark=accuracy", place.scene)))
     parts = [f"{told}\n```\n{command}\n```\n"]
     if systems:

@@ -110,7 +110,7 @@ def _part(place: Place, rows: Sequence[Row], tolerance: float, scale: Scale) -> 
             references.setdefault(row["of"], {}).setdefault(row["axis"], []).append(row)
     command = " ".join(filter(None, ("python -m gaigs command=benchmark benchmark=budgets", place.scene)))
     conditions = "; ".join(filter(None, (place.device, place.trainer)))
-    parts = [f"### {place.task}, split {place.split}\n\n{conditions}\n\n```\n{command}\n```\n"]
+    parts = [f"### {place.title}\n\n{conditions}\n\n```\n{command}\n```\n"]
     unit = f" {scale.unit}" if scale.unit else ""
     head = ["part", "key", f"{scale.title} of the validation links by value", f"smallest within {tolerance:g}{unit}"]
     head += ["default now", "inference [ms], smallest, default", "training [s], smallest, default"]

@@ -55,6 +55,13 @@ def test_dbs_have_a_tolerance_of_their_own():
     assert "| 30: 4.04, 60: 4.00 | **30** | 60 |" in text
 
 
+def test_sections_tell_their_data():
+    scenes = [row | {"scene": scene} for scene in ("", "data=x") for row in rows({"300": 0.9, "600": 0.92})]
+    titles = [line for line in budgets().tables(scenes).splitlines() if line.startswith("### ")]
+    (split,) = {row["split"] for row in scenes}
+    assert titles == [f"### spectrum, split {split}", f"### spectrum, data=x, split {split}"]
+
+
 def test_the_largest_tried_is_told():
     assert "| **600**, the largest tried | 300 |" in budgets().tables(rows({"300": 0.9, "600": 0.92}))
 
