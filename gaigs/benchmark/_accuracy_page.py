@@ -1,6 +1,7 @@
 """Tables and figures of error against time, from the rows of trainings."""
 
 import functools
+import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -37,9 +38,14 @@ class Place(NamedTuple):
     split: str
 
     @property
+    def overrides(self) -> str:
+        """The scene as a command has it: a folder by its name, without the digest of where it lies."""
+        return re.sub(r"#[0-9a-f]{6}\b", "", self.scene)
+
+    @property
     def title(self) -> str:
         """Of the section."""
-        return ", ".join(filter(None, (self.task, self.scene, f"split {self.split}")))
+        return ", ".join(filter(None, (self.task, self.overrides, f"split {self.split}")))
 
 
 def places(rows: Sequence[Row]) -> dict[Place, list[Row]]:
@@ -108,7 +114,7 @@ def _part(place: Place, rows: Sequence[Row], fixed: Mapping, end: str) -> list[s
         axes.setdefault(row["axis"], []).append(row)
     look_ups, systems = axes.pop(LOOK_UPS, []), axes.pop(SYSTEMS, [])
     told = f"### {place.title}\n\n{_conditions(place, rows)}\n"
-    command = " ".join(filter(None, ("python -m gaigs command=benchmark benchmark=accuracy", place.scene)))
+    command = " ".join(filter(None, ("python -m gaigs command=benchmark benchmark=accuracy", place.overrides)))
     parts = [f"{told}\n```\n{command}\n```\n"]
     if systems:
         parts.append(f"Seconds to reach a {scale.title} of the validation links:\n\n{_times(systems, levels, scale)}")
@@ -237,7 +243,7 @@ def highlights(rows: Sequence[Row]) -> list[Glance]:
         scale = scale_of(place.task)
         systems = [row for row in own if row["axis"] == SYSTEMS]
         look_ups = _ranked([row for row in own if row["axis"] == LOOK_UPS and row["validation"]], "validation", scale)
-        where = f"{place.task}, {place.scene or 'built-in room'}, split {place.split}"
+        where = f"{place.task}, {place.overrides or 'built-in room'}, split {place.split}"
         if look_ups:
             level, known = float(look_ups[0]["validation"]), look_ups[0]["value"]
             times = {seconds_to(row, level, scale): row for row in reversed(systems)}

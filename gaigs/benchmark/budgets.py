@@ -108,7 +108,7 @@ def _part(place: Place, rows: Sequence[Row], tolerance: float, scale: Scale) -> 
     for row in rows:
         if row["validation"]:
             references.setdefault(row["of"], {}).setdefault(row["axis"], []).append(row)
-    command = " ".join(filter(None, ("python -m gaigs command=benchmark benchmark=budgets", place.scene)))
+    command = " ".join(filter(None, ("python -m gaigs command=benchmark benchmark=budgets", place.overrides)))
     conditions = "; ".join(filter(None, (place.device, place.trainer)))
     parts = [f"### {place.title}\n\n{conditions}\n\n```\n{command}\n```\n"]
     unit = f" {scale.unit}" if scale.unit else ""

@@ -56,10 +56,14 @@ def test_dbs_have_a_tolerance_of_their_own():
 
 
 def test_sections_tell_their_data():
-    scenes = [row | {"scene": scene} for scene in ("", "data=x") for row in rows({"300": 0.9, "600": 0.92})]
-    titles = [line for line in budgets().tables(scenes).splitlines() if line.startswith("### ")]
+    scenes = [
+        row | {"scene": scene} for scene in ("", "data.root=x#0a1b2c seed=1") for row in rows({"300": 0.9, "600": 0.92})
+    ]
+    text = budgets().tables(scenes)
+    titles = [line for line in text.splitlines() if line.startswith("### ")]
     (split,) = {row["split"] for row in scenes}
-    assert titles == [f"### spectrum, split {split}", f"### spectrum, data=x, split {split}"]
+    assert titles == [f"### spectrum, split {split}", f"### spectrum, data.root=x seed=1, split {split}"]
+    assert "benchmark=budgets data.root=x seed=1\n" in text
 
 
 def test_the_largest_tried_is_told():
