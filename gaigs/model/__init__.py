@@ -312,7 +312,8 @@ def as_directions(directions: Directions) -> Directions:
         ValueError: An angle is no number, or too large to be one in radians; or rays have not one of either each.
     """
     angles = {}
-    for name, most in (("elevations", math.pi / 2), ("azimuths", 2 * math.pi)):
+    # Azimuths are periodic, and a few turns are no mistake; those of a circle in degrees are more.
+    for name, most in (("elevations", math.pi / 2), ("azimuths", 20 * math.pi)):
         expected = f"{name} must be a list of angles from {-most:.4f} to {most:.4f} rad"
         angles[name] = values = as_numbers(name, getattr(directions, name), expected.partition("be ")[2])
         if values.ndim != 1:
