@@ -129,6 +129,8 @@ def resolved(config: DictConfig) -> dict:
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
         configuration.check(plain)
+        if plain["command"] == "train":
+            processes.check_ranks()
         is_sweep = settings.mode is RunMode.MULTIRUN
         limit_threads(plain["threads"], settings.launcher.get("n_jobs", 1) if is_sweep else 1)
     except OmegaConfBaseException as error:  # whose message Hydra adds
@@ -150,7 +152,6 @@ def going_on_later(work: Callable):
     goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
     try:
         with mendable(goes_on), stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
-            processes.check_ranks()
             importlib.import_module("lightning.pytorch")  # slow: here, once the configuration has proved good
             for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
                 logging.getLogger(name).setLevel(logging.WARNING)
@@ -245,7 +246,8 @@ def compose_and_run() -> None:
         if asked == "1":
             raise
         told = isinstance(error, HydraException | OmegaConfBaseException | ValueError)
-        if told or configuration.is_composing(error):
+        of_system = isinstance(error, MemoryError) or getattr(error, "errno", None) is not None
+        if told or (configuration.is_composing(error) and not of_system):
             print(f"gaigs: {configuration.explain(error)}", file=sys.stderr)
         elif isinstance(error, OSError | MemoryError):  # of one of Hydra's own files
             print(f"gaigs: {advice(error, Path.cwd(), 'the same command goes on')}", file=sys.stderr)

@@ -71,7 +71,8 @@ def read(path: str | Path) -> dict:
         FileNotFoundError: There is no such file.
         ValueError: It is no checkpoint of gaigs, not a whole one, or of a later version.
     """
-    check_type("the path of a checkpoint", path, Path)
+    if not isinstance(path, os.PathLike):
+        check_type("the path of a checkpoint", path, Path)
     path = Path(path)
     if not os.path.isfile(path):  # Path.is_file raises where a name is too long
         raise FileNotFoundError(f"no checkpoint at {path}; a run leaves best.ckpt and last.ckpt in its folder")

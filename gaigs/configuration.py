@@ -122,6 +122,8 @@ def unreadable() -> str | None:
         try:
             OmegaConf.load(file)
         except Exception as error:  # whatever YAML meets
+            if getattr(error, "errno", None) is not None:  # of the system, and not of what is in the file
+                continue
             cause = " ".join(str(error).split())
             return f"{file} must be a YAML file in UTF-8, and is none ({cause}); mend it, or take it away"
     return None

@@ -91,7 +91,8 @@ def check_ranks() -> None:
             raise ValueError(f"{name} must be a whole number in the environment, got {value!r}; unset it")
     count = int(os.environ.get("SLURM_NTASKS", 1))
     is_shell = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # where one process runs alone
-    if count > 1 and not is_shell and "SLURM_NTASKS_PER_NODE" not in os.environ:
+    asked = not is_shell and "TORCHELASTIC_RUN_ID" not in os.environ  # torchrun's numbers go before SLURM's
+    if count > 1 and asked and "SLURM_NTASKS_PER_NODE" not in os.environ:
         raise ValueError(
             f"SLURM_NTASKS_PER_NODE must be in the environment where SLURM_NTASKS is more than 1, got {count}; give "
             "srun --ntasks-per-node in place of --ntasks, or unset SLURM_NTASKS for one process"
@@ -150,6 +151,8 @@ def stopping(waits: bool = False) -> Iterator[None]:
     handlers = {number: signal.getsignal(number) for number in STOPPING}
 
     def stop(number: int, _) -> None:
+        for timer in timers:  # they are not to interrupt what this one ends
+            timer.cancel()
         raise Stopped("stopped", number)
 
     timers, hook = [], sys.unraisablehook
@@ -159,6 +162,7 @@ def stopping(waits: bool = False) -> Iterator[None]:
             hook(lost)
             return
         timers.append(threading.Timer(AGAIN, os.kill, (os.getpid(), getattr(lost.exc_value, "number", signal.SIGINT))))
+        timers[-1].daemon = True
         timers[-1].start()
 
     signal.signal(signal.SIGTERM, stop)
@@ -167,6 +171,9 @@ def stopping(waits: bool = False) -> Iterator[None]:
         if received:  # between two runs of a process that waits
             raise Stopped("stopped", received[0])
         yield
+        for timer in timers:
+            if not timer.finished.is_set():  # the end came before it did
+                raise Stopped("stopped", timer.args[1])
     finally:
         for timer in timers:
             timer.cancel()

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,6 +125,8 @@ def radio_map(
     """
     if not hasattr(model, "scene"):
         raise TypeError(f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint first")
+    # Arrays without an axis are numbers, too.
+    pitch, height, margin = (v.item() if getattr(v, "ndim", None) == 0 else v for v in (pitch, height, margin))
     for name, value, kind in (
         ("pitch", pitch, float | None),
         ("height", height, float | None),
@@ -132,6 +134,8 @@ def radio_map(
     ):
         if not isinstance(value, float):  # whose range is looked at below
             check_type(name, value, kind)
+    if isinstance(receivers, Iterable) and not isinstance(receivers, str):
+        receivers = list(receivers)
     check_type("receivers", receivers, Sequence[str] | str | None)
     scene = model.scene
     if scene.task.shape != () or scene.task.dtype.is_complex:

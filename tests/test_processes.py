@@ -167,6 +167,42 @@ def test_a_signal_that_python_passes_over_stops_a_run_all_the_same(number):
     assert sys.unraisablehook is hook
 
 
+class Passing:
+    def __del__(self):
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_signal_that_was_passed_over_at_the_very_end_counts():
+    with pytest.raises(processes.Stopped), processes.stopping():
+        Passing()
+
+
+def test_a_signal_that_was_passed_over_does_not_come_again_while_a_run_stops():
+    saved = []
+
+    def work():
+        try:
+            Passing()
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            time.sleep(4 * processes.AGAIN)
+            saved.append(True)
+
+    with pytest.raises(processes.Stopped), processes.stopping():
+        work()
+    assert saved
+
+
+def test_torchrun_within_slurm_says_itself_which_process_this_is(monkeypatch):
+    monkeypatch.setenv("SLURM_NTASKS", "2")
+    monkeypatch.delenv("SLURM_NTASKS_PER_NODE", raising=False)
+    monkeypatch.delenv("SLURM_JOB_NAME", raising=False)
+    with pytest.raises(ValueError, match="SLURM_NTASKS_PER_NODE must be in the environment"):
+        processes.check_ranks()
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "x")
+    processes.check_ranks()
+
+
 def test_sigterm_stops_all_jobs_of_a_launcher(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs gaigs[parallel]")
     jobs = ("seed=0,1,2", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "save_every=0.2")

@@ -87,7 +87,7 @@ def test_what_the_first_prediction_loads_makes_no_map_coarser(monkeypatch):
 
 
 def test_map_covers_transmitters_gateways_and_the_margin_with_multiples_of_the_pitch():
-    drawn = radio_map(Slope(scene()), pitch=0.25, margin=0.35)
+    drawn = radio_map(Slope(scene()), pitch=np.array(0.25), margin=torch.tensor(0.35, dtype=torch.float64))
     for axis, lower, upper in ((drawn.x, -0.35, 5.35), (drawn.y, -0.55, 2.35)):
         assert lower - 0.25 < axis[0] <= lower < upper <= axis[-1] <= upper + 0.25
         np.testing.assert_allclose(axis, 0.25 * np.round(axis / 0.25), atol=1e-12)
@@ -109,7 +109,7 @@ def test_a_row_of_transmitters_still_makes_a_plane():
 
 
 def test_height_and_receivers_may_be_chosen():
-    drawn = radio_map(Slope(scene()), pitch=0.5, height=2, receivers=["window"])
+    drawn = radio_map(Slope(scene()), pitch=0.5, height=2, receivers={"window": 1}.keys())
     assert (drawn.height, drawn.receivers) == (2.0, ("window",))
     assert drawn.values[0, 0, 0] == pytest.approx(drawn.x[0] + 10 * drawn.y[0] + 200 - 1000, abs=1e-3)
 

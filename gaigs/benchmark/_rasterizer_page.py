@@ -37,7 +37,7 @@ a tile of `torch` is 16 x 16 pixels, one of `opencl` 16 x 8. A pass of over half
 Place = tuple[str, str, str, str]
 """Device, scene, Gaussians and grid."""
 
-PLACE = ("scene", "gaussians", "grid")
+PLACE = ("device", "scene", "gaussians", "grid")
 """What a reader calls a cell."""
 
 

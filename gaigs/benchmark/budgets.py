@@ -23,7 +23,8 @@ INTRODUCTION = """## Budgets
 Here you find how small each part may be before accuracy suffers: the smallest value whose mean validation score is
 within the tolerance of the best value's. One key changes at a time, all others are as in the reference. Test links have
 no say. Where scores scatter over seeds by more than the tolerance, a difference of that size says nothing. Where it is
-the largest tried, a larger one may be better still.
+the largest tried, a larger one may be better still. Times are of one run each; where other work was on the machine,
+they tell orders of magnitude alone.
 """
 
 
@@ -146,7 +147,7 @@ def smallest_within(rows: Sequence[Row], tolerance: float, scale: Scale) -> Row:
 def size(value: str) -> float:
     """Of a value: its number, or the product of a list's."""
     found = yaml.safe_load(value)
-    return math.prod(found) if isinstance(found, list) else float(found)
+    return float(math.prod(found) if isinstance(found, list) else found)
 
 
 def _check_size(row: Row) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.data._files import NEAR
-from gaigs.directions import Directions, Rays
+from gaigs.directions import Directions, Grid, Rays
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import FAR
 from gaigs.query import Batch, Query
@@ -325,7 +325,7 @@ def as_directions(directions: Directions) -> Directions:
         raise ValueError(
             f"rays must have as many elevations as azimuths, got {counts[0]} and {counts[1]}; Grid has rows"
         )
-    return type(directions)(**angles)
+    return (Rays if isinstance(directions, Rays) else Grid)(**angles)
 
 
 def build_trend(config: dict, scene: Scene) -> Model:

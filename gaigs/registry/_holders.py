@@ -117,11 +117,11 @@ def _entry_points(kind: str, file: Path) -> Iterable[tuple[str, str]]:
 def _decorated(kind: str, file: Path) -> list[str]:
     """Names of a kind that a file's top-level ``@register(kind, name)`` decorators claim."""
     stat = file.stat()
-    return [name for own, name in _claims(file, stat.st_mtime_ns, stat.st_size) if own == kind]
+    return [name for own, name in _claims(file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size) if own == kind]
 
 
 @functools.cache  # a file is asked for the names of each kind
-def _claims(file: Path, _changed: int, _size: int) -> list[tuple[str, str]]:
+def _claims(file: Path, *_state: int) -> list[tuple[str, str]]:
     """Kinds and names that the decorators of a file claim, as it stands now."""
     found = []
     for node in ast.parse(file.read_bytes(), file.name).body:

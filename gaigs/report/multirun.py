@@ -1,6 +1,7 @@
 """The runs of a Hydra multirun, or of several: one table, their spread over seeds, their speed against their error."""
 
 import csv
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -130,7 +131,8 @@ def report(folder: str | Path) -> Group:
         FileNotFoundError: The folder holds no run.
         ValueError: The runs make no table.
     """
-    check_type("folder", folder, Path)
+    if not isinstance(folder, os.PathLike):
+        check_type("folder", folder, Path)
     folder = Path(folder)
     runs = read_runs(folder)
     claims = write_claims(folder, runs)

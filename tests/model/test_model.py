@@ -310,3 +310,13 @@ def test_a_batch_moves(batch):
 def test_queries_that_cannot_be_answered_are_refused(build, query, options, message):
     with pytest.raises(ValueError, match=message):
         build([]).predict(query, **options)
+
+
+def test_directions_of_ones_own_class_are_asked_for_as_they_are(build):
+    class Ring(Rays):
+        def __init__(self, n):
+            super().__init__(torch.full((n,), 0.5), torch.linspace(-3, 3, n))
+
+    model = build([])
+    expected = model.predict([[1.0, 2, 3]], directions=Rays(torch.full((5,), 0.5), torch.linspace(-3, 3, 5)))
+    assert torch.equal(model.predict([[1.0, 2, 3]], directions=Ring(5)), expected)
