@@ -306,13 +306,14 @@ def as_numbers(what: str, values: object, expected: str) -> Tensor:
 
 
 def as_directions(directions: Directions) -> Directions:
-    """Directions that a model can be asked for, in float32.
+    """Directions that a model can be asked for: lists of angles [rad], in float32.
 
     Raises:
         ValueError: An angle is no number, or too large to be one in radians; or rays have not one of either each.
     """
     angles = {}
-    # Azimuths are periodic, and a few turns are no mistake; those of a circle in degrees are more.
+    # Azimuths are periodic, and a few turns are no mistake; those of a circle in degrees are more. 1e-4 is for angles
+    # that somebody has rounded.
     for name, most in (("elevations", math.pi / 2), ("azimuths", 20 * math.pi)):
         expected = f"{name} must be a list of angles from {-most:.4f} to {most:.4f} rad"
         angles[name] = values = as_numbers(name, getattr(directions, name), expected.partition("be ")[2])

@@ -122,6 +122,12 @@ def test_sizes_of_values(value, number):
     assert size(value) == number
 
 
+@pytest.mark.parametrize("value", ["multiview", "[a]", "null", "[4,wide]"])
+def test_what_is_no_size_is_none(value):
+    with pytest.raises((TypeError, ValueError)):
+        size(value)
+
+
 def test_values_are_trained_and_axes_that_do_not_apply_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr(evaluation, "write_figures", lambda *_: None)
     axes = {"Gaussians": {"of": ["model=gaigs"], "key": "gaussians.count"}, "grid": {"of": [], "key": "pooling.grid"}}
