@@ -113,8 +113,9 @@ class Loud(GATokenizer):
         return tokens._replace(scene=GAIN * tokens.scene)
 
 
-BASE = {"static": ["deformation=none"], "euclidean": ["tokenizer=euclidean"], "ga": ["tokenizer=ga"]}
-"""Overrides of ways that are not ``multiview`` with other names."""
+BASE = {way: ["deformation=two_branch", f"tokenizer={way}"] for way in ("euclidean", "ga", "multiview")}
+BASE |= {"static": ["deformation=none"]}
+"""Overrides of ways; those of ``multiview`` are those of all others. The network is as wide as in the claims."""
 
 NAMES = {name: name for name in ("scene_alone", "own_tokens")}
 NAMES |= {"loud": "multiview", "loud_alone": "scene_alone", "fixed_alone": "scene_alone"}
@@ -123,13 +124,13 @@ NAMES |= {"loud": "multiview", "loud_alone": "scene_alone", "fixed_alone": "scen
 GA = {"loud": "ga_loud", "loud_alone": "ga_loud", "fixed_alone": "ga_of_fixed_anchors"}
 """That within it which gives the scene token, likewise."""
 
-WAYS = ("multiview", *BASE, *NAMES)
+WAYS = (*BASE, *NAMES)
 
 
 def configure(way: str, overrides: list[str]) -> dict:
     """The configuration of a way."""
     with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-        config = compose("config", ["+experiment=spectrum", *BASE.get(way, []), *overrides])
+        config = compose("config", ["+experiment=spectrum", *BASE.get(way, BASE["multiview"]), *overrides])
     config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     tokenizer = config["model"]["tokenizer"]
     tokenizer["name"] = NAMES.get(way, tokenizer["name"])

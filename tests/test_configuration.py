@@ -61,6 +61,23 @@ def test_an_experiment_wins_over_a_model(configure):
     assert config["deformation"]["name"] == "none"
 
 
+# --- the width of the deformation network ---
+
+
+@pytest.mark.parametrize(("task", "width"), [("spectrum", 128), ("rssi", 32), ("csi", 64)])
+def test_the_task_says_how_wide_the_network_is_and_the_command_line_wins(configure, task, width):
+    for words, expected in ((), width), (("deformation=two_branch",), 64), (("deformation.width=5",), 5):
+        assert configure(f"data={DATA[task]}", *words)["model"]["deformation"]["width"] == expected
+
+
+@pytest.mark.parametrize(("task", "width"), [("spectrum", 64), ("rssi", 32), ("csi", 64)])
+def test_variants_of_the_paper_are_as_wide_as_they_were_measured(configure, task, width):
+    for words in ("+variant=no_scale", "+experiment=claims"), ("+experiment=claims", "+variant=no_scale"):
+        deformation = configure(f"data={DATA[task]}", *words)["deformation"]
+        assert (deformation["width"], len(deformation["heads"])) == (width, 4)
+    assert configure(f"data={DATA[task]}", "+variant=static", "+experiment=claims")["deformation"] == {"name": "none"}
+
+
 # --- all systems ---
 
 

@@ -2,6 +2,7 @@
 
 import math
 import reprlib
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -162,6 +163,10 @@ class Model(nn.Module):
             For each position a value of the task's shape, scaled as the training labels were
             (``model.scene.task.normalisation``); on the device of the model.
 
+        Warns:
+            UserWarning: A position is farther from the box of the training transmitters than this box and the receivers
+                are wide, so that its prediction is extrapolated.
+
         Raises:
             TypeError: The batch size is no whole number, or the directions are none.
             ValueError: The positions are not (..., 3) real numbers, or one is not finite or too far away; there is no
@@ -237,10 +242,24 @@ class Model(nn.Module):
             if not holds.all():
                 row = int((~holds).any(1).nonzero()[0])
                 raise ValueError(f"transmitters must be {expected}, got {points[row].tolist()} in row {row}")
+        self._warn_of_far(points)
         receivers = self._index(receiver, shape).to(points.device)
         query = Query(points, receivers, self._frequencies(frequency, shape))
         device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
         return query.to(device), shape, None if directions is None else directions.to(device)
+
+    def _warn_of_far(self, points: Float[Tensor, "b 3"]) -> None:
+        """Warns of positions farther from the training transmitters' box than this and the receivers are wide."""
+        lower, upper = self.scene.lower.to(points), self.scene.upper.to(points)
+        ends = torch.cat((torch.stack((lower, upper)), self.scene.positions(points)))
+        width = (ends.amax(0) - ends.amin(0)).norm()
+        distances = (points - points.clamp(lower, upper)).norm(dim=-1)
+        if count := int((distances > width).sum()):
+            warnings.warn(
+                f"{count} of {len(points)} transmitters stand up to {distances.amax():.3g} m outside the box of the training "
+                f"transmitters, which with the receivers is {width:.3g} m wide; predictions there are extrapolated",
+                stacklevel=4,
+            )
 
     def _frequencies(self, frequency, shape: tuple[int, ...]) -> Float[Tensor, "b"] | None:
         """The carrier of each position [Hz]."""

@@ -65,19 +65,19 @@ def test_one_carrier_is_no_input(links):
 
 
 @pytest.mark.parametrize(
-    ("chosen", "pooling"),
+    ("chosen", "pooling", "width"),
     [
-        ((), "spectrum"),
-        (("data=synthetic_rssi",), "softmax_attention"),
-        (("+experiment=rssi",), "softmax_attention"),
-        (("+experiment=csi",), "element_sum"),
+        ((), "spectrum", 128),
+        (("data=synthetic_rssi",), "softmax_attention", 64),
+        (("+experiment=rssi",), "softmax_attention", 64),
+        (("+experiment=csi",), "element_sum", 64),
     ],
 )
-def test_it_is_itself_with_every_task(chosen, pooling):
+def test_it_is_itself_with_every_task(chosen, pooling, width):
     config = composed("model=wide_gs", *chosen)["model"]
     assert (config["name"], config["tokenizer"]["name"]) == ("wide_gs", "euclidean")
     assert config["deformation"]["heads"] == ["signal", "attenuation"]
-    assert config["pooling"]["name"] == pooling
+    assert (config["pooling"]["name"], config["deformation"]["width"]) == (pooling, width)
 
 
 def test_a_run_on_a_folder_with_the_carrier_of_each_link(tmp_path, monkeypatch):
