@@ -256,8 +256,9 @@ class Model(nn.Module):
         distances = (points - points.clamp(lower, upper)).norm(dim=-1)
         if count := int((distances > width).sum()):
             warnings.warn(
-                f"{count} of {len(points)} transmitters stand up to {distances.amax():.3g} m outside the box of the training "
-                f"transmitters, which with the receivers is {width:.3g} m wide; predictions there are extrapolated",
+                f"{count} of {len(points)} transmitters stand up to {distances.amax():.3g} m outside the box of the "
+                f"training transmitters, which with the receivers is {width:.3g} m wide; predictions there are "
+                "extrapolated",
                 stacklevel=4,
             )
 

@@ -44,7 +44,8 @@ def check_model(build: Callable[[Scene], Model], links: Links, device: torch.dev
         parameters = dict(model.named_parameters())
         grouped = [id(parameter) for group in model.parameter_groups().values() for parameter in group]
         require(
-            sorted(grouped) == sorted(map(id, parameters.values())), "each parameter must stand in one of parameter_groups"
+            sorted(grouped) == sorted(map(id, parameters.values())),
+            "each parameter must stand in one of parameter_groups",
         )
         if not model.state_dict():
             return

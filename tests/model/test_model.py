@@ -189,7 +189,7 @@ def test_labels_without_directions_are_predicted_in_none():
 
 
 def test_far_positions_are_predicted_with_a_warning(build):
-    told = r"2 of 3 transmitters stand up to 1\.71e\+05 m outside the box of .* m wide; predictions there are extrapolated"
+    told = r"2 of 3 transmitters stand up to 1\.71e\+05 m outside .* m wide; predictions there are extrapolated"
     with pytest.warns(UserWarning, match=told) as warned:
         values = build().predict([[9.9e4, -9.9e4, 9.9e4], [1.0, 2.0, 1.0], [-9.9e4, 0.0, 0.0]])
     assert values.isfinite().all()
