@@ -3,6 +3,7 @@
 import hashlib
 import logging
 import traceback
+from collections.abc import Mapping
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,7 +12,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from gaigs.registry import KINDS, check_type, find_holders, suggest
@@ -188,6 +189,11 @@ def known(kind: str, name: str, otherwise: str) -> str:
     return name if any((folder / kind / f"{name}.yaml").is_file() for folder in folders) else otherwise
 
 
+def by_task(values: Mapping, otherwise: object, *, _root_: DictConfig) -> object:
+    """The value of a run's task, by the task's name."""
+    return values.get(_root_.task.name, otherwise)
+
+
 def launcher(name: str) -> str:
     """A launcher that joblib is needed for, where it is installed; else Hydra's own, which runs job by job."""
     try:
@@ -201,6 +207,7 @@ def launcher(name: str) -> str:
 OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
 OmegaConf.register_new_resolver("installed", installed, replace=True, use_cache=True)
 OmegaConf.register_new_resolver("known", known, replace=True)
+OmegaConf.register_new_resolver("by_task", by_task, replace=True)
 OmegaConf.register_new_resolver("launcher", launcher, replace=True)
 
 

@@ -15,6 +15,10 @@ FAINTEST = torch.finfo(torch.float32).tiny
 """Amplitudes and powers below this are silence: what is divided by such a number of float32 overflows."""
 
 
+class ExtrapolationWarning(UserWarning):
+    """Something is asked for far from all that was measured."""
+
+
 @dataclass(frozen=True)
 class Pose:
     """Position and orientation of an antenna array.

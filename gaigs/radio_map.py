@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gaigs.files import whole
+from gaigs.geometry import ExtrapolationWarning
 from gaigs.registry import check_type
 
 PITCH = 0.1
@@ -165,7 +167,9 @@ def radio_map(
         shape = (*points.shape[:-1], len(names))
         links = np.broadcast_to(points[..., None, :], (*shape, 3)).astype(np.float32)
         index = np.broadcast_to(heard, shape).copy()
-        return model.predict(links, index, frequency=frequency, batch_size=BATCH * len(names)).cpu().numpy()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ExtrapolationWarning)  # the margin is asked for
+            return model.predict(links, index, frequency=frequency, batch_size=BATCH * len(names)).cpu().numpy()
 
     if pitch is None:
         pitch = max(PITCH, float((upper - lower).max()) / POINTS)

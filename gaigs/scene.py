@@ -131,6 +131,12 @@ class Scene:
         """Where the receivers stand [m], on the device and in the dtype of ``like``."""
         return torch.stack([receiver.pose.position for receiver in self.receivers]).to(like)
 
+    @functools.cached_property
+    def extent(self) -> float:
+        """Diagonal of the box that holds the training transmitters and all receivers [m]."""
+        ends = torch.cat((torch.stack((self.lower, self.upper)), self.positions(self.lower)))
+        return (ends.amax(0) - ends.amin(0)).norm().item()
+
     @property
     def has_band(self) -> bool:
         """Whether the training links have several carriers, so that the frequency tells something."""

@@ -6,7 +6,6 @@ import yaml
 
 from gaigs.benchmark import Context, Glance, Row, check_names
 from gaigs.benchmark._accuracy_page import LOOK_UPS, SYSTEMS, figures, highlights, tables
-from gaigs.benchmark._scale import scale_of
 from gaigs.benchmark._trainings import Trainings, written
 from gaigs.configuration import conf_dir, plugin_conf_dirs
 from gaigs.registry import check_type, register, registry
@@ -42,8 +41,6 @@ class Accuracy(Trainings):
         device: str | None = None,
     ):
         super().__init__(trainer, axes, minutes, device)
-        if levels:
-            check_names("levels", [*levels], sorted({scale_of(task).watched for task in registry("task").names()}))
         for score, found in levels.items():
             check_type(f"benchmark.levels.{score}", found, list[float])
         if systems:

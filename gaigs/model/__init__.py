@@ -17,7 +17,7 @@ from gaigs.data import Links
 from gaigs.data._files import NEAR
 from gaigs.directions import Directions, Grid, Rays
 from gaigs.gaussians import Gaussians
-from gaigs.geometry import FAR
+from gaigs.geometry import FAR, ExtrapolationWarning
 from gaigs.query import Batch, Query
 from gaigs.registry import check_type, registry
 from gaigs.report.shapes import LearntRoom
@@ -164,8 +164,8 @@ class Model(nn.Module):
             (``model.scene.task.normalisation``); on the device of the model.
 
         Warns:
-            UserWarning: A position is farther from the box of the training transmitters than this box and the receivers
-                are wide, so that its prediction is extrapolated.
+            ExtrapolationWarning: A position is farther from the box of the training transmitters than this box and the
+                receivers are across. Of a query nothing is said.
 
         Raises:
             TypeError: The batch size is no whole number, or the directions are none.
@@ -219,7 +219,8 @@ class Model(nn.Module):
         check_type("batch_size", batch_size, int)
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
-        if isinstance(transmitters, Query):
+        whole = isinstance(transmitters, Query)
+        if whole:
             if frequency is not None or not isinstance(receiver, int) or receiver:
                 raise ValueError("a query says itself who hears at which frequency; leave receiver and frequency out")
             query = transmitters
@@ -242,23 +243,23 @@ class Model(nn.Module):
             if not holds.all():
                 row = int((~holds).any(1).nonzero()[0])
                 raise ValueError(f"transmitters must be {expected}, got {points[row].tolist()} in row {row}")
-        self._warn_of_far(points)
         receivers = self._index(receiver, shape).to(points.device)
         query = Query(points, receivers, self._frequencies(frequency, shape))
         device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
+        if not whole:
+            self._warn_of_far(points)
         return query.to(device), shape, None if directions is None else directions.to(device)
 
     def _warn_of_far(self, points: Float[Tensor, "b 3"]) -> None:
-        """Warns of positions farther from the training transmitters' box than this and the receivers are wide."""
+        """Warns of positions farther from the training transmitters' box than this box and the receivers are across."""
         lower, upper = self.scene.lower.to(points), self.scene.upper.to(points)
-        ends = torch.cat((torch.stack((lower, upper)), self.scene.positions(points)))
-        width = (ends.amax(0) - ends.amin(0)).norm()
         distances = (points - points.clamp(lower, upper)).norm(dim=-1)
-        if count := int((distances > width).sum()):
+        if count := int((distances > self.scene.extent).sum()):
             warnings.warn(
-                f"{count} of {len(points)} transmitters stand up to {distances.amax():.3g} m outside the box of the "
-                f"training transmitters, which with the receivers is {width:.3g} m wide; predictions there are "
-                "extrapolated",
+                f"{count} of {len(points)} positions are up to {distances.amax():.3g} m outside the box of the "
+                f"training transmitters, which with the receivers is {self.scene.extent:.3g} m across: nothing was "
+                "measured near there",
+                ExtrapolationWarning,
                 stacklevel=4,
             )
 

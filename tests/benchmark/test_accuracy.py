@@ -177,11 +177,6 @@ def test_the_command_line_says_how_long():
     assert trainings.options(Context(("trainer.max_time=00:00:00:05",))) == []
 
 
-def test_levels_of_a_score_that_no_task_has_are_refused():
-    with pytest.raises(ValueError, match=r"benchmark\.levels has 'sim' \(did you mean 'ssim'\?\), and there are: mae"):
-        Accuracy({}, COUNTS, {"sim": [0.9]})
-
-
 def test_all_that_train_are_found():
     names = installed()
     assert names.index("gaigs") < names.index("mirrored")

@@ -132,7 +132,7 @@ def test_labels_are_held_in_memory_by_parts(task, monkeypatch):
     assert max(sizes) == 9
 
 
-@pytest.mark.filterwarnings("ignore:.*are extrapolated")
+@pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
 @TASKS
 def test_far_away_nothing_is_left_but_the_trend(task):
     links = make(task)
@@ -157,7 +157,7 @@ def test_the_process_is_of_what_the_trend_leaves_over():
     torch.testing.assert_close(more.predict(asked), plain.predict(asked) + law.predict(asked), rtol=0, atol=1e-2)
 
 
-@pytest.mark.filterwarnings("ignore:.*are extrapolated")
+@pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
 def test_channels_have_a_trend_too():
     links = example_links("csi")
     model, friis = fitted(links, trend={"name": "friis"}), registry("model").build({"name": "friis"}, scene=links.scene)

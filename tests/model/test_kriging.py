@@ -131,7 +131,6 @@ def test_components_keep_what_matters(task):
     assert (np.abs(errors) ** 2).sum() <= 2 * kriging.LEFT * (np.abs(added) ** 2).sum()
 
 
-@pytest.mark.filterwarnings("ignore:.*are extrapolated")
 @TASKS
 def test_far_away_trend_and_fallback_are_left(task):
     model = kriged(make(task, smooth=1.0, trained=0.5))

@@ -9,6 +9,7 @@ import torch
 from pipeline import NONE, PARTS, watch
 
 from gaigs.directions import Rays
+from gaigs.geometry import ExtrapolationWarning
 from gaigs.model.path_loss import PathLoss
 from gaigs.query import Batch, Query
 from gaigs.testing import example_links
@@ -188,22 +189,27 @@ def test_labels_without_directions_are_predicted_in_none():
         model.predict([[1.0, 2, 3]], directions=Rays(torch.zeros(2), torch.zeros(2)))
 
 
-def test_far_positions_are_predicted_with_a_warning(build):
-    told = r"2 of 3 transmitters stand up to 1\.71e\+05 m outside .* m wide; predictions there are extrapolated"
-    with pytest.warns(UserWarning, match=told) as warned:
-        values = build().predict([[9.9e4, -9.9e4, 9.9e4], [1.0, 2.0, 1.0], [-9.9e4, 0.0, 0.0]])
-    assert values.isfinite().all()
+@pytest.mark.parametrize("method", ["predict", "predict_batches"])
+def test_far_positions_are_predicted_with_a_warning(build, method):
+    told = r"^2 of 3 positions are up to 1\.71e\+05 m outside .* is 7\.04 m across: nothing was measured near there$"
+    ask, places = getattr(build(), method), [[9.9e4, -9.9e4, 9.9e4], [1.0, 2.0, 1.0], [-9.9e4, 0.0, 0.0]]
+    with pytest.warns(ExtrapolationWarning, match=told) as warned:
+        values = ask(places)
+    assert torch.cat([*values]).isfinite().all()
     assert [warning.filename for warning in warned] == [__file__]
+    with pytest.raises(ValueError, match="receiver"):  # which is told first
+        ask(places, "nobody")
 
 
-def test_as_far_away_as_the_scene_is_wide_is_near_enough(build):
+def test_a_query_is_predicted_without_a_warning(build):
+    assert build().predict(Query(torch.full((1, 3), 9e4), torch.tensor([0]))).isfinite().all()
+
+
+def test_as_far_away_as_the_scene_is_across_is_near_enough(build):
     model = build()
-    scene = model.scene
-    ends = torch.stack((scene.lower, scene.upper, *(receiver.pose.position for receiver in scene.receivers)))
-    width = (ends.amax(0) - ends.amin(0)).norm()
-    model.predict(scene.upper + torch.tensor([0.99 * width, 0.0, 0.0]))
-    with pytest.warns(UserWarning, match="1 of 1 transmitters"):
-        model.predict(scene.upper + torch.tensor([1.01 * width, 0.0, 0.0]))
+    model.predict(model.scene.upper + torch.tensor([0.99 * model.scene.extent, 0.0, 0.0]))
+    with pytest.warns(ExtrapolationWarning, match="1 of 1 positions"):
+        model.predict(model.scene.upper + torch.tensor([1.01 * model.scene.extent, 0.0, 0.0]))
 
 
 def test_indices_of_any_whole_type_name_a_receiver(build):

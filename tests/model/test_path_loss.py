@@ -46,7 +46,7 @@ def fitted(links):
     return model
 
 
-@pytest.mark.filterwarnings("ignore:.*are extrapolated")
+@pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
 @pytest.mark.parametrize("shift", [0.0, 1e4])
 def test_its_own_law_comes_back(places, shift, monkeypatch):
     monkeypatch.setattr(__name__ + ".GATEWAYS", GATEWAYS + shift)
@@ -77,7 +77,7 @@ def test_a_signal_that_grows_with_distance_keeps_its_sign(places):
     assert fitted(make(places, labels)).exponents.tolist() == pytest.approx([-0.7, 1.6], abs=1e-4)
 
 
-@pytest.mark.filterwarnings("ignore:.*are extrapolated")
+@pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
 @pytest.mark.parametrize("jitter", [0.0, 1e-3])
 def test_links_of_one_length_get_the_slope_of_free_space(places, jitter):
     angles = torch.linspace(0, 6, 30)

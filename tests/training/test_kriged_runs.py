@@ -218,7 +218,7 @@ def test_what_cannot_be_kriged_is_refused(overrides, message, tmp_path):
     assert not (tmp_path / "last.ckpt").exists()
 
 
-@pytest.mark.filterwarnings("ignore:.*are extrapolated")
+@pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
 def test_rssi_falls_back_on_the_trend_of_its_process(tmp_path):
     few = ["+experiment=rssi", "data.transmitters=60", "deformation.width=8", "split.validation=0.2", "kriging=true"]
     metrics = experiment.run(configure(*few), tmp_path)
