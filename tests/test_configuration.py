@@ -78,6 +78,11 @@ def test_variants_of_the_paper_are_as_wide_as_they_were_measured(configure, task
     assert configure(f"data={DATA[task]}", "+variant=static", "+experiment=claims")["deformation"] == {"name": "none"}
 
 
+def test_a_variant_leaves_the_deformation_of_another_model(configure):  # which has no heads, so that no run begins
+    deformation = configure("model=mirrored", "+variant=paper")["deformation"]
+    assert (deformation["name"], *deformation) == ("none", "name", "heads", "width")
+
+
 # --- all systems ---
 
 
