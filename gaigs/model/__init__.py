@@ -219,8 +219,8 @@ class Model(nn.Module):
         check_type("batch_size", batch_size, int)
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
-        whole = isinstance(transmitters, Query)
-        if whole:
+        is_query = isinstance(transmitters, Query)
+        if is_query:
             if frequency is not None or not isinstance(receiver, int) or receiver:
                 raise ValueError("a query says itself who hears at which frequency; leave receiver and frequency out")
             query = transmitters
@@ -246,7 +246,7 @@ class Model(nn.Module):
         receivers = self._index(receiver, shape).to(points.device)
         query = Query(points, receivers, self._frequencies(frequency, shape))
         device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
-        if not whole:
+        if not is_query:
             self._warn_of_far(points)
         return query.to(device), shape, None if directions is None else directions.to(device)
 
