@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from gaigs import configuration, files, processes
 from gaigs.processes import Stopped, forward_to_children, lacks_memory, limit_threads, only_run, stopping
@@ -133,6 +133,9 @@ def resolved(config: DictConfig) -> dict:
             processes.check_ranks()
         is_sweep = settings.mode is RunMode.MULTIRUN
         limit_threads(plain["threads"], settings.launcher.get("n_jobs", 1) if is_sweep else 1)
+    except MissingMandatoryValue as error:
+        key = error.full_key
+        raise CompactHydraException(f"gaigs: {key} must be given, as it has no default; add {key}=...") from None
     except OmegaConfBaseException as error:  # whose message Hydra adds
         raise CompactHydraException("gaigs: the configuration is not complete") from error
     except (TypeError, ValueError) as error:
