@@ -123,7 +123,7 @@ def run(config: dict, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     console = Console()
     titles = {name: metric.title for name, metric in links.task.metrics().items()}
-    cells = agreement.cells(links.task.watched)
+    cells = agreement.cells(links.task.compared_by)
     console.print(write(folder, links.task.pair_score, titles, cells, rows, links.split.name, lines))
     console.print(f"results: {folder}", soft_wrap=True)
 
@@ -278,7 +278,7 @@ def on_split(
         drawn: dict[str, list[Tensor]] = {}
         for cell, count in zip(*np.unique(many, return_counts=True), strict=True):
             scores = agreement.scores[int(cell)]
-            which = torch.from_numpy(random.integers(len(scores[links.task.watched]), size=count))
+            which = torch.from_numpy(random.integers(len(scores[links.task.compared_by]), size=count))
             for name, values in scores.items():
                 drawn.setdefault(name, []).append(values[which])
         mixed = {name: torch.cat(parts) for name, parts in drawn.items()}

@@ -125,11 +125,35 @@ def direct_gains(scene: Scene, query: Query) -> Float[Tensor, "b"]:
     return gains
 
 
+def fit_gain(channels: Complex[Tensor, "k *shape"], waves: Complex[Tensor, "k *shape"]) -> Complex[Tensor, ""]:
+    """The complex gain of measured channels over waves predicted at a gain of 1; complex128.
+
+    Its magnitude is the median over the links of |h| / |w|, its phase that of the sum of w* h / (|w| |h|). So each link
+    has one vote, however weak or loud it is: a fit of least squares follows the loudest links, one of least relative
+    errors those in the deepest shadow (docs/methods.md has both figures).
+
+    Args:
+        channels: Measured, h of each link.
+        waves: Predicted, w of each link. Links of which either is silent have no vote.
+
+    Returns:
+        The gain; 0 where no link has a vote.
+    """
+    h, w = (part.to(torch.complex128).flatten(1) for part in (channels, waves))
+    sizes, strengths = h.norm(dim=1), w.norm(dim=1)
+    heard = (sizes > 0) & (strengths > 0)
+    if not heard.any():
+        return torch.zeros((), dtype=torch.complex128, device=h.device)
+    alike = (w.conj() * h).sum(1)[heard] / (sizes * strengths)[heard]
+    return (sizes / strengths)[heard].quantile(0.5) * alike.sum().sgn()
+
+
 def phase_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, "k"]) -> int:
     """The sign with which the phases of channels follow the direct distance.
 
     The direct path alone, over free space, would be one number at all links of a receiver. What the mean over links
-    keeps of the power is compared for both signs; by chance alone it is about one part in the number of links.
+    keeps of the power is compared for both signs; by chance alone it is about one part in the number of links. All links
+    count alike, however weak or loud they are.
 
     Args:
         channels: Measured.
@@ -139,7 +163,7 @@ def phase_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s
     Returns:
         -1 or 1; 0 where neither keeps ``KEPT`` more than four times what chance does.
     """
-    relative, phases = channels / waves.abs(), waves.angle()
+    relative, phases = _normalised(channels / waves.abs()), waves.angle()
     kept = {-1: 0.0, 1: 0.0}
     for receiver in receivers.unique().tolist():
         own = receivers == receiver
@@ -165,9 +189,15 @@ def array_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s
     Returns:
         -1 or 1, whichever keeps more power in the mean over elements and subcarriers; -1 where neither does.
     """
-    relative, phases = channels / waves.abs(), waves.angle()
+    relative, phases = _normalised(channels / waves.abs()), waves.angle()
     kept = [
         (relative * torch.polar(torch.ones_like(phases), sign * phases)).mean((1, 2)).abs().square().sum()
         for sign in (-1, 1)
     ]
     return 1 if kept[1] > kept[0] else -1
+
+
+def _normalised(channels: Complex[Tensor, "k e s"]) -> Complex[Tensor, "k e s"]:
+    """Channels of a mean power of 1 each; silent ones stay so."""
+    powers = channels.abs().square().mean((1, 2), keepdim=True)
+    return channels / torch.where(powers > 0, powers, 1).sqrt()

@@ -9,6 +9,25 @@ from torch import Tensor
 
 from gaigs.directions import Directions
 
+CARRIERS = 1e4, 3e11
+"""All carriers lie from the first to the second [Hz]; another number is in another unit."""
+
+UNITS = {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}
+
+
+def unit_hint(number: float) -> str:
+    """A question about the unit in which a number that is no carrier would be one; empty where there is none."""
+    low, high = CARRIERS
+    return next((f"; in {unit}?" for unit, size in UNITS.items() if low / size <= number <= high / size), "")
+
+
+def check_carrier(name: str, frequency: float) -> None:
+    """Raises a ``ValueError`` unless the option of that name is a carrier [Hz]."""
+    low, high = CARRIERS
+    if not low <= frequency <= high:
+        expected = f"a carrier in Hz, from {low:g} to {high:g}"
+        raise ValueError(f"{name} must be {expected}, got {frequency:.7g}{unit_hint(frequency)}")
+
 
 @dataclass
 class Query:
@@ -17,7 +36,7 @@ class Query:
     Attributes:
         transmitters: Positions, world frame (b, 3) [m].
         receivers: Indices into the scene's receivers (b,).
-        frequencies: Of the carrier (b,) [Hz]; None where it is unknown.
+        frequencies: Of the carrier (b,) [Hz], from 10 kHz to 300 GHz; None where it is unknown.
     """
 
     transmitters: Float[Tensor, "b 3"]

@@ -121,6 +121,9 @@ def radio_map(
         receivers: Names, or one name; None is all of them.
         frequency: Of the carrier [Hz]; None is that of the training links, of several the middle one.
 
+    Warns:
+        ExtrapolationWarning: The frequency is outside the training links' band.
+
     Raises:
         TypeError: The model is none, or an option is not of its type.
         ValueError: The model predicts something else, an option is out of range, or there is no such receiver.
@@ -168,15 +171,17 @@ def radio_map(
         links = np.broadcast_to(points[..., None, :], (*shape, 3)).astype(np.float32)
         index = np.broadcast_to(heard, shape).copy()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ExtrapolationWarning)  # the margin is asked for
+            # The margin is asked for.
+            warnings.filterwarnings("ignore", r"\d+ of \d+ positions are up to", ExtrapolationWarning)
             return model.predict(links, index, frequency=frequency, batch_size=BATCH * len(names)).cpu().numpy()
 
     if pitch is None:
         pitch = max(PITCH, float((upper - lower).max()) / POINTS)
         some = np.column_stack((np.linspace(lower, upper, BATCH), np.full(BATCH, height)))
-        predict(some[:1])  # what is compiled or loaded at the first prediction is no part of its time
-        start = time.perf_counter()
-        predict(some)
+        with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):  # the whole map says it again
+            predict(some[:1])  # what is compiled or loaded at the first prediction is no part of its time
+            start = time.perf_counter()
+            predict(some)
         most = BATCH * SECONDS / (time.perf_counter() - start)  # points
         while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, FEWEST):
             pitch *= 2

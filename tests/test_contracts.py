@@ -61,7 +61,7 @@ SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "syntheti
 
 MADE_FOR = {
     "loss": {"l1_ssim": ["spectrum"], "absolute": ["spectrum", "rssi"], "squared": ["spectrum", "rssi"]}
-    | {"huber": ["spectrum", "rssi"], "nmse": ["csi"]},
+    | {"huber": ["spectrum", "rssi"], "relative_error": ["csi"], "log_relative_error": ["csi"]},
     "model": {"path_loss": ["rssi"], "friis": ["csi"], "kriging": []},  # kriging is made of a trained model alone
     "pooling": {
         "array_response": ["spectrum"],

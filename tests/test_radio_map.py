@@ -1,5 +1,6 @@
 """Radio maps: where their points lie, whose they are, and that they survive a file."""
 
+import re
 import time
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 import gaigs
 from gaigs.directions import Grid
-from gaigs.geometry import Pose
+from gaigs.geometry import ExtrapolationWarning, Pose
 from gaigs.model import Model, Prediction
 from gaigs.radio_map import FEWEST, POINTS, RadioMap, radio_map
 from gaigs.scene import Receiver, Scene
@@ -34,7 +35,7 @@ class Slope(Model):
     def forward(self, batch):
         query = batch.query
         value = query.transmitters @ torch.tensor([1.0, 10, 100]) - 1000 * query.receivers
-        return Prediction(value if query.frequencies is None else value + query.frequencies, {})
+        return Prediction(value if query.frequencies is None else value + query.frequencies / 1e9, {})
 
 
 def scene(upper=(4.0, 2.0, 1.5), task=None, far=(5.0, 1.0, 2.5), frequencies=()):
@@ -177,14 +178,27 @@ def test_carrier_is_the_training_links_of_several_the_middle_one_or_the_one_aske
     pitch = {"pitch": 0.5}
     unknown = radio_map(Slope(scene()), **pitch)
     assert unknown.frequency is None
-    for carriers, asked, used in (((7.0,), None, 7), ((5.0, 7.0, 12.0), None, 7), ((5.0, 12.0), 9, 9), ((7.0,), 7, 7)):
+    for carriers, asked, used in (
+        ((7e9,), None, 7e9),
+        ((5e9, 7e9, 12e9), None, 7e9),
+        ((5e9, 12e9), 9e9, 9e9),
+        ((7e9,), 7e9, 7e9),
+    ):
         drawn = radio_map(Slope(scene(frequencies=carriers)), frequency=asked, **pitch)
         assert drawn.frequency == used
-        np.testing.assert_allclose(drawn.values, unknown.values + used, atol=1e-3)
-    with pytest.raises(ValueError, match="frequency must be positive"):
+        np.testing.assert_allclose(drawn.values, unknown.values + used / 1e9, atol=1e-3)
+    with pytest.raises(ValueError, match="frequency must be a carrier in Hz"):
         radio_map(Slope(scene()), frequency=-1.0)
-    with pytest.raises(ValueError, match="have one carrier, 7 Hz, which says nothing of others"):
-        radio_map(Slope(scene(frequencies=(7.0,))), frequency=9)
+    with pytest.raises(ValueError, match=r"have one carrier, 7e\+09 Hz, which says nothing of others"):
+        radio_map(Slope(scene(frequencies=(7e9,))), frequency=9e9)
+
+
+@pytest.mark.parametrize("pitch", [None, 0.5])
+def test_a_band_is_left_with_one_warning(pitch):
+    with pytest.warns(ExtrapolationWarning) as warned:
+        radio_map(Slope(scene(frequencies=(5e9, 12e9))), pitch, margin=50.0, frequency=60e9)
+    (only,) = warned
+    assert re.search(r"at 6e\+10 Hz, outside the training links' band of 5e\+09 to 1\.2e\+10 Hz", str(only.message))
 
 
 def test_file_holds_the_map_and_its_axes(tmp_path):

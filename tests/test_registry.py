@@ -74,7 +74,7 @@ BUILT_IN = {
     "projection": {"mercator", "equirectangular", "direction_cosine"},
     "rasterizer": {"torch", "opencl", "fastest"},
     "pooling": {"spectrum", "softmax_attention", "mean_power", "element_sum"},
-    "loss": {"absolute", "squared", "huber", "l1_ssim", "nmse"},
+    "loss": {"absolute", "squared", "huber", "l1_ssim", "log_relative_error", "relative_error"},
     "benchmark": {"accuracy", "all", "budgets", "guard", "rasterizer", "step"},
     "model": {"gaigs", "mean", "knn", "path_loss", "friis", "gaussian_process", "kriging"},
     "training": {"descent", "adversarial"},

@@ -8,6 +8,7 @@ import torch
 from scipy.constants import speed_of_light
 from torch import Tensor
 
+from gaigs.geometry import semi_axes
 from gaigs.projection import Plane, Splats
 from gaigs.scene import Array
 
@@ -36,7 +37,8 @@ class MapScene(NamedTuple):
 class ApertureScene(NamedTuple):
     """Arguments of ``fields``."""
 
-    splats: Splats
+    points: Tensor
+    semi_axes: Tensor
     amplitudes: Tensor
     lengths: Tensor
     array: Array
@@ -45,7 +47,7 @@ class ApertureScene(NamedTuple):
 
     def leaves(self) -> list[Tensor]:
         """What the fields are differentiable by."""
-        return [self.splats.means2d, self.splats.factors, self.amplitudes, self.lengths]
+        return [self.points, self.semi_axes, self.amplitudes, self.lengths]
 
 
 Scene = MapScene | ApertureScene
@@ -77,15 +79,19 @@ def training(n: int, rows: int, columns: int) -> MapScene:
 
 
 def aperture(n: int, rows: int, columns: int) -> ApertureScene:
-    """One transmitter, a square array of 16 elements; splats of 0.02 to 0.17 in the plane of direction cosines, paths
-    of 1 to 20 m that all interfere at one frequency. The grid is that of the spectrum that is pooled from it."""
+    """One transmitter, a square array of 16 elements; Gaussians 1 to 20 m away, up to 44 degrees off each of its axes,
+    of 0.02 to 0.17 of that distance, that all interfere at one frequency. The grid is that of the spectrum that is
+    pooled from it."""
     uniform = _uniform()
-    splats = _splats(uniform(-0.7, 0.7, n, 2), uniform(0.02, 0.17, 1, n, 2), uniform)
-    lengths = uniform(1, 20, 1, n)
+    cosines, lengths = uniform(-0.7, 0.7, n, 2), uniform(1, 20, 1, n)
+    ahead = (1 - cosines.square().sum(1, keepdim=True)).sqrt()
+    points = lengths[..., None] * torch.cat((cosines, ahead), 1)
+    scales = lengths[..., None] * uniform(0.02, 0.17, 1, n, 3)
+    axes = semi_axes(uniform(-1, 1, 1, n, 4), scales)
     amplitudes = torch.polar(uniform(0, 1, 1, n), uniform(-math.pi, math.pi, 1, n))
     array = Array.planar(ELEMENTS, ELEMENTS, speed_of_light / CARRIER / 2, "isotropic")
     carriers = torch.full((1,), CARRIER, dtype=torch.float64)
-    return ApertureScene(splats, amplitudes, lengths, array, carriers, torch.zeros(1, 1, dtype=torch.float64))
+    return ApertureScene(points, axes, amplitudes, lengths, array, carriers, torch.zeros(1, 1, dtype=torch.float64))
 
 
 SCENES: dict[str, Callable[[int, int, int], Scene]] = {"common": common, "training": training, "aperture": aperture}
@@ -115,10 +121,10 @@ def cast(scene: Scene, device: str, dtype: torch.dtype) -> Scene:
 def with_leaves(scene: Scene) -> Scene:
     """The same scene with inputs of its own that take gradients."""
     own = iter([leaf.detach().clone().requires_grad_() for leaf in scene.leaves()])
+    if isinstance(scene, ApertureScene):
+        return scene._replace(points=next(own), semi_axes=next(own), amplitudes=next(own), lengths=next(own))
     splats = scene.splats
     splats = Splats(next(own), next(own), splats.depths, splats.visible)
-    if isinstance(scene, ApertureScene):
-        return scene._replace(splats=splats, amplitudes=next(own), lengths=next(own))
     parts = {"signal": next(own), "opacities": next(own), "attenuations": next(own, None)}
     return scene._replace(splats=splats, **parts)
 

@@ -21,9 +21,6 @@ LONGEST = 400
 
 NEAR = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
 
-CARRIERS = 1e4, 1e12
-"""All carriers lie from the first to below the second [Hz]; a smaller number is in MHz or GHz."""
-
 BESIDE_QUOTE = re.compile(r"(?<=\")[ \t]+(?=,|$)")
 """Blanks behind a quoted cell."""
 

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from gaigs.data import Links
-from gaigs.data._files import CARRIERS, NEAR, find_file, number_places, refuse
+from gaigs.data._files import NEAR, find_file, number_places, refuse
 from gaigs.geometry import FAR, Pose
-from gaigs.query import Query
+from gaigs.query import CARRIERS, Query, unit_hint
 from gaigs.registry import register
 from gaigs.scene import Array, Receiver
 from gaigs.task.csi import Csi
@@ -174,14 +174,16 @@ def _check_values(arrays: dict[str, np.ndarray], defects: list[str]) -> None:
                 holds, expected = (array >= 0) & (array < count), f"a row of rx, 0..{count - 1}"
             case "frequencies":
                 low, high = CARRIERS
-                holds, expected = (low <= array) & (array < high), f"a frequency from {low:g} to below {high:g} Hz"
+                holds, expected = (low <= array) & (array <= high), f"a frequency from {low:g} to {high:g} Hz"
             case _:
                 holds, expected = np.abs(array) < FAR, NEAR
         wrong = np.flatnonzero(~holds.reshape(len(array), -1).all(1))
         if len(wrong):
             first, entries = wrong[0], f"{len(wrong)} of {len(array)} such rows"
             value = array[first][~holds[first]] if array.ndim > 1 else array[first]
-            defects.append(f"{name}[{first}]: expected {expected}, got {np.atleast_1d(value)[0]}; {entries}")
+            value = np.atleast_1d(value)[0]
+            hint = unit_hint(value) if name == "frequencies" else ""
+            defects.append(f"{name}[{first}]: expected {expected}, got {value}; {entries}{hint}")
         elif name == "frequencies" and len(np.unique(array)) < len(array):
             defects.append("frequencies: expected different ones, got one twice; leave one of its subcarriers out")
         elif name == "h" and not array.any():

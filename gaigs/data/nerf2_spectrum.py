@@ -19,7 +19,6 @@ from torch import Tensor
 
 from gaigs.data import Links, Parts
 from gaigs.data._files import (
-    CARRIERS,
     find_folder,
     has_file,
     number_places,
@@ -33,7 +32,7 @@ from gaigs.data._yaml import read_mapping, to_entries, to_position, to_vector
 from gaigs.directions import Grid
 from gaigs.files import whole, write_text
 from gaigs.geometry import Pose
-from gaigs.query import Query
+from gaigs.query import CARRIERS, Query, check_carrier, unit_hint
 from gaigs.registry import register
 from gaigs.scene import Array, Receiver
 from gaigs.task.spectrum import Spectrum
@@ -183,9 +182,8 @@ def write(folder: str | Path, links: Links) -> None:
 def _check_options(elements: Sequence[int] | None, frequency: float | None, bandwidth: float | None) -> None:
     if bandwidth is not None and not 0 <= bandwidth < math.inf:
         raise ValueError(f"bandwidth must be that of a band, 0 or more [Hz], or null, got {bandwidth}")
-    low, high = CARRIERS
-    if frequency is not None and not low <= frequency < high:
-        raise ValueError(f"frequency must be a carrier from {low:g} to below {high:g} Hz, or null, got {frequency}")
+    if frequency is not None:
+        check_carrier("frequency", frequency)
     is_pair = isinstance(elements, Sequence) and len(elements) == 2
     if elements is not None and not (is_pair and all(isinstance(count, int) and count > 0 for count in elements)):
         raise ValueError(f"elements must be the array's rows and columns, such as [4, 4], or null, got {elements!r}")
@@ -223,9 +221,10 @@ def _read_frequencies(root: Path, count: int, defects: list[str]) -> Float[Tenso
     gigahertz = [to_number(line) for line in lines]
     low, high = (bound / 1e9 for bound in CARRIERS)
     for number, value in enumerate(gigahertz, 1):
-        if not low <= value < high:
-            expected = f"one carrier from {low:g} to below {high:g} GHz"
-            defects.append(f"{FREQUENCIES}, line {number}: expected {expected}, got {lines[number - 1]!r}")
+        if not low <= value <= high:
+            expected = f"one carrier from {low:g} to {high:g} GHz"
+            got = f"{lines[number - 1]!r}{unit_hint(value)}"
+            defects.append(f"{FREQUENCIES}, line {number}: expected {expected}, got {got}")
     return (1e9 * torch.tensor(gigahertz, dtype=torch.float64)).float()
 
 

@@ -18,7 +18,9 @@ class MeanError:
 
     def __init__(self, task: Task):
         if task.dtype.is_complex:
-            raise ValueError(f"labels of task {task.name!r} are complex, and this loss takes real ones; take loss=nmse")
+            raise ValueError(
+                f"labels of task {task.name!r} are complex, and this loss takes real ones; take loss=log_relative_error"
+            )
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and the mean absolute error; see ``gaigs.loss.Loss``."""

@@ -18,10 +18,13 @@ from gaigs.data._files import NEAR
 from gaigs.directions import Directions, Grid, Rays
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import FAR, ExtrapolationWarning
-from gaigs.query import Batch, Query
+from gaigs.query import CARRIERS, Batch, Query, check_carrier
 from gaigs.registry import check_type, registry
 from gaigs.report.shapes import LearntRoom
 from gaigs.scene import Scene
+
+ROUNDING = 1e-6
+"""Relative difference up to which two carriers are the same: float32 and seven printed digits round by less."""
 
 INDICES = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 """What an index of a receiver may be."""
@@ -154,8 +157,8 @@ class Model(nn.Module):
             transmitters: Positions, world frame [m], anything that becomes a float tensor, nearer than 1e5 m to the
                 origin on each axis as positions of data sets are; or a whole query.
             receiver: Name, or index into the scene's receivers; or the index of each position's receiver.
-            frequency: Carrier, one for all or one for each position [Hz]; None is the training links' own where they
-                have one carrier or none.
+            frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz as those of data sets are;
+                None is the training links' own where they have one carrier or none.
             batch_size: Links worked on at a time.
             directions: Those to predict, where the label has directions; None: the label's own.
 
@@ -165,12 +168,12 @@ class Model(nn.Module):
 
         Warns:
             ExtrapolationWarning: A position is farther from the box of the training transmitters than this box and the
-                receivers are across. Of a query nothing is said.
+                receivers are across, or a frequency is outside the training links' band. Of a query nothing is said.
 
         Raises:
             TypeError: The batch size is no whole number, or the directions are none.
             ValueError: The positions are not (..., 3) real numbers, or one is not finite or too far away; there is no
-                such receiver; a frequency is not positive, is another than the training links' only one, or is missing
+                such receiver; a frequency is out of range, is another than the training links' only one, or is missing
                 where they have several; the batch size is less than 1; directions are asked for where the label has
                 none, or are no angles in radians; or a query is given with a receiver or a frequency beside it.
         """
@@ -195,6 +198,9 @@ class Model(nn.Module):
         Returns:
             Values (b, *shape) of one batch of positions after the other, those of a grid in the order of
             ``reshape(-1, 3)``; the last batch may be smaller. Each is computed when it is asked for.
+
+        Warns:
+            ExtrapolationWarning: As of ``predict``, at once.
 
         Raises:
             TypeError, ValueError: As of ``predict``, at once.
@@ -248,6 +254,7 @@ class Model(nn.Module):
         device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
         if not is_query:
             self._warn_of_far(points)
+            self._warn_of_other_band(query)
         return query.to(device), shape, None if directions is None else directions.to(device)
 
     def _warn_of_far(self, points: Float[Tensor, "b 3"]) -> None:
@@ -263,29 +270,43 @@ class Model(nn.Module):
                 stacklevel=4,
             )
 
+    def _warn_of_other_band(self, query: Query) -> None:
+        """Warns of carriers below the training links' lowest or above their highest."""
+        if query.frequencies is None or not self.scene.has_band:
+            return
+        asked, (low, high) = query.frequencies.double(), self.scene.frequencies.double()[[0, -1]].tolist()
+        outside = asked[(asked < low * (1 - ROUNDING)) | (asked > high * (1 + ROUNDING))]
+        if len(outside):
+            first, last = f"{outside.amin():.7g}", f"{outside.amax():.7g}"
+            span = first if first == last else f"{first} to {last}"
+            warnings.warn(
+                f"{len(outside)} of {len(asked)} positions are asked at {span} Hz, outside the training links' band of "
+                f"{low:.7g} to {high:.7g} Hz: nothing was measured there",
+                ExtrapolationWarning,
+                stacklevel=4,
+            )
+
     def _frequencies(self, frequency, shape: tuple[int, ...]) -> Float[Tensor, "b"] | None:
         """The carrier of each position [Hz]."""
-        known = self.scene.frequencies.cpu()
+        known = self.scene.frequencies.cpu().float()
         if frequency is None:
             if len(known) > 1:
                 raise ValueError(
-                    f"the training links have {len(known)} carriers, {known[0]:.6g} to {known[-1]:.6g} Hz; say which "
+                    f"the training links have {len(known)} carriers, {known[0]:.7g} to {known[-1]:.7g} Hz; say which "
                     "with frequency=..."
                 )
-            frequency = known[0] if len(known) else None
-        if frequency is None:
-            return None
-        frequency = as_numbers("a frequency", frequency, "positive and finite [Hz]")
-        wrong = frequency[~(frequency.isfinite() & (frequency > 0))]
-        if len(wrong):
-            raise ValueError(f"a frequency must be positive and finite [Hz], got {wrong[0]:g}")
+            return known[0].expand(shape).reshape(-1) if len(known) else None
+        frequency = as_numbers("a frequency", frequency, "a carrier in Hz")
+        low, high = CARRIERS
+        for wrong in frequency[~((frequency >= low) & (frequency <= high))][:1].tolist():
+            check_carrier("a frequency", wrong)
         if frequency.ndim and frequency.shape != shape:
             raise ValueError(
                 f"frequencies must be one, or one for each of the {tuple(shape)} positions, got "
                 f"{tuple(frequency.shape)}"
             )
-        if len(known) < 2 and not (len(known) and torch.isclose(frequency, known[0].float(), rtol=1e-6).all()):
-            carrier = f"one carrier, {known[0]:.6g} Hz" if len(known) else "no carrier that is known"
+        if len(known) < 2 and not (len(known) and torch.isclose(frequency, known[0], rtol=ROUNDING).all()):
+            carrier = f"one carrier, {known[0]:.7g} Hz" if len(known) else "no carrier that is known"
             raise ValueError(f"the training links have {carrier}, which says nothing of others; leave frequency out")
         return frequency.expand(shape).reshape(-1)
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -31,6 +31,10 @@ FEWEST = 10
 NOISE = (1e-4, 1e2)
 """Bounds of the noise's variance over the signal's. The lower is well above float64's rounding errors, so that places
 measured twice do not make matrices singular."""
+
+LOUDEST = 10.0
+"""What is left over of a channel counts as no larger than so many times the median channel: within some decimetres of a
+receiver it is that large, and a reading that is far too loud would otherwise be heard all over the room."""
 
 EDGES = 8
 """Longest correlation length, in longest edges of the box of places: beyond it the kernel is a straight line in the
@@ -73,6 +77,28 @@ class HeldOut(NamedTuple):
 def numbers_of(scene: Scene) -> Int[Tensor, "m"]:
     """Which of a label's numbers the hyperparameters are chosen by."""
     return evenly(torch.arange(math.prod(scene.task.shape)), NUMBERS)
+
+
+def norms(channels: Complex[Tensor, "k *shape"]) -> Float[Tensor, "k"]:
+    """Of each link's channel; float64."""
+    return channels.flatten(1).to(torch.complex128).norm(dim=1)
+
+
+def damping(
+    residuals: Float[Tensor, "k"], labels: Float[Tensor, "k"], receivers: Int[Tensor, "k"]
+) -> Float[Tensor, "k"]:
+    """By what residuals of channels are multiplied so that those of each receiver keep to ``LOUDEST``.
+
+    Args:
+        residuals, labels: Their ``norms``.
+        receivers: Of each link.
+    """
+    factors = torch.ones_like(residuals)
+    for receiver in receivers.unique():
+        own = receivers == receiver
+        most = LOUDEST * labels[own].quantile(0.5)
+        factors[own] = most / residuals[own].clamp_min(most)
+    return factors.float()
 
 
 def likeliest(

@@ -7,7 +7,7 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.model import Model, Prediction
 from gaigs.model._known import known_links
-from gaigs.propagation import check_elements, direct_gains, direct_waves, phase_sign
+from gaigs.propagation import check_elements, direct_gains, direct_waves, fit_gain, phase_sign
 from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.scene import Scene
@@ -17,9 +17,9 @@ from gaigs.scene import Scene
 class Friis(Model):
     """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, with one complex gain g for each receiver.
 
-    a is the elements' pattern towards the transmitter. The gain is the least-squares one over the known links, each
-    weighed by its own power: it stands for transmit power, cables and the clock's phase. The sign of the phase is what
-    the known links show, as either time convention is in use; -1 where they show none. NaN until it is fitted.
+    a is the elements' pattern towards the transmitter. The gain, ``fit_gain`` of the known links, stands for transmit
+    power, cables and the clock's phase. The sign of the phase is what the known links show, as either time convention
+    is in use. Where they show none, as without a common clock, no gain is better than 0. NaN until it is fitted.
 
     Raises:
         ValueError: The labels are no channels, or an array has another number of elements than they.
@@ -44,14 +44,11 @@ class Friis(Model):
         index = torch.cat(known)
         labels, query = links.labels[index].to(torch.complex128), links.query[index]
         waves = direct_waves(self.scene, query, self.scene.task.frequencies)
-        self.sign.fill_(phase_sign(labels, waves, query.receivers) or -1)
-        for receiver, own in enumerate(known):
-            labels, waves = links.labels[own].to(torch.complex128), self._waves(links.query[own])
-            weights = 1 / labels.abs().square().sum((1, 2), keepdim=True)
-            power = (weights * waves.abs().square()).sum()
-            # An array that has all known links at its back hears nothing directly.
-            gain = (weights * waves.conj() * labels).sum() / power if power > 0 else torch.zeros_like(power)
-            self.gains[receiver] = gain.to(self.gains)
+        sign = phase_sign(labels, waves, query.receivers)
+        self.sign.fill_(sign or -1)
+        self.gains.zero_()
+        for receiver, own in enumerate(known if sign else ()):
+            self.gains[receiver] = fit_gain(links.labels[own], self._waves(links.query[own])).to(self.gains)
 
     def forward(self, batch: Batch) -> Prediction:
         waves = self._waves(batch.query).to(self.gains)

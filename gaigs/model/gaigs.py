@@ -296,17 +296,20 @@ class GaussianSplatting(Model):
     ) -> Tensor:
         """What the receiver's elements hear, summed without a map."""
         stands = placed.means.expand(len(which), -1, -1) if len(placed.means) == 1 else placed.means[which]
-        splats = self._splats(stands, axes, which, receiver)
         signal, opacities, _ = self._strengths(placed, residuals, which)
         amplitudes = torch.complex(signal[..., 0], signal[..., 1]) * opacities
         n = amplitudes.shape[1]
         lengths = amplitudes.real.new_zeros(len(which), n) if placed.lengths is None else placed.lengths[which]
-        array, frequencies = self.scene.receivers[receiver].array, self._carriers(query)
+        antenna, frequencies = self.scene.receivers[receiver], self._carriers(query)
         if self.pooling.takes == "fields":
+            pose = antenna.pose.to(stands)
+            axes = pose.rotation.mT @ (axes if len(axes) == 1 else axes[which])
             offsets = self.scene.task.frequencies.to(frequencies)[None] - frequencies[:, None]
-            return self.rasterizer.fields(splats, amplitudes, lengths, array, frequencies, offsets)
+            heard = pose.local(stands), axes, amplitudes, lengths, antenna.array, frequencies, offsets
+            return self.rasterizer.fields(*heard)
+        splats = self._splats(stands, axes, which, receiver)
         coherences = lengths.new_ones(n) if placed.coherences is None else placed.coherences
-        return self.rasterizer.lags(splats, amplitudes, lengths, coherences, placed.bandwidth, array, frequencies)
+        return self.rasterizer.lags(splats, amplitudes, lengths, coherences, placed.bandwidth, antenna.array, frequencies)
 
     def _carriers(self, query: Query) -> Float[Tensor, "b"]:
         """The links' frequencies [Hz]; single antennas hear powers alike at any, so they need none."""

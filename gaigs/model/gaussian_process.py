@@ -10,7 +10,7 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.model import Model, Prediction, build_trend
 from gaigs.model._known import at_directions, coordinates, distances, known_links
-from gaigs.model._process import LIMIT, PART, Hyperparameters, likeliest, numbers_of, weigh
+from gaigs.model._process import LIMIT, PART, Hyperparameters, damping, likeliest, norms, numbers_of, weigh
 from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.scene import Scene
@@ -37,6 +37,8 @@ class GaussianProcess(Model):
     A receiver with more than ``LIMIT`` known links is predicted from the ``NEIGHBOURS`` nearest to each query instead
     of from all (local kriging).
 
+    What the trend leaves over of a channel counts as no larger than ``LOUDEST`` times the receiver's median channel.
+
     It is a look-up, which keeps the links, and is not stored in a checkpoint.
 
     Args:
@@ -58,7 +60,7 @@ class GaussianProcess(Model):
                 "path_loss or friis"
             )
         self.trends = (built,)  # in a tuple, so that its state is no state of this look-up
-        self.links, self.known, self.solved = None, None, None
+        self.links, self.known, self.solved, self.factors = None, None, None, None
         self.process = Hyperparameters(math.nan, math.nan, None)
 
     @torch.no_grad()
@@ -70,6 +72,13 @@ class GaussianProcess(Model):
         """
         self.links, self.known = links, known_links(links)
         self.trends[0].fit(links)
+        self.factors = None
+        if self.scene.task.dtype.is_complex:
+            index = torch.cat(self.known)
+            sizes = torch.cat([norms(part) for _, part in self._residuals(index)])
+            usual = torch.cat([norms(links.labels[part]) for part in index.split(PART)])
+            factors = damping(sizes, usual, links.query.receivers[index])
+            self.factors = torch.ones(len(links)).index_copy(0, index, factors)
         numbers = numbers_of(self.scene)
         residuals = lambda index: torch.cat(
             [part.reshape(len(part), -1)[:, numbers] for _, part in self._residuals(index)]
@@ -119,7 +128,10 @@ class GaussianProcess(Model):
         for start in range(0, len(index), PART):
             some = index[start : start + PART]
             trend = self.trends[0](Batch(self.links.query[some], self.scene.task.directions)).value
-            yield slice(start, start + len(some)), self.links.labels[some] - trend
+            residuals = self.links.labels[some] - trend
+            if self.factors is not None:
+                residuals = residuals * self.factors[some, None, None]
+            yield slice(start, start + len(some)), residuals
 
     def _krige(self, query: Query, receiver: int) -> Tensor:
         """What the process adds to the trend (b, *shape)."""

@@ -14,7 +14,7 @@ from gaigs.data import Links, Split
 from gaigs.gaussians import Gaussians
 from gaigs.model import Model, Prediction
 from gaigs.model._known import at_directions, coordinates, distances, evenly, known_links
-from gaigs.model._process import LIMIT, PART, Hyperparameters, likeliest, numbers_of
+from gaigs.model._process import LIMIT, PART, Hyperparameters, damping, likeliest, norms, numbers_of
 from gaigs.query import Batch
 from gaigs.registry import register, registry
 from gaigs.report.shapes import LearntRoom
@@ -49,7 +49,8 @@ class Kriging(Model):
     places with the Matern-1/2 kernel, as in ``gaigs.model.gaussian_process``. Share, length and noise are those with
     which the validation links are likeliest, each given the training links around it. So at a share of 0 it is that
     process, and far from all known links it is trend and fallback alone. Likelihood is no score: the weight is that of
-    ``WEIGHTS`` with which the validation links, predicted from the training links, score best.
+    ``WEIGHTS`` with which the validation links, predicted from the training links, score best. Residuals of channels
+    are damped as in ``gaigs.model.gaussian_process``.
 
     A checkpoint holds it whole, in a compact form: residuals as a few principal components. Of a receiver with more
     than ``LIMIT`` known links an even part is looked at.
@@ -125,15 +126,17 @@ class Kriging(Model):
             over.append(thin(links.labels[index[part]] - fallback))
             apart.append(thin(values[part] - fallback))
         over, apart = torch.cat(over), torch.cat(apart)
-        found = {}
-        for share in SHARES:
-            residuals = lambda some, share=share: over[rows[some]] - share * apart[rows[some]]
-            found[share] = likeliest(self.scene, links, known_links(links), residuals)
+
+        def likeliest_of(share: float, **options: int) -> tuple[Hyperparameters, float]:
+            left = over - share * apart
+            if left.is_complex():
+                sizes = norms(left), norms(thin(links.labels[index]))
+                left = left * damping(*sizes, links.query.receivers[index])[:, None]
+            return likeliest(self.scene, links, known_links(links), lambda some: left[rows[some]], **options)
+
+        found = {share: likeliest_of(share) for share in SHARES}
         share = min(SHARES, key=lambda share: found[share][1])
-        process, _ = found[share]
-        if share:
-            residuals = lambda some: over[rows[some]] - share * apart[rows[some]]
-            process, _ = likeliest(self.scene, links, known_links(links), residuals, ASKED)
+        process, _ = likeliest_of(share, most=ASKED) if share else found[share]
         self._set(share, process)
         left = (over - apart).abs().square().mean(1)
         train, validation = left.tensor_split([len(links.split.train)])
@@ -151,6 +154,9 @@ class Kriging(Model):
                 some = index[rows[part]]
                 fallback = predicted(self.fallback, links, some)
                 residuals[part] = links.labels[some] - share * values[rows[part]] - (1 - share) * fallback
+            if residuals.is_complex():
+                sizes = norms(residuals), norms(links.labels[index[rows]])
+                residuals = residuals * damping(*sizes, own[rows])[:, None, None]
             places = coordinates(self.scene, links.query[index[rows]], self.process.scale)
             field.solve(places, residuals, self.process)
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -9,9 +10,10 @@ from jaxtyping import Bool, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.data import Links
+from gaigs.data import Links, Split
 from gaigs.model import _learnt_room
 from gaigs.model._plane_search import fewer, find_planes
+from gaigs.model.friis import Friis
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.propagation import carriers
 from gaigs.query import Batch, Query
@@ -54,13 +56,31 @@ class Mirrored(GaussianSplatting):
 
     places: Query | None = None  # set by fit
 
+    @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """As the pipeline's; and remembers some places, by which the paths' powers are told."""
+        """As the pipeline's; and remembers some places, by which the paths' powers are told.
+
+        Channels start from free space as ``friis`` has it, fitted to the training links alone; where that has no gain,
+        from the median link's strength.
+        """
         super().fit(links)
         self.places = _learnt_room.some(links.query[links.split.train])
+        if not self.scene.task.dtype.is_complex:
+            return
+        split, free_space = links.split, Friis(self.scene)
+        free_space.fit(replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation)))
+        gains = torch.where(free_space.gains == 0, 1, free_space.gains / self.pooling.strength)
+        self.placement.strip(gains.conj() if self.pooling.array_sign > 0 else gains)
+        self.placement.sharpen(speed_of_light / self.scene.task.frequencies.mean().item())
+
+    @property
+    def predicts_untrained(self) -> bool:
+        return super().predicts_untrained or self.scene.task.dtype.is_complex
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
         """Looks for more planes; has phases count; searches planes by them; drops what does not help."""
+        if self.placement.is_bare:
+            self.placement.furnish()
         if number < FINDS and self.placement.fixed:
             return "planes stay where they were put"
         if number < FINDS and not self._adds_waves:

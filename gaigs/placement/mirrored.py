@@ -23,7 +23,7 @@ from gaigs.placement._words import Folded, all_words, fold, images
 from gaigs.propagation import NEAREST, carriers, fresnel
 from gaigs.query import Query
 from gaigs.registry import register
-from gaigs.scene import Scene
+from gaigs.scene import Receiver, Scene
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +51,9 @@ BLUR = 0.3
 UNIT = 0.12
 """What a step of 1 in a plane's offset is, in diagonals of the box, so that learning rates suit rooms of any size."""
 
+FLAT = 1e-6
+"""Least extent of an array over its largest, by which it is no line, or no plane: float32 places it no better."""
+
 FINE = 2.2
 """What it is once phases count [wavelengths]: a usual step of 0.01 then turns a phase by a tenth of a radian."""
 
@@ -75,6 +78,9 @@ class Mirrored(Placement):
 
     Phases are not looked at before ``coherent`` is set (see ``sharpen``): powers alone say where planes are to some
     centimetres, and phases take a fraction of the wavelength.
+
+    For channels there is a phase of each receiver, too, and the start is free space: while ``is_bare`` is set there is
+    the direct path alone, without obstacles and spread (see ``furnish``).
 
     Args:
         scene: Its box and receivers say where the first planes are.
@@ -154,6 +160,14 @@ class Mirrored(Placement):
             bandwidth = scene.bandwidth or speed_of_light / self.diagonal
             self.log_bandwidth = nn.Parameter(torch.tensor(math.log(bandwidth)))
         self.obstacles = Obstacles(obstacles, lower, upper) if obstacles else None
+        is_complex = scene.task.dtype.is_complex
+        self.register_buffer("is_bare", torch.tensor(False), persistent=is_complex)
+        self.register_buffer("planned", self.kept.clone(), persistent=is_complex)
+        self.boresights = [torch.tensor([0.0, 0.0, 1.0])] * len(scene.receivers)
+        self.receiver_phases = None
+        if is_complex:
+            self.boresights = [boresight(receiver, (lower + upper) / 2) for receiver in scene.receivers]
+            self.receiver_phases = nn.Parameter(torch.zeros(len(scene.receivers)))
         self.holds, self.held = False, None
 
     def fit(self, links: Links) -> None:
@@ -228,6 +242,21 @@ class Mirrored(Placement):
         self.step.fill_(min(1.0, FINE * wavelength / (UNIT * self.diagonal)))
         self.coherent.fill_(True)
 
+    @torch.no_grad()
+    def strip(self, gains: Complex[Tensor, "receivers"]) -> None:
+        """Starts channels from free space, with a gain of each receiver over the pooling's unit, none of them 0."""
+        self.planned.copy_(self.kept)
+        self.kept.copy_(self.words_of(self.used[:0]))
+        self.is_bare.fill_(True)
+        self.receiver_gains.copy_(gains.abs().log())
+        self.receiver_phases.copy_(gains.angle())
+
+    @torch.no_grad()
+    def furnish(self) -> None:
+        """Ends ``strip``: from now on planes reflect, obstacles dim and paths spread."""
+        self.kept.copy_(self.planned)
+        self.is_bare.fill_(False)
+
     @contextmanager
     def holding(self) -> Iterator[None]:
         """Within it, strengths stay those of the first query, while images follow the planes: for searches."""
@@ -257,6 +286,8 @@ class Mirrored(Placement):
         if self.coherent:
             turns = lengths / (speed_of_light / carriers(self.scene, query).to(lengths))[:, None]
             phases = self.path_phases[self.kept] - 2 * math.pi * (turns - turns.detach().round())
+            if self.receiver_phases is not None:
+                phases = phases + self.receiver_phases[query.receivers, None]
             gains = gains * torch.polar(torch.ones_like(phases), phases)
             coherences = (-self.log_blurs[self.kept].exp().square() / 2).exp()
         if distributed.is_available() and distributed.is_initialized():
@@ -264,7 +295,7 @@ class Mirrored(Placement):
             gains = gains + 0 * sum(parameter.sum() for parameter in self.parameters() if parameter.requires_grad)
         signal = lengths.new_zeros(len(words), self.channels, 1)
         signal[:, 0] = 1
-        scales = (lengths * self.log_spreads[self.kept].exp())[..., None].expand(-1, -1, 3)
+        scales = (lengths * (self.log_spreads[self.kept].exp() * ~self.is_bare))[..., None].expand(-1, -1, 3)
         quats = signal.new_tensor([1.0, 0, 0, 0]).expand(len(words), 4)
         bandwidth = None if self.log_bandwidth is None else self.log_bandwidth.exp()
         ones = signal.new_ones(len(words))
@@ -274,7 +305,7 @@ class Mirrored(Placement):
     def strengths(self, query: Query, folded: Folded) -> Complex[Tensor, "b n"]:
         """What reflections and obstacles leave of each kept path's field, over free space; 0 where there is no path."""
         left = self.path_gains[self.kept] + self.receiver_gains[query.receivers, None]
-        if self.obstacles is not None:
+        if self.obstacles is not None and not self.is_bare:
             left = left.index_add(1, folded.path, -self.obstacles(folded.start, folded.end))
         left = torch.complex(left.exp() * folded.exists, torch.zeros_like(left))
         normals = self.normals
@@ -291,7 +322,10 @@ class Mirrored(Placement):
         """Field gain of a receiver's elements in its frame; of an array also what was learnt, cos^q."""
         array = self.scene.receivers[receiver].array
         gain = array.gain(directions)
-        return gain if len(array) == 1 else gain * directions[..., 2].clamp_min(GRAZING) ** self.directivity
+        if len(array) == 1:
+            return gain
+        cosines = directions @ self.boresights[receiver].to(directions)
+        return gain * cosines.clamp_min(GRAZING) ** self.directivity
 
     def _patterns(self, query: Query, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
         """Field gain of the receivers' elements towards points."""
@@ -308,8 +342,7 @@ class Mirrored(Placement):
             self.log_permittivities, self.log_conductivities, self.plane_gains, self.middles, self.log_extents,
             self.path_gains, self.path_phases, self.log_spreads, self.log_blurs, self.receiver_gains, self.directivity,
         ]  # fmt: skip
-        if self.log_bandwidth is not None:
-            groups["paths"].append(self.log_bandwidth)
+        groups["paths"] += [part for part in (self.log_bandwidth, self.receiver_phases) if part is not None]
         if self.obstacles is not None:
             groups["obstacles"] = list(self.obstacles.parameters())
         return groups
@@ -319,6 +352,16 @@ class Mirrored(Placement):
         if self.obstacles is None:
             return {}
         return {"obstacles": self.obstacles.densities.mean() * self.diagonal}
+
+
+def boresight(receiver: Receiver, middle: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """The normal of a planar array in its own frame, on the side of a point of the world [m]; of others 0: no axis."""
+    elements = receiver.array.elements.double()
+    _, values, axes = torch.linalg.svd(elements - elements.mean(0), full_matrices=True)
+    if len(values) < 3 or values[2] > FLAT * values[0] or values[1] <= FLAT * values[0]:
+        return torch.zeros(3)
+    normal = axes[2].float()
+    return normal if normal @ receiver.pose.to(middle).local(middle) >= 0 else -normal
 
 
 def _beside(placed: Placed, gaussians: Gaussians) -> Placed:

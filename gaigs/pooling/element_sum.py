@@ -10,7 +10,7 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.directions import Directions
 from gaigs.pooling import Pooling, sphere
-from gaigs.propagation import array_sign, check_elements, direct_waves, phase_sign
+from gaigs.propagation import array_sign, check_elements, direct_waves, fit_gain, phase_sign
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene
@@ -22,7 +22,7 @@ class ElementSum(Pooling):
 
     m_f is the map at subcarrier f, complex: its real parts are the map's channels before all imaginary ones. x_e is an
     element's place, a its pattern, w the share of the direction's solid angle. F is the wave of free space over the
-    direct distance d, and g its usual strength: the map holds what is relative to them, so that a direct path is the
+    direct distance d, and g its median strength: the map holds what is relative to them, so that a direct path is the
     same in it from everywhere.
 
     The sign s of phases, -1 as for the time dependence exp(+j omega t), or +1, is what the training channels show.
@@ -57,8 +57,7 @@ class ElementSum(Pooling):
         train = links.split.train
         labels, query = links.labels[train].to(torch.complex128), links.query[train]
         waves = direct_waves(self.scene, query, self.scene.task.frequencies)
-        relative = (labels / waves).abs().square().mean((1, 2))
-        self.strength.fill_(relative.log().mean().div(2).exp())
+        self.strength.copy_(fit_gain(labels, waves).abs())
         self.sign.fill_(phase_sign(labels, waves, query.receivers))
         self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))
 

@@ -1,4 +1,4 @@
-"""No pixels: what splats send to each element of a planar array, summed in closed form."""
+"""No pixels: what Gaussians send to each element of an array, summed in closed form."""
 
 import math
 
@@ -8,9 +8,13 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.geometry import magnitudes, polar
-from gaigs.projection import Splats
+from gaigs.projection import NEAR, Splats
+from gaigs.propagation import NEAREST
 from gaigs.registry import register
 from gaigs.scene import Array
+
+WIDE = 3.0
+"""Largest phase by which a band turns over an array [rad] for which its power series is summed: terms then stay small."""
 
 FLAT = 1e-6
 """An array whose elements leave its plane by no more than this is planar [m]: float32 places metres no better."""
@@ -18,9 +22,9 @@ FLAT = 1e-6
 
 @register("rasterizer", "aperture")
 class Aperture:
-    """Sums splats of the plane of direction cosines in the array's aperture, where a footprint's integral is known.
+    """Sums Gaussians in the array's aperture, where a footprint's integral is known.
 
-    A splat holds in all the amplitude A, spread over directions u about its centre as a Gaussian with covariance S. An
+    As a splat of the plane of direction cosines, one holds in all the amplitude A, spread over directions u about its centre as a Gaussian with covariance S. An
     element at x, in wavelengths, hears of it
 
         y(x) = A exp(-(2 pi)² x' S x / 2 + j 2 pi x . u)
@@ -39,32 +43,61 @@ class Aperture:
 
     def fields(
         self,
-        splats: Splats,
+        points: Float[Tensor, "b n 3"],
+        semi_axes: Float[Tensor, "*b n 3 3"],
         amplitudes: Complex[Tensor, "b n"],
         lengths: Float[Tensor, "b n"],
         array: Array,
         carriers: Float[Tensor, "b"],
         offsets: Float[Tensor, "b s"],
     ) -> Complex[Tensor, "b e s"]:
-        """What each element hears at several frequencies, all splats interfering.
+        """What each element hears at several frequencies, all paths interfering.
+
+        A path is longer to an element by as much as the element is farther from the path's point than the array's
+        middle is, and its wave is weaker by the ratio: a spherical wave, at an array of any shape and orientation. It is
+        weaker too by the footprint above, of the Gaussian as the array's middle sees it.
 
         Args:
-            splats: On the plane of direction cosines.
+            points: Where the Gaussians stand, in the array's frame [m].
+            semi_axes: Theirs in that frame, a column for each axis (1 or b, n, 3, 3) [m].
             amplitudes: At the carrier, in the array's middle.
-            lengths: Of the paths, by which phases differ from that at the carrier [m].
-            array: Whose elements; planar.
+            lengths: Of the paths to the middle, by which phases differ from that at the carrier [m].
+            array: Whose elements.
             carriers: Of each query [Hz].
             offsets: Frequencies over the carrier [Hz].
-
-        Raises:
-            ValueError: The array is not planar.
         """
-        _check_planar(array)
-        steering = self._steering(splats, array, carriers)
-        phases = -2 * math.pi / speed_of_light * lengths[..., None] * offsets[:, None].to(lengths)
-        # The elements' places are a few wavelengths at the most, over which the frequencies of a band hardly differ.
-        waves = _seen(splats, amplitudes)[..., None] * torch.polar(torch.ones_like(phases), phases)
-        return steering.mT @ waves
+        ways = points.norm(dim=-1)
+        visible = ~(ways < NEAR)  # a point that is NaN is no reason to hide it
+        # One on the middle has no direction: a stand-in keeps values and gradients finite, and it sends nothing.
+        points = torch.where(visible[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
+        ways = torch.where(visible, ways, 1)[..., None]
+        elements = array.elements.to(points)
+        to_elements = (points[:, :, None] - elements).norm(dim=-1).clamp_min(NEAREST)
+        # The difference of two lengths, without the digits that it would lose.
+        longer = (elements.square().sum(-1) - 2 * points @ elements.T) / (to_elements + ways)
+        wavelengths = speed_of_light / carriers.to(points)[:, None, None]
+        units = points / ways
+        aside = elements - (units @ elements.T)[..., None] * units[:, :, None]  # as the point sees the element
+        turns = (aside @ semi_axes) * (2 * math.pi / (wavelengths * ways))[..., None]
+        weights = (turns.square().sum(-1) / -2).exp() * (ways.clamp_min(NEAREST) / to_elements)
+        waves = torch.where(visible, amplitudes, 0)[..., None] * polar(weights, -2 * math.pi / wavelengths * longer)
+        reach = float(elements.norm(dim=-1).amax()) / speed_of_light
+        rates = -2 * math.pi * offsets.to(lengths)
+        turned = lambda delays: torch.polar(torch.ones_like(delays), delays)
+        widest = reach * float(rates.abs().amax()) if rates.numel() else 0.0  # what the band turns over the array [rad]
+        if widest > WIDE:
+            delays = (lengths[..., None] + longer) / speed_of_light
+            return (waves[..., None] * turned(delays[..., None] * rates[:, None, None])).sum(1)
+        # exp(j rate (t + dt)) = exp(j rate t) sum_k (j rate dt)^k / k!: one product of matrices, and no wave of each
+        # path, element and frequency. |dt| is at most the reach.
+        terms, size = [waves], widest
+        while size > torch.finfo(lengths.dtype).eps:
+            terms.append(terms[-1] * (longer * (1j / (reach * speed_of_light * len(terms)))))
+            size *= widest / len(terms)
+        middle = turned(lengths[..., None] / speed_of_light * rates[:, None])
+        sums = torch.stack(terms, 2).flatten(2).mT @ middle  # (b, terms x e, s)
+        powers = (reach * rates)[:, None] ** torch.arange(len(terms), device=rates.device)[:, None]
+        return (sums.unflatten(1, (len(terms), -1)) * powers[:, :, None]).sum(1)
 
     def lags(
         self,
@@ -82,9 +115,11 @@ class Aperture:
         their paths' delays: what averaging over the band leaves of cos(2 pi f (t - t')).
 
         Args:
-            splats, amplitudes, lengths, array, carriers: As for ``fields``.
+            splats: On the plane of direction cosines.
+            amplitudes, lengths, carriers: As for ``fields``.
             coherences: Of each splat, in [0, 1].
             bandwidth: Of the band [Hz]; None: the carrier alone.
+            array: Whose elements; planar.
 
         Raises:
             ValueError: The array is not planar.
@@ -138,7 +173,7 @@ def _check_planar(array: Array) -> None:
     if (heights > FLAT).any():
         raise ValueError(
             "rasterizer 'aperture' takes planar arrays, whose elements have z = 0 in the array's frame, got z up to "
-            f"{heights.max():.3g} m; take rasterizer=fastest with pooling=array_response"
+            f"{heights.max():.3g} m; for spectra take rasterizer=fastest with pooling=array_response"
         )
 
 

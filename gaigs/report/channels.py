@@ -1,6 +1,6 @@
 """Complex channels beside their predictions: over frequency, and as impulse responses over delay."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 from numpy import ndarray
 
-from gaigs.report.style import PAGE, SKY, STYLE
+from gaigs.report.style import COLUMN, MARKERS, PAGE, SKY, STYLE
 
 DEPTH = 60
 """How far below the label's peak magnitudes are shown [dB]."""
@@ -186,3 +186,30 @@ def _fourier_sum(
     turns = 2j * np.pi * (frequencies - frequencies.min())
     parts = np.array_split(delays, -(-len(delays) // 256))
     return np.concatenate([spectra @ np.exp(np.outer(turns, part)) for part in parts], -1) / len(frequencies)
+
+
+def error_against_power(powers: Float[ndarray, "k"], errors: Mapping[str, Float[ndarray, "k"]], split: str) -> Figure:
+    """Power of each test link's error over the power of its channel, of two models; NMSE of all links in the key.
+
+    Links that lie above the line have an error larger than their channel. Those to the right rule the NMSE.
+
+    Args:
+        powers: Of the labels, linear, all above 0.
+        errors: Powers of the errors by model, the run's own first; that and the baseline of the least NMSE are drawn.
+        split: Name of the split.
+    """
+    own, *others = errors
+    baselines = sorted((name for name in others if name != f"{own}_trend"), key=lambda name: errors[name].sum())
+    with rc_context(STYLE):
+        figure = Figure(figsize=(COLUMN, COLUMN), layout="constrained")
+        ax = figure.subplots()
+        x = 10 * np.log10(powers)
+        ax.axline((x.max(), x.max()), slope=1, color="0.75", linewidth=0.8, zorder=0, label="SNR 0 dB")
+        for name, look in zip([own, *baselines[:1]], MARKERS, strict=False):
+            error = np.maximum(errors[name], 1e-14 * powers)  # the highest SNR that is told
+            nmse = 10 * np.log10(error.sum() / powers.sum())
+            ax.plot(x, 10 * np.log10(error), linestyle="", markersize=3, label=f"{name}, NMSE {nmse:.1f} dB", **look)
+        ax.set(xlabel="power of the channel [dB]", ylabel="power of the error [dB]", title=f"Test links, split {split}")
+        ax.grid()
+        ax.legend()
+    return figure

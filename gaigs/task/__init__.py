@@ -65,7 +65,12 @@ class Task(ABC):
 
     @property
     def pair_score(self) -> str:
-        """What a reader calls ``watched`` where it is of two labels, with its unit in brackets; by default its name."""
+        """What a reader calls ``compared_by``, with its unit in brackets; by default its name."""
+        return self.compared_by
+
+    @property
+    def compared_by(self) -> str:
+        """The score of two labels of one data set; by default ``watched``."""
         return self.watched
 
     @abstractmethod
@@ -83,6 +88,10 @@ class Task(ABC):
         Raises:
             ValueError: There is no sample.
         """
+
+    def logged(self, means: dict[str, float]) -> dict[str, float]:
+        """What the log has of a validation, by name, from the mean of each score over its links; by default these."""
+        return means
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
         """What becomes of scores of one label as the prediction of another where the mean of many takes its place.

@@ -23,8 +23,15 @@ EXAMPLES = {"10th percentile": 0.1, "median": 0.5, "90th percentile": 0.9}
 class Csi(Task):
     """Complex channels (elements, subcarriers), linear amplitudes in the data's own unit.
 
-    SNR [dB] = -10 log10(|h - h'|² / |h|²) over a link's elements and subcarriers; ``snr_aligned_db`` is that after the
-    global phase of the prediction that suits the label best, as where receiver and transmitter share no clock.
+    Scores of a link, with error e = h - h' over its elements and subcarriers:
+
+    - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is that after the global phase of the prediction that suits
+      the label best, as where receiver and transmitter share no clock.
+    - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²): the SNR, but never below 0. Links in deep shadow may have an SNR of
+      -50 dB, of which a few decide a mean; so the mean SINAD is watched.
+
+    And of all links together NMSE [dB], 10 log10(sum |e|² / sum |h|²): the error of a link budget, in which loud links
+    count most.
 
     Args:
         elements: Of the receivers' arrays; 1 for single antennas.
@@ -37,7 +44,7 @@ class Csi(Task):
     """
 
     name, quantity = "csi", "channel"
-    watched, larger_is_better = "snr_db", True
+    watched, compared_by, larger_is_better = "sinad_db", "snr_db", True
     pair_score = "SNR [dB]"
     dtype = torch.complex64
     normalisation = "linear amplitude, in the data's own unit"
@@ -65,6 +72,8 @@ class Csi(Task):
             "snr_db_mean": Metric("mean SNR [dB]", True),
             "snr_db_p10": Metric("p10 SNR [dB]", True, is_brief=False),
             "snr_db_p90": Metric("p90 SNR [dB]", True, is_brief=False),
+            "sinad_db_mean": Metric("mean SINAD [dB]", True, is_brief=False),
+            "nmse_db": Metric("NMSE [dB]", False),
             "snr_aligned_db_median": Metric("median SNR, phase removed [dB]", True),
             "snr_aligned_db_mean": Metric("mean SNR, phase removed [dB]", True, is_brief=False),
             "snr_aligned_db_p10": Metric("p10 SNR, phase removed [dB]", True, is_brief=False),
@@ -72,7 +81,7 @@ class Csi(Task):
         }
 
     def scores(self, labels: Complex[Tensor, "k e s"], values: Complex[Tensor, "k e s"]) -> dict[str, Tensor]:
-        """SNR of each link, with its phase and without [dB].
+        """SNR of each link, with its phase and without, SINAD [dB], and the powers of error and label.
 
         Raises:
             ValueError: As for every task; or a label is zero throughout, and has no SNR.
@@ -85,34 +94,50 @@ class Csi(Task):
                 f"labels must not be zero throughout, got {int((power == 0).sum())} such channels; leave them out"
             )
         phase = torch.polar(torch.ones_like(power), (guess.conj() * h).sum(1).angle())
+        error, aligned = ((h - turned).abs().square().sum(1) for turned in (guess, phase[:, None] * guess))
         return {
-            name: -10 * ((h - turned).abs().square().sum(1) / power).clamp(min=10 ** (-HIGHEST / 10)).log10()
-            for name, turned in (("snr_db", guess), ("snr_aligned_db", phase[:, None] * guess))
+            "snr_db": -decibels(error, power),
+            "snr_aligned_db": -decibels(aligned, power),
+            "sinad_db": -decibels(error, power + error),
+            "error_power": error,
+            "label_power": power,
         }
 
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
-        """Median, mean and percentiles over the links (linear interpolation) of both scores."""
+        """Median, mean and percentiles of both SNRs (linear interpolation), mean SINAD, and the NMSE of all links."""
         need_samples(scores["snr_db"])
         numbers = []
         for snr in (scores["snr_db"], scores["snr_aligned_db"]):
             p10, median, p90 = torch.quantile(snr, snr.new_tensor([0.1, 0.5, 0.9])).tolist()
             numbers += [median, snr.mean().item(), p10, p90]
-        return dict(zip(self.metrics(), numbers, strict=True))
+        nmse = decibels(scores["error_power"].sum(), scores["label_power"].sum())
+        between = scores["sinad_db"].mean().item(), nmse.item()
+        return dict(zip(self.metrics(), [*numbers[:4], *between, *numbers[4:]], strict=True))
+
+    def logged(self, means: dict[str, float]) -> dict[str, float]:
+        """NMSE in place of the powers."""
+        error, power = (torch.tensor(means[name], dtype=torch.float64) for name in ("error_power", "label_power"))
+        kept = {name: mean for name, mean in means.items() if not name.endswith("_power")}
+        return kept | {"nmse_db": decibels(error, power).item()}
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
-        """3 dB more, as half of the difference's power is left."""
-        return {name: (score + 10 * math.log10(2)).clamp(max=HIGHEST) for name, score in scores.items()}
+        """Half of the difference's power is left: 3 dB more."""
+        error, power = scores["error_power"] / 2, scores["label_power"]
+        snr = {name: scores[name] + 10 * math.log10(2) for name in ("snr_db", "snr_aligned_db")}
+        snr = {name: score.clamp(max=HIGHEST) for name, score in snr.items()}
+        return snr | {"sinad_db": -decibels(error, power + error), "error_power": error, "label_power": power}
 
     def figures(self, folder: Path, links) -> dict:
-        """Magnitude, phase and impulse response of the 10th, 50th and 90th percentile, and how SNR is distributed."""
-        from gaigs.report.channels import impulse_responses, magnitudes_and_phases  # matplotlib is slow to import
-        from gaigs.report.curves import cdf
+        """Magnitude, phase and impulse response of the 10th, 50th and 90th percentile, how SNR is distributed, and the
+        links' errors by their power."""
+        from gaigs.report.channels import error_against_power, impulse_responses, magnitudes_and_phases
+        from gaigs.report.curves import cdf  # matplotlib is slow to import
 
         with np.load(folder / "predictions.npz") as run:
-            prefix = f"{self.watched}_"
-            scores = {name.removeprefix(prefix): run[name] for name in run.files if name.startswith(prefix)}
+            stored = lambda kind: {key.removeprefix(kind): run[key] for key in run.files if key.startswith(kind)}
+            scores, errors, powers = (stored(kind) for kind in ("snr_db_", "error_power_", "label_power_"))
             labels, predictions = run["labels"], run["prediction"]
-        own = next(iter(scores.values()))
+        name, own = next(iter(scores.items()))
         order = np.argsort(own)
         names = {order[round(rank * (len(own) - 1))]: name for name, rank in EXAMPLES.items()}
         shown = list(names)
@@ -120,11 +145,19 @@ class Csi(Task):
         figures = {"channels": magnitudes_and_phases(*examples)}
         if len(self.frequencies) > 1:
             figures["impulse_response"] = impulse_responses(*examples)
-        return figures | {"snr_cdf": cdf(scores, "SNR [dB]", "channels", links.split.name, (None, None))}
+        split = links.split.name
+        figures["error_power"] = error_against_power(powers[name], errors, split)
+        return figures | {"snr_cdf": cdf(scores, "SNR [dB]", "channels", split, (None, None))}
 
     @classmethod
     def compared(cls, files: Mapping[str, Path], split: str) -> dict:
         """How SNR is distributed."""
         from gaigs.report.curves import cdf  # matplotlib is slow to import
 
-        return {"cdf": cdf(stored_scores(files, cls.watched), "SNR [dB]", "channels", split, (None, None))}
+        return {"cdf": cdf(stored_scores(files, "snr_db"), "SNR [dB]", "channels", split, (None, None))}
+
+
+def decibels(error: Float[Tensor, "*k"], power: Float[Tensor, "*k"]) -> Float[Tensor, "*k"]:
+    """Of an error's power over a label's; at least -``HIGHEST``."""
+    return 10 * (error / power).clamp(min=10 ** (-HIGHEST / 10)).log10()
+

@@ -16,8 +16,9 @@ from gaigs.testing._checks import PRECISION, fixed_sum, require, require_close, 
 
 def check_aperture(rasterizer, device: torch.device | str) -> None:
     """Fields and lags, and their gradients, against the formulas in float64, on easy scenes and hard ones."""
-    for title, scene in _scenes():
-        for what, truth in (("fields", sum_fields), ("lags", sum_lags)):
+    both = (("fields", sum_fields), ("lags", sum_lags))
+    for title, scene, functions in (*((*named, both) for named in _scenes()), ("a bent array", _bent(), both[:1])):
+        for what, truth in functions:
             true = _sum(truth, what, _cast(scene, "cpu", torch.float64))
             for dtype, tolerance in PRECISION.items():
                 moved = _cast(scene, device, dtype)
@@ -38,15 +39,30 @@ def check_aperture(rasterizer, device: torch.device | str) -> None:
 
 
 def sum_fields(
-    splats: Splats, amplitudes: Tensor, lengths: Tensor, array: Array, carriers: Tensor, offsets: Tensor
+    points: Tensor,
+    semi_axes: Tensor,
+    amplitudes: Tensor,
+    lengths: Tensor,
+    array: Array,
+    carriers: Tensor,
+    offsets: Tensor,
 ) -> Complex[Tensor, "b e s"]:
-    """What each element hears at each frequency: one wave a splat, each with its own phase."""
-    steps = array.elements.to(lengths)[:, :2]
-    delays = lengths / speed_of_light
-    waves = torch.where(splats.visible, amplitudes, 0)[..., None] * torch.exp(
-        -2j * math.pi * delays[..., None] * offsets[:, None]
-    )
-    return torch.einsum("bne,bns->bes", _footprints(splats, steps, carriers), waves)
+    """What each element hears at each frequency: one spherical wave a path, each with its own phase."""
+    hidden = (points == 0).all(-1)
+    points = torch.where(hidden[..., None], torch.ones_like(points), points)
+    covariances = (semi_axes @ semi_axes.mT).expand(len(points), -1, -1, -1)
+    wavenumbers = 2 * math.pi / speed_of_light * carriers[:, None]
+    heard = []
+    for element in array.elements.to(points):
+        ways, own = points.norm(dim=-1), (points - element).norm(dim=-1)
+        units = points / ways[..., None]
+        aside = element - (units @ element)[..., None] * units
+        spread = torch.einsum("bni,bnij,bnj->bn", aside, covariances, aside) / ways.square()
+        strengths = torch.where(hidden, 0, amplitudes) * ways / own * torch.exp(-wavenumbers.square() * spread / 2)
+        delays = (lengths + own - ways) / speed_of_light
+        phases = (wavenumbers * (own - ways))[..., None] + 2 * math.pi * delays[..., None] * offsets[:, None]
+        heard.append((strengths[..., None] * torch.exp(-1j * phases)).sum(1))
+    return torch.stack(heard, 1)
 
 
 def sum_lags(
@@ -90,7 +106,7 @@ def _footprints(splats: Splats, steps: Tensor, carriers: Tensor) -> Complex[Tens
 
 
 def _scenes() -> Iterator[tuple[str, dict]]:
-    """Splats, paths and arrays, each with a title."""
+    """Gaussians as points with axes and as splats, paths and arrays, each with a title."""
     generator = torch.Generator().manual_seed(0)
     # Whole millimetres, since lags are told to nine decimals of a metre.
     places = [[0, 0, 0], [42, -12, 0], [-24, 54, 0], [6, 78, 0]]
@@ -100,9 +116,15 @@ def _scenes() -> Iterator[tuple[str, dict]]:
         random = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
         rows = (b,) if own else ()
         factors = random(*spread, b if own else 1, n, 3) * torch.tensor([1, -1, 1])
-        splats = Splats(random(-0.7, 0.7, *rows, n, 2), factors, random(1, 9, *rows, n), random(0, 1, *rows, n) > 0.1)
+        visible = random(0, 1, *rows, n) > 0.1
+        splats = Splats(random(-0.7, 0.7, *rows, n, 2), factors, random(1, 9, *rows, n), visible)
+        # All around, none nearer than some decimetres but those on the array's middle.
+        points = torch.randn(b, n, 3, generator=generator)
+        points = points + 0.5 * torch.nn.functional.normalize(points, dim=-1)
         return {
             "splats": splats,
+            "points": points * visible[..., None],
+            "semi_axes": random(*spread, b if own else 1, n, 3, 3),
             "amplitudes": torch.randn(b, n, dtype=torch.complex64, generator=generator),
             "lengths": random(0.5, 20, b, n),
             "coherences": random(*coherence, n),
@@ -113,7 +135,7 @@ def _scenes() -> Iterator[tuple[str, dict]]:
         }
 
     yield "random", scene()
-    yield "splats that all queries share", scene(own=False)
+    yield "Gaussians that all queries share", scene(own=False)
     yield "a regular array", scene(array=Array.planar(3, 2, 0.03, "cosine"))
     yield "a single element", scene(array=Array.single())
     yield "one carrier", scene(bandwidth=None)
@@ -129,30 +151,43 @@ def _scenes() -> Iterator[tuple[str, dict]]:
     silent["amplitudes"] *= 0
     yield "silence", silent
     stacked = scene()
-    stacked["splats"].means2d[:] = stacked["splats"].means2d[:, :1].clone()
-    stacked["lengths"][:] = stacked["lengths"][:, :1].clone()
+    for part in (stacked["splats"].means2d, stacked["lengths"], stacked["points"]):
+        part[:] = part[:, :1].clone()
     yield "one on top of the other", stacked
     hidden = scene()
     hidden["splats"].visible[:] = False
+    hidden["points"][:] = 0
     yield "nothing visible", hidden
 
 
-LEAVES = {"fields": ("amplitudes", "lengths"), "lags": ("amplitudes", "lengths", "coherences", "bandwidth")}
-"""What each is differentiable by, beside the splats."""
+def _bent() -> dict:
+    """A scene of fields alone: an array that leaves its plane, larger than some paths are long."""
+    places = torch.tensor([[0, 0, 0], [42, -12, 900], [-240, 540, 30], [6, 0, -78]], dtype=torch.float64) / 1000
+    return next(_scenes())[1] | {"array": Array(places)}
+
+
+LEAVES = {
+    "fields": ("points", "semi_axes", "amplitudes", "lengths"),
+    "lags": ("amplitudes", "lengths", "coherences", "bandwidth"),
+}
+"""What each is differentiable by; lags by their splats, too."""
 
 ARGUMENTS = {
-    "fields": ("amplitudes", "lengths", "array", "carriers", "offsets"),
-    "lags": ("amplitudes", "lengths", "coherences", "bandwidth", "array", "carriers"),
+    "fields": ("points", "semi_axes", "amplitudes", "lengths", "array", "carriers", "offsets"),
+    "lags": ("splats", "amplitudes", "lengths", "coherences", "bandwidth", "array", "carriers"),
 }
 
 
 def _sum(function, what: str, scene: dict) -> dict[str, Tensor]:
     """What a function gives, and the gradients of a fixed sum of it, each times the size of what it is by."""
-    leaves = {"means2d": scene["splats"].means2d, "factors": scene["splats"].factors}
-    leaves |= {name: scene[name] for name in LEAVES[what] if scene[name] is not None}
+    leaves = {name: scene[name] for name in LEAVES[what] if scene[name] is not None}
+    if what == "lags":
+        leaves |= {"means2d": scene["splats"].means2d, "factors": scene["splats"].factors}
     leaves = {name: leaf.detach().clone().requires_grad_() for name, leaf in leaves.items()}
-    splats = replace(scene["splats"], means2d=leaves["means2d"], factors=leaves["factors"])
-    value = function(splats, *(leaves.get(name, scene[name]) for name in ARGUMENTS[what]))
+    inputs = scene | leaves
+    if what == "lags":
+        inputs["splats"] = replace(scene["splats"], means2d=leaves["means2d"], factors=leaves["factors"])
+    value = function(*(inputs[name] for name in ARGUMENTS[what]))
     gradients = torch.autograd.grad(fixed_sum(value), [*leaves.values()], allow_unused=True)
     results = {what: value.detach()}
     for (name, leaf), gradient in zip(leaves.items(), gradients, strict=True):
@@ -178,17 +213,18 @@ def _only_last(scene: dict) -> dict:
     if splats.means2d.ndim == 3:
         parts = splats.means2d[-1:], splats.factors[-1:], splats.depths[-1:], splats.visible[-1:]
         splats = Splats(*parts)
-    rows = {name: scene[name][-1:] for name in ("amplitudes", "lengths", "carriers", "offsets")}
-    return scene | rows | {"splats": splats}
+    rows = ("points", "semi_axes", "amplitudes", "lengths", "carriers", "offsets")
+    return scene | {name: scene[name][-1:] for name in rows} | {"splats": splats}
 
 
 def _check_nan_shows(rasterizer, device: torch.device | str) -> None:
     """What is broken must not vanish."""
-    for name in ("means2d", "factors", "amplitudes"):
-        scene = _cast(next(_scenes())[1], device, torch.float32)
-        splats = scene["splats"]
-        broken = {"means2d": splats.means2d, "factors": splats.factors}.get(name, scene["amplitudes"])
-        broken[:, int(splats.visible[0].int().argmax())] = torch.nan
-        for what, arguments in ARGUMENTS.items():
-            value = getattr(rasterizer, what)(splats, *(scene[argument] for argument in arguments))
+    broken = {"fields": ("points", "semi_axes", "amplitudes"), "lags": ("means2d", "factors", "amplitudes")}
+    for what, names in broken.items():
+        for name in names:
+            scene = _cast(next(_scenes())[1], device, torch.float32)
+            splats = scene["splats"]
+            part = {"means2d": splats.means2d, "factors": splats.factors}.get(name, scene.get(name))
+            part[:, int(splats.visible[0].int().argmax())] = torch.nan
+            value = getattr(rasterizer, what)(*(scene[argument] for argument in ARGUMENTS[what]))
             require(bool(value.isnan().any()), f"NaN in {name} must show as NaN in the {what}")

@@ -12,7 +12,7 @@ from gaigs.data import Links, Parts, Split
 from gaigs.data.nerf2_spectrum import NORMALISATION
 from gaigs.directions import Grid
 from gaigs.geometry import Pose
-from gaigs.query import Query
+from gaigs.query import CARRIERS, Query
 from gaigs.scene import Array, Receiver, Scene
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
@@ -143,7 +143,9 @@ def _check_query(links: Links) -> None:
     if query.frequencies is not None:
         require_tensor("frequencies", query.frequencies, (n,), query.frequencies.dtype)
         require(query.frequencies.dtype.is_floating_point, "frequencies must be floats [Hz]")
-        require(bool((query.frequencies > 0).all()), "frequencies must be positive [Hz]")
+        low, high = CARRIERS
+        holds = (query.frequencies >= low) & (query.frequencies <= high)
+        require(bool(holds.all()), f"frequencies must be from {low:g} to {high:g} Hz")
 
 
 def _check_rows(links: Links) -> None:

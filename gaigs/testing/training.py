@@ -164,11 +164,12 @@ def _check_validation(model: Model, links: Links, metrics: Mapping[str, float]) 
     batch = links.batch(links.split.validation)
     device = next(model.parameters()).device
     values = model.eval().evaluate(batch.to(device)).cpu()
-    for name, scores in links.task.scores(batch.labels, values).items():
+    scores = links.task.scores(batch.labels, values)
+    for name, expected in links.task.logged({name: score.mean().item() for name, score in scores.items()}).items():
         logged = metrics.get(f"validation/{name}")
         require(logged is not None, f"a validation must log validation/{name}, got {', '.join(metrics) or 'nothing'}")
         rule = f"validation/{name} must be the mean over the validation links of what the model evaluates"
-        require_close(torch.tensor(logged), scores.mean(), 1e-4, rule)
+        require_close(torch.tensor(logged), torch.tensor(expected), 1e-4, rule)
 
 
 def _compare(states: list[dict[str, Tensor]], expected: list[dict[str, Tensor]], rule: str) -> None:

@@ -31,7 +31,7 @@ class MeanScores:
             self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """The mean of each score; every process has to ask.
+        """The mean of each score, as ``Task.logged`` has it; every process has to ask.
 
         Args:
             strategy: Lightning's, which knows the processes.
@@ -39,4 +39,4 @@ class MeanScores:
         names = list(self.sums)
         totals = torch.tensor([self.count, *self.sums.values()], dtype=torch.float64, device=strategy.root_device)
         count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()
-        return {name: total / count for name, total in zip(names, sums, strict=True)}
+        return self.task.logged({name: total / count for name, total in zip(names, sums, strict=True)})

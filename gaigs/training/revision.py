@@ -39,8 +39,8 @@ class Revision(Callback):
     def load_state_dict(self, state: dict) -> None:
         self.made = state["made"]
 
-    def on_train_start(self, trainer, module) -> None:
-        if trainer.global_step == 0:
+    def on_train_batch_start(self, trainer, module, *_) -> None:
+        if trainer.global_step == 0:  # behind the validation of models that predict untrained
             self._revise(trainer, module)
 
     def on_train_batch_end(self, trainer, module, *_) -> None:

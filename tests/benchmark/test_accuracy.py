@@ -331,7 +331,7 @@ def test_places_have_tables_and_figures_of_their_own():
 @pytest.mark.parametrize(
     ("task", "score", "title", "error"),
     [("spectrum", 0.9, "1 - mean SSIM", 0.1), ("rssi", 4.0, "MAE [dB]", 4.0),
-     ("csi", 10.0, "squared error over power, at the mean SNR [dB]", 0.1)],
+     ("csi", 10.0, "squared error over power, at the mean SINAD [dB]", 0.1)],
 )  # fmt: skip
 def test_errors_are_above_zero_and_fall_as_scores_get_better(task, score, title, error):
     scale = scale_of(task)

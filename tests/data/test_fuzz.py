@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 
 from gaigs.data import csi_npz, nerf2_rssi, nerf2_spectrum, rssi_csv
-from gaigs.data._files import CARRIERS
 from gaigs.geometry import FAR
+from gaigs.query import CARRIERS
 from gaigs.registry import registry
 
 COUNT = 140

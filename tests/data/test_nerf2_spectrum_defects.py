@@ -154,22 +154,30 @@ DEFECTS = {
     "no index": (lambda f: (f / "test_index.txt").unlink(), "test_index.txt: missing; expected one image number"),
     "frequency negative": (
         lambda f: frequencies(f, 3, "-2.4"),
-        "freq.txt, line 3: expected one carrier from 1e-05 to below 1000 GHz, got '-2.4'",
+        "freq.txt, line 3: expected one carrier from 1e-05 to 300 GHz, got '-2.4'",
     ),
     "frequency zero": (lambda f: frequencies(f, 1, "0"), "freq.txt, line 1: expected one carrier from 1e-05"),
     "frequency in vain": (
         lambda f: frequencies(f, 1, "1e-300"),
-        "freq.txt, line 1: expected one carrier from 1e-05 to below 1000 GHz, got '1e-300'",
+        "freq.txt, line 1: expected one carrier from 1e-05 to 300 GHz, got '1e-300'",
     ),
     "frequency in Hz": (
         lambda f: frequencies(f, 6, "2.4e9"),
-        "line 6: expected one carrier from 1e-05 to below 1000 GHz, got '2.4e9'",
+        "line 6: expected one carrier from 1e-05 to 300 GHz, got '2.4e9'; in Hz?",
+    ),
+    "frequency in MHz": (
+        lambda f: frequencies(f, 1, "920"),
+        "freq.txt, line 1: expected one carrier from 1e-05 to 300 GHz, got '920'; in MHz?",
+    ),
+    "frequency just too high": (
+        lambda f: frequencies(f, 1, "300.001"),
+        "line 1: expected one carrier from 1e-05 to 300 GHz, got '300.001'; in MHz?",
     ),
     "frequency nan": (lambda f: frequencies(f, 2, "nan"), "freq.txt, line 2: expected one carrier from 1e-05"),
     "frequency infinite": (lambda f: frequencies(f, 2, "inf"), "freq.txt, line 2: expected one carrier from 1e-05"),
     "frequency with its unit": (
         lambda f: frequencies(f, 2, "2.4 GHz"),
-        "line 2: expected one carrier from 1e-05 to below 1000 GHz, got '2.4 GHz'",
+        "line 2: expected one carrier from 1e-05 to 300 GHz, got '2.4 GHz'",
     ),
     "frequency blank between": (lambda f: frequencies(f, 2, ""), "freq.txt, line 2: expected one carrier"),
     "frequencies too few": (

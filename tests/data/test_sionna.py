@@ -140,7 +140,7 @@ def test_each_place_sends_at_each_carrier(tracer):
         ({"bandwidth": 0}, "bandwidth must be positive"),
         ({"frequency": []}, "frequency must be a carrier or several different ones"),
         ({"frequency": [5e9, 5e9]}, "frequency must be a carrier or several different ones"),
-        ({"frequency": -5e9}, "frequency must be positive"),
+        ({"frequency": -5e9}, "frequency must be a carrier in Hz"),
     ],
 )
 def test_options_out_of_range_are_refused(options, message):

@@ -58,7 +58,7 @@ def test_a_single_subcarrier_is_the_carrier(links):
         ({"room": "round"}, "room must be one of"),
         ({"subcarriers": 0}, "subcarriers must be at least 1, got 0"),
         ({"bandwidth": 0.0}, r"bandwidth must be positive \[Hz\], got 0.0"),
-        ({"frequency": 0.0}, "frequency must be positive"),
+        ({"frequency": 0.0}, "frequency must be a carrier in Hz"),
         ({"transmitters": 1}, "transmitters must be at least 2"),
     ],
 )

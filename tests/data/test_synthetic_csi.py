@@ -124,7 +124,7 @@ def test_channels_repeat_with_their_seed_alone():
         ({"bandwidth": 0.0}, r"bandwidth must be positive \[Hz\], got 0.0"),
         ({"bandwidth": 14e9}, "frequencies must be positive"),
         ({"frequency": 920e6}, r"frequency must lie in 1e9\.\.40e9 Hz"),
-        ({"frequency": 0.0}, "frequency must be positive"),
+        ({"frequency": 0.0}, "frequency must be a carrier in Hz"),
         ({"transmitters": 1}, "transmitters must be at least 2"),
         ({"order": -1}, "order must be the largest number of reflections"),
     ],

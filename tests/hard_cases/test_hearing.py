@@ -61,16 +61,21 @@ def test_what_an_array_hears(splats, waves, n, coherence, bandwidth):
     size = WAVES[waves]
     amplitudes = size * torch.randn(B, N, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
     lengths = torch.linspace(0, 50, B * N).view(B, N)
+    # Number 4 stands on the array's middle, number 5 on an element, number 6 next to it.
+    ahead = (1 - CENTRES.square().sum(-1, keepdim=True)).sqrt()
+    points = torch.linspace(0.1, 30, N)[:, None] * torch.cat((CENTRES, ahead), -1)
+    points[:, 4:7] = torch.tensor([[0.0, 0, 0], [0.03, -0.03, 0], [0.03, 0.03, 1e-5]])
+    axes = points.norm(dim=-1)[..., None, None] * torch.diag_embed(SPLATS[splats].abs().expand(1, N, 3))
 
-    def ask(_, centres, factors, amplitudes, lengths, coherences):
+    def ask(_, points, axes, centres, factors, amplitudes, lengths, coherences):
         visible = torch.arange(n) != 4
         drawn = Splats(centres, factors, lengths.detach(), visible.expand(B, n))
         carriers, offsets = lengths.new_full((B,), 5e9), lengths.new_tensor([[-1e7, 0, 1e7]]).expand(B, 3)
         band = None if bandwidth is None else lengths.new_tensor(bandwidth)
-        fields = aperture.fields(drawn, amplitudes, lengths, array, carriers, offsets)
+        fields = aperture.fields(points, axes, amplitudes, lengths, array, carriers, offsets)
         lags = aperture.lags(drawn, amplitudes, lengths, coherences, band, array, carriers)
         return (fields, lags) if size <= 1 else (fields / size, lags / size**2)
 
     factors = SPLATS[splats].expand(1, N, 3)
-    leaves = CENTRES[:, :n], factors[:, :n], amplitudes[:, :n], lengths[:, :n], torch.full((n,), coherence)
-    require_same(ask, None, *leaves)
+    leaves = points, axes, CENTRES, factors, amplitudes, lengths
+    require_same(ask, None, *(leaf[:, :n] for leaf in leaves), torch.full((n,), coherence))

@@ -380,3 +380,20 @@ def test_a_receiver_without_known_links_is_refused():
     links.query.receivers[:20] = 0  # the other is heard in the test alone
     with pytest.raises(ValueError, match="on split 'example' there are none of gateway1; choose another split"):
         fitted(links)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-6])
+def test_a_channel_that_is_far_too_loud_is_not_heard_all_over_the_room(factor):
+    """Channels that are alike within a metre, and one that is not."""
+    links = make("csi")
+    places = links.query.transmitters
+    labels = torch.polar(torch.ones(80), places.sum(1))[:, None, None] * links.labels[:1]
+    changed = labels.clone()
+    changed[3] *= factor
+    asked = links.split.test[links.query.receivers[links.split.test] == links.query.receivers[3]]
+    error = {}
+    for name, part in (("plain", labels), ("changed", changed)):
+        model = fitted(replace(links, labels=part), trend={"name": "friis"})  # no gain where phases are not geometry's
+        left = model.predict(links.query[asked]) - labels[asked]
+        error[name] = left.abs().square().mean((1, 2)).median().sqrt().item()
+    assert error["changed"] < 2 * error["plain"] < labels.abs().square().mean().sqrt().item()

@@ -1,6 +1,7 @@
 """What all models share, asked of the splatting pipeline: directions, chunks, questions of every kind, carriers."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from pipeline import NONE, PARTS, watch
 
 from gaigs.directions import Rays
 from gaigs.geometry import ExtrapolationWarning
+from gaigs.model.knn import KNearestNeighbours
 from gaigs.model.path_loss import PathLoss
 from gaigs.query import Batch, Query
 from gaigs.testing import example_links
@@ -248,11 +250,16 @@ def test_batches_are_computed_one_after_the_other(build, monkeypatch):
 @pytest.mark.parametrize(
     ("frequency", "message"),
     [
-        (0.0, r"positive and finite \[Hz\], got 0"),
-        (-1e9, "positive and finite"),
-        (float("nan"), "positive and finite"),
-        ("2 GHz", r"must be positive and finite \[Hz\] in real numbers, got '2 GHz'"),
-        (1e9 + 1j, r"must be positive and finite \[Hz\] in real numbers, got"),
+        (0.0, r"^a frequency must be a carrier in Hz, from 10000 to 3e\+11, got 0$"),
+        (-1e9, r"a carrier in Hz, .* got -1e\+09$"),
+        (math.nan, "a carrier in Hz, .* got nan$"),
+        (math.inf, "a carrier in Hz, .* got inf$"),
+        (0.95, r"a carrier in Hz, .* got 0\.95; in GHz\?$"),
+        (950, r"a carrier in Hz, .* got 950; in MHz\?$"),
+        (9e11, r"a carrier in Hz, .* got 9e\+11$"),
+        (torch.tensor([2.4e9, 5.0]), r"a carrier in Hz, .* got 5; in GHz\?$"),
+        ("2 GHz", "must be a carrier in Hz in real numbers, got '2 GHz'"),
+        (1e9 + 1j, "must be a carrier in Hz in real numbers, got"),
         (torch.tensor([1e9, 2e9]), r"one for each of the \(1,\) positions, got \(2,\)"),
         (1e9, "the training links have no carrier that is known, which says nothing of others; leave frequency out"),
     ],
@@ -305,6 +312,74 @@ def test_one_carrier_goes_without_saying(build, band):
     band = replace(band, query=replace(band.query, frequencies=torch.full((24,), 2e9)))
     model, place = build(scene=band.scene), band.query.transmitters[:1]
     assert torch.equal(model.predict(place), model.predict(place, frequency=2e9))
+
+
+def test_a_band_is_left_with_a_warning(build, band):
+    model, place = build(scene=band.scene), band.query.transmitters[:1]
+    told = r"^2 of 3 positions are asked at 9e\+08 to 6e\+10 Hz, outside .* band of 1e\+09 to 4e\+09 Hz: nothing was"
+    for method in (model.predict, model.predict_batches):
+        with pytest.warns(ExtrapolationWarning, match=told) as warned:
+            values = method(place.expand(3, 3), frequency=torch.tensor([6e10, 2e9, 9e8]))
+        assert torch.cat([*values]).isfinite().all()
+        assert [warning.filename for warning in warned] == [__file__]
+    with pytest.warns(ExtrapolationWarning, match=r"^1 of 1 positions are asked at 6e\+10 Hz, outside"):
+        model.predict(place, frequency=60e9)
+
+
+def test_a_band_ends_at_its_carriers_to_rounding(build, band):
+    model, place = build(scene=band.scene), band.query.transmitters[:1]
+    for frequency in (1e9, 1e9 * (1 - 5e-7), 3e9, 4e9, 4e9 * (1 + 5e-7)):
+        assert model.predict(place, frequency=frequency).isfinite().all()
+    for frequency in (1e9 * (1 - 2e-6), 4e9 * (1 + 2e-6)):
+        with pytest.warns(ExtrapolationWarning, match="1 of 1 positions are asked at"):
+            model.predict(place, frequency=frequency)
+
+
+def test_of_a_querys_frequencies_only_the_range_is_looked_at(build, band):
+    model, place, receiver = build(scene=band.scene), band.query.transmitters[:1], torch.tensor([0])
+    assert model.predict(Query(place, receiver, torch.tensor([60e9]))).isfinite().all()
+    with pytest.raises(ValueError, match=r"must be a carrier in Hz, .* got 60; in GHz\?"):
+        model.predict(Query(place, receiver, torch.tensor([60.0])))
+
+
+CARRIER = 2.437123e9  # of which six digits are another
+
+
+def channels(carriers):
+    """A look-up of channels whose links have these carriers in turn."""
+    links = example_links("csi")
+    frequencies = torch.tensor(carriers)[torch.arange(24) // 2 % len(carriers)] if carriers else None
+    links = replace(links, query=replace(links.query, frequencies=frequencies))
+    model = KNearestNeighbours(links.scene, 3)
+    model.fit(links)
+    return model
+
+
+@pytest.mark.parametrize("carriers", [(), (CARRIER,), (CARRIER, 5e9)])
+@pytest.mark.parametrize("frequency", [0.95, 950, math.nan])
+def test_channels_are_refused_at_what_is_no_carrier(carriers, frequency):
+    with pytest.raises(ValueError, match=f"must be a carrier in Hz, from .*, got {frequency}") as error:
+        channels(carriers).predict([[1.0, 2, 1]], frequency=frequency)
+    assert "\n" not in str(error.value)
+
+
+def test_channels_know_their_own_carrier_alone():
+    model, place = channels((CARRIER,)), [[1.0, 2, 1]]
+    own = model.predict(place)
+    told = "have one carrier, (.*) Hz, which says nothing of others; leave frequency out"
+    for other in (60e9, CARRIER * (1 + 2e-6)):
+        with pytest.raises(ValueError, match=told) as error:
+            model.predict(place, frequency=other)
+    printed = float(re.search(told, str(error.value))[1])
+    for frequency in (CARRIER, printed, model.scene.frequencies, CARRIER * (1 + 5e-7)):
+        assert torch.equal(model.predict(place, frequency=frequency), own)
+    with pytest.raises(ValueError, match="have no carrier that is known, which says nothing of others"):
+        channels(()).predict(place, frequency=60e9)
+
+
+def test_channels_of_several_carriers_warn_outside_their_band():
+    with pytest.warns(ExtrapolationWarning, match=r"at 6e\+10 Hz, outside .* band of 2\.437123e\+09 to 5e\+09 Hz"):
+        channels((CARRIER, 5e9)).predict([[1.0, 2, 1]], frequency=60e9)
 
 
 def test_a_batch_moves(batch):

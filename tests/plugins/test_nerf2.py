@@ -236,7 +236,7 @@ def test_a_run_from_start_to_end(task, tmp_path, monkeypatch):
     data = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}[task]
     few = ("training.thinning.rays=50",) if task == "spectrum" else ()
     config, metrics, model = run(tmp_path, monkeypatch, f"data={data}", *SMALL, *few)
-    assert config["loss"]["name"] == ("nmse" if task == "csi" else "squared")
+    assert config["loss"]["name"] == ("log_relative_error" if task == "csi" else "squared")
     assert metrics["models"].keys() == {"nerf2", "mean"}
     assert type(model).__name__ == "Nerf2"
 
@@ -253,7 +253,7 @@ class Delay(Scalar):
     [
         ({"samples": 1}, "model.samples must be at least 2 a ray, got 1"),
         ({"far": 0.0}, r"model.far must be positive \[m\] or null, got 0"),
-        ({"frequency": -1.0}, r"model.frequency must be positive \[Hz\], got -1"),
+        ({"frequency": -1.0}, r"model\.frequency must be a carrier in Hz, from 10000 to 3e\+11, got -1"),
         ({"rays": [9]}, r"model.rays must be \[rows, columns\], got \[9\]"),
         ({"octaves": -1}, "model.octaves must be at least 0 and at most 30, got -1"),
         ({"octaves": 200}, "model.octaves must be at least 0 and at most 30, got 200"),

@@ -196,7 +196,7 @@ def test_a_trained_models_links_do_not_depend_on_each_other(task):
 def test_a_run_from_start_to_end(task, tmp_path, monkeypatch):
     data = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}[task]
     config, metrics, model = run(tmp_path, monkeypatch, f"data={data}", *SMALL)
-    assert config["loss"]["name"] == ("nmse" if task == "csi" else "squared")
+    assert config["loss"]["name"] == ("log_relative_error" if task == "csi" else "squared")
     assert metrics["models"].keys() == {"nerf_apt", "mean"}
     assert type(model).__name__ == "NerfApt"
 

@@ -202,7 +202,7 @@ def test_it_learns_channels_of_free_space():
 
 def test_a_run_from_start_to_end(tmp_path, monkeypatch):
     config, metrics, model = run(tmp_path, monkeypatch, "data=synthetic_csi", *SMALL)
-    assert config["loss"]["name"] == "nmse"
+    assert config["loss"]["name"] == "log_relative_error"
     assert metrics["models"].keys() == {"newrf", "mean"}
     assert type(model).__name__ == "NeWrf"
     assert (model.origins[0].diff(dim=0).norm(dim=1) > 0.1).all()

@@ -501,7 +501,7 @@ def test_unknown_materials_are_refused(chosen, message):
         ({"room": "nerf2_spectrum"}, "must know the room: one of built_in, l_shape, slanted, furnished, got 'nerf2_sp"),
         ({"depth": 0}, r"model\.depth must be in 1\.\.8, got 0"),
         ({"rays": 0}, r"model\.rays must be at least 1, got 0"),
-        ({"frequency": -1.0}, r"model\.frequency must be positive \[Hz\], or null, got -1"),
+        ({"frequency": -1.0}, r"model\.frequency must be a carrier in Hz, from 10000 to 3e\+11, got -1"),
     ],
 )
 def test_options_out_of_range_are_refused(options, message):

@@ -1,4 +1,4 @@
-"""Sums in the aperture against numpy, averages over frequencies and phases, and maps on a fine grid."""
+"""Sums in the aperture against plane and spherical waves, averages over frequencies and phases, and maps."""
 
 import math
 
@@ -7,8 +7,12 @@ import pytest
 import torch
 from reference import factors_of
 from scipy.constants import speed_of_light
+from scipy.spatial.transform import Rotation
 
+from gaigs.geometry import Pose
 from gaigs.projection import Plane, Splats
+from gaigs.projection.direction_cosine import DirectionCosine
+from gaigs.propagation import free_space
 from gaigs.rasterizer.aperture import Aperture
 from gaigs.rasterizer.torch import TorchRasterizer
 from gaigs.scene import Array
@@ -41,30 +45,70 @@ def lags_of(fields, array):
     return np.stack([products[:, (np.abs(differences - step) < 1e-6).all(-1)].mean(1) for step in steps.numpy()], 1)
 
 
-@arrays
-def test_fields_are_waves_summed_one_by_one(array):
-    splats, amplitudes, lengths = draw()
-    offsets = torch.tensor([[0.0, 1e8], [-2e8, 3e7]], dtype=torch.float64)
-    found = Aperture().fields(splats, amplitudes, lengths, array, carriers(), offsets)
+def plane_waves(splats, amplitudes, lengths, array, offsets):
+    """What each element hears of plane waves from splats, frequency by frequency, far from all of them (b, e, s)."""
     wavenumber = 2 * math.pi * CARRIER / speed_of_light
-    for b in range(2):
-        for e, (x, y, _) in enumerate(array.elements.tolist()):
-            for s in range(2):
-                total = 0
-                for k in range(6):
-                    u, v = splats.means2d[b, k].tolist()
-                    step = wavenumber * np.array([x, y])
-                    spread = step @ splats.covariances2d[b, k].numpy() @ step
-                    delay = lengths[b, k].item() / speed_of_light
-                    wave = np.exp(1j * wavenumber * (u * x + v * y) - spread / 2)
-                    total += amplitudes[b, k].item() * wave * np.exp(-2j * math.pi * offsets[b, s].item() * delay)
-                assert found[b, e, s].item() == pytest.approx(total, rel=1e-9)
+    steps = wavenumber * array.elements[:, :2].double()
+    spread = torch.einsum("ei,bnij,ej->bne", steps, splats.covariances2d.expand(len(lengths), -1, -1, -1), steps)
+    centres = splats.means2d.expand(len(lengths), -1, -1)
+    waves = amplitudes[..., None] * torch.exp(1j * torch.einsum("ei,bni->bne", steps, centres) - spread / 2)
+    turns = torch.exp(-2j * math.pi / speed_of_light * lengths[..., None] * offsets[:, None])
+    return torch.einsum("bne,bns->bes", waves, turns)
+
+
+def turned(array, quaternion):
+    """An array in another orientation."""
+    rotation = torch.from_numpy(Rotation.from_quat(quaternion).as_matrix())
+    return Array(array.elements.double() @ rotation.mT), rotation
+
+
+def test_far_away_fields_are_plane_waves():
+    """Of Gaussians a kilometre away in the directions of splats, as wide as these."""
+    splats, amplitudes, _ = draw(spread=0)
+    ahead = (1 - splats.means2d.square().sum(-1, keepdim=True)).sqrt()
+    points = 1e3 * torch.cat((splats.means2d, ahead), -1)
+    axes = 100 * (torch.rand(2, 6, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5)
+    # So narrow a band that it turns hardly from one element to the next.
+    lengths, offsets = 1e3 + torch.zeros(2, 6).double(), torch.tensor([[0.0, 1e6], [-2e6, 3e5]]).double()
+    seen = DirectionCosine(1e-9).project(points, axes, Pose(torch.zeros(3), torch.eye(3)))
+    expected = plane_waves(seen, amplitudes, lengths, SCATTERED, offsets)
+    found = Aperture().fields(points, axes, amplitudes, lengths, SCATTERED, carriers(), offsets)
+    torch.testing.assert_close(found, expected, rtol=0, atol=0.01 * expected.abs().max().item())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_array_of_any_shape_hears_free_space(dtype):
+    """One path, the direct one: Friis' formula at each element, some of which are a metre from the others."""
+    generator = torch.Generator().manual_seed(0)
+    elements = 0.5 * torch.randn(7, 3, generator=generator, dtype=torch.float64)
+    points = 3 * torch.randn(5, 1, 3, generator=generator, dtype=torch.float64)
+    offsets = torch.linspace(-2e8, 2e8, 4, dtype=torch.float64)
+    expected = free_space((points - elements).norm(dim=-1)[..., None], CARRIER + offsets)
+    lengths = points.norm(dim=-1)
+    amplitudes = torch.polar(1 / lengths, -2 * math.pi * CARRIER / speed_of_light * lengths)
+    given = points.to(dtype), torch.zeros(1, 1, 3, 3, dtype=dtype), amplitudes.to(dtype.to_complex()), lengths.to(dtype)
+    found = Aperture().fields(*given, Array(elements), carriers(5), offsets.expand(5, -1))
+    assert found.dtype == dtype.to_complex()
+    found = found * speed_of_light / (4 * math.pi * (CARRIER + offsets))
+    torch.testing.assert_close(found.to(expected), expected, rtol=0, atol=2e-4 * expected.abs().max().item())
+
+
+def test_an_array_may_be_turned_with_all_it_hears():
+    splats, amplitudes, lengths = draw()
+    points, axes = torch.randn(2, 6, 3).double() + 2, 0.1 * torch.randn(2, 6, 3, 3).double()
+    offsets = torch.tensor([[0.0, 1e8], [-2e8, 3e7]]).double()
+    upright, rotation = turned(ARRAY, (0.3, -0.5, 0.2, 0.7))
+    found = [
+        Aperture().fields(points @ by.mT, by @ axes, amplitudes, lengths, array, carriers(), offsets)
+        for array, by in ((ARRAY, torch.eye(3).double()), (upright, rotation))
+    ]
+    torch.testing.assert_close(*found)
 
 
 @arrays
 def test_lags_of_one_carrier_are_those_of_the_fields(array):
     splats, amplitudes, lengths = draw()
-    fields = Aperture().fields(splats, amplitudes, lengths, array, carriers(), torch.zeros(2, 1))[..., 0]
+    fields = plane_waves(splats, amplitudes, lengths, array, torch.zeros(2, 1))[..., 0]
     ones = torch.ones(6, dtype=torch.float64)
     found = Aperture().lags(splats, amplitudes, lengths, ones, None, array, carriers())
     np.testing.assert_allclose(found.numpy(), lags_of(fields.numpy(), array), atol=1e-6)
@@ -75,7 +119,7 @@ def test_lags_of_a_band_are_averages_over_its_frequencies(bandwidth):
     splats, amplitudes, lengths = draw()
     nodes, weights = np.polynomial.legendre.leggauss(400)
     offsets = torch.from_numpy(nodes * bandwidth / 2).expand(2, -1)
-    fields = Aperture().fields(splats, amplitudes, lengths, ARRAY, carriers(), offsets).numpy()
+    fields = plane_waves(splats, amplitudes, lengths, ARRAY, offsets).numpy()
     each = lags_of(np.moveaxis(fields, 2, 1).reshape(-1, len(ARRAY)), ARRAY).reshape(2, 400, -1)
     expected = np.einsum("s,bsl->bl", weights / 2, each)
     ones = torch.ones(6, dtype=torch.float64)
@@ -89,7 +133,7 @@ def test_where_powers_add_lags_are_averages_over_phases():
     average = 0
     for j in range(7):
         turned = amplitudes * torch.exp(2j * math.pi * j / 7 * torch.arange(6, dtype=torch.float64))
-        fields = Aperture().fields(splats, turned, lengths, ARRAY, carriers(), torch.zeros(2, 1))[..., 0]
+        fields = plane_waves(splats, turned, lengths, ARRAY, torch.zeros(2, 1))[..., 0]
         average = average + lags_of(fields.numpy(), ARRAY) / 7
     found = Aperture().lags(splats, amplitudes, lengths, torch.zeros(6).double(), None, ARRAY, carriers())
     np.testing.assert_allclose(found.numpy(), average, atol=1e-6)
@@ -167,9 +211,7 @@ def test_it_is_a_map_of_faint_splats_on_a_fine_grid():
         waves = torch.complex(*image[0]) / 0.9
         fields = fields + torch.einsum("vu,vue->e", waves, steering) * step**2
     wholes = 2 * math.pi * torch.linalg.det(shared.covariances2d).sqrt()
-    found = Aperture().fields(
-        shared, amplitudes * wholes, torch.zeros(1, 5).double(), ARRAY, carriers(1), torch.zeros(1, 1)
-    )
+    found = plane_waves(shared, amplitudes * wholes, torch.zeros(1, 5).double(), ARRAY, torch.zeros(1, 1))
     scale = found.abs().max().item()
     torch.testing.assert_close(found[0, :, 0], fields, rtol=0, atol=0.01 * scale)
 
@@ -188,25 +230,17 @@ def test_what_hides_what_is_all_that_a_map_has_beyond():
         opacities = torch.full((1, 4), opacity).double()
         image, _ = TorchRasterizer()(shared, torch.view_as_real(amplitudes), opacities, None, plane)
         total = torch.complex(*image[0]).sum() * step**2
-        true = Aperture().fields(
-            shared,
-            amplitudes * opacities * wholes,
-            torch.zeros(1, 4).double(),
-            Array.single(),
-            carriers(1),
-            torch.zeros(1, 1),
-        )
+        dimmed = amplitudes * opacities * wholes
+        true = plane_waves(shared, dimmed, torch.zeros(1, 4).double(), Array.single(), torch.zeros(1, 1))
         missing[opacity] = ((total - true[0, 0, 0]) / true[0, 0, 0]).abs().item()
     assert missing[0.05] < 0.2
     assert missing[0.8] > 2 * missing[0.05]
 
 
-def test_an_array_that_is_not_planar_is_refused():
+def test_lags_of_an_array_that_is_not_planar_are_refused():
     splats, amplitudes, lengths = draw()
     bent = Array(torch.tensor([[0.0, 0, 0], [0.03, 0, 0.01]]))
-    message = r"takes planar arrays, whose elements have z = 0 .* got z up to 0\.01 m; take rasterizer=fastest with"
-    with pytest.raises(ValueError, match=message):
-        Aperture().fields(splats, amplitudes, lengths, bent, carriers(), torch.zeros(2, 1))
+    message = r"takes planar arrays, whose elements have z = 0 .* got z up to 0\.01 m; for spectra take raster"
     for coherence in (0.0, 1.0):
         with pytest.raises(ValueError, match=message):
             Aperture().lags(splats, amplitudes, lengths, torch.full((6,), coherence).double(), None, bent, carriers())

@@ -201,12 +201,20 @@ def test_a_run_of_channels_is_drawn(tmp_path, rng, spy, monkeypatch, subcarriers
     links = Links(query, (Receiver("array", pose, array),), labels, task, split=split)
     own = rng.permutation(np.linspace(-10, 30, 21))
     test = labels[split.test].numpy()
-    np.savez(tmp_path / "predictions.npz", labels=test, prediction=1j * test, snr_db_gaigs=own, snr_db_knn=own[::-1])
+    stored = {"snr_db_gaigs": own, "snr_db_knn": own[::-1]}
+    for name, error in (("gaigs", 2.0), ("gaigs_trend", 1.0), ("knn", 3.0), ("mean", 4.0)):
+        stored |= {f"error_power_{name}": np.full(21, error), f"label_power_{name}": np.full(21, 20.0)}
+    np.savez(tmp_path / "predictions.npz", labels=test, prediction=1j * test, **stored)
+    errors = spy(channels, "error_against_power")
     shown = spy(channels, "magnitudes_and_phases")
     monkeypatch.setattr(style, "DPI", 50)
     files = write_figures(tmp_path, links, None)
     responses = {"impulse_response"} if subcarriers > 1 else set()
-    assert {file.stem for file in files} == {"room", "channels", "snr_cdf"} | responses
+    assert {file.stem for file in files} == {"room", "channels", "snr_cdf", "error_power"} | responses
+    (ax,) = errors[0][1].axes
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == [
+        "SNR 0 dB", "gaigs, NMSE -10.0 dB", "knn, NMSE -8.2 dB"
+    ]  # fmt: skip
     drawn_labels, drawn_predictions, snr, names, drawn_frequencies = shown[0][0]
     assert dict(zip(names, snr, strict=True)) == pytest.approx(
         {"10th percentile": -6, "median": 10, "90th percentile": 26}

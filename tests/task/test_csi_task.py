@@ -8,6 +8,7 @@ from gaigs.task.csi import HIGHEST, Csi
 
 FREQUENCIES = 2.4e9 + 312.5e3 * torch.arange(6, dtype=torch.float64)
 TASK = Csi(3, FREQUENCIES)
+SCORES = ["snr_db", "snr_aligned_db", "sinad_db", "error_power", "label_power"]
 
 
 def snr(labels, values):
@@ -27,9 +28,13 @@ def pairs():
 def test_it_is_the_formula(pairs, dtype):
     labels, values = (part.to(dtype) for part in pairs)
     scores = TASK.scores(labels, values)
-    assert [*scores] == ["snr_db", "snr_aligned_db"]
+    assert [*scores] == SCORES
     assert scores["snr_db"].dtype == torch.float64
     np.testing.assert_allclose(scores["snr_db"], snr(labels, values), rtol=1e-12)
+    power, error = ((abs(part.numpy().astype(np.complex128)) ** 2).sum((1, 2)) for part in (labels, labels - values))
+    np.testing.assert_allclose(scores["label_power"], power, rtol=1e-6)
+    np.testing.assert_allclose(scores["error_power"], error, rtol=1e-6)
+    np.testing.assert_allclose(scores["sinad_db"], 10 * np.log10((power + error) / error), rtol=1e-6)
 
 
 def test_the_phase_removed_is_the_best_there_is(pairs):
@@ -66,18 +71,42 @@ def test_the_unit_of_amplitudes_does_not_matter(pairs):
     here = TASK.scores(*pairs)
     for scale in (1e-18, 1e15):
         there = TASK.scores(*(scale * part for part in pairs))
-        for name, score in here.items():
-            torch.testing.assert_close(there[name], score, rtol=1e-5, atol=1e-4)
+        for name in SCORES[:3]:
+            torch.testing.assert_close(there[name], here[name], rtol=1e-5, atol=1e-4)
+        assert TASK.summarise(there)["nmse_db"] == pytest.approx(TASK.summarise(here)["nmse_db"], abs=1e-4)
 
 
 def test_a_perfect_channel_has_the_highest_snr(pairs):
-    for score in TASK.scores(pairs[0], pairs[0]).values():
-        np.testing.assert_allclose(score, HIGHEST)
+    scores = TASK.scores(pairs[0], pairs[0])
+    for name in SCORES[:3]:
+        np.testing.assert_allclose(scores[name], HIGHEST)
+    assert TASK.summarise(scores)["nmse_db"] == pytest.approx(-HIGHEST)
 
 
 def test_silence_predicts_nothing_of_a_channel(pairs):
-    for score in TASK.scores(pairs[0], torch.zeros_like(pairs[0])).values():
-        np.testing.assert_allclose(score, 0, atol=1e-12)
+    scores = TASK.scores(pairs[0], torch.zeros_like(pairs[0]))
+    for name, expected in zip(SCORES[:3], (0, 0, 10 * np.log10(2)), strict=True):
+        np.testing.assert_allclose(scores[name], expected, atol=1e-12)
+    assert TASK.summarise(scores)["nmse_db"] == pytest.approx(0)
+
+
+def test_a_link_in_deep_shadow_decides_neither_sinad_nor_nmse(pairs):
+    """An SNR of -120 dB, of one link in seven."""
+    labels, values = pairs
+    shadowed = labels.clone()
+    shadowed[6] *= 1e-6
+    here, there = (TASK.summarise(TASK.scores(part, values)) for part in (labels, shadowed))
+    assert there["snr_db_mean"] < here["snr_db_mean"] - 10
+    assert abs(there["sinad_db_mean"] - here["sinad_db_mean"]) < 1
+    assert abs(there["nmse_db"] - here["nmse_db"]) < 1
+
+
+def test_the_log_has_the_nmse_of_all_links(pairs):
+    scores = TASK.scores(*pairs)
+    logged = TASK.logged({name: score.mean().item() for name, score in scores.items()})
+    assert [*logged] == [*SCORES[:3], "nmse_db"]
+    assert logged["nmse_db"] == pytest.approx(TASK.summarise(scores)["nmse_db"])
+    assert logged["sinad_db"] == pytest.approx(scores["sinad_db"].mean().item())
 
 
 def test_the_summary_is_that_of_numpy(pairs):
@@ -88,9 +117,13 @@ def test_the_summary_is_that_of_numpy(pairs):
         p10, p90 = np.percentile(score, [10, 90])
         numbers = {"median": np.median(score), "mean": score.mean(), "p10": p10, "p90": p90}
         expected |= {f"{name}_{what}": number for what, number in numbers.items()}
+        if name == "snr_db":
+            labels, values = (part.numpy().astype(np.complex128) for part in pairs)
+            error, power = (abs(labels - values) ** 2).sum(), (abs(labels) ** 2).sum()
+            expected |= {"sinad_db_mean": scores["sinad_db"].mean().item(), "nmse_db": 10 * np.log10(error / power)}
     summary = TASK.summarise(scores)
     assert [*summary] == [*expected] == [*Csi.metrics()]
-    assert summary == pytest.approx(expected, rel=1e-12)
+    assert summary == pytest.approx(expected, rel=1e-6)
 
 
 def test_predictions_may_carry_a_gradient(pairs):
@@ -100,7 +133,7 @@ def test_predictions_may_carry_a_gradient(pairs):
 def test_both_scores_are_stored(pairs):
     scores = TASK.scores(*pairs)
     stored = TASK.stored(*pairs, scores)
-    assert [*stored] == ["snr_db", "snr_aligned_db"]
+    assert [*stored] == SCORES
     np.testing.assert_array_equal(stored["snr_db"], scores["snr_db"])
 
 

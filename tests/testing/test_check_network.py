@@ -10,7 +10,7 @@ from gaigs.deformation import Deformation, Residuals
 from gaigs.deformation.two_branch import TwoBranch
 from gaigs.loss.absolute import Absolute
 from gaigs.loss.l1_ssim import L1Ssim
-from gaigs.loss.nmse import Nmse
+from gaigs.loss.relative_error import RelativeError
 from gaigs.loss.squared import Squared
 from gaigs.placement import Placed
 from gaigs.testing import (
@@ -183,12 +183,12 @@ class Changing(Absolute):
         return loss, terms | ({"large": loss} if loss > 5 else {})
 
 
-class Pooled(Nmse):
+class Pooled(RelativeError):
     """The errors of all links over the powers of all."""
 
     def __call__(self, values, batch):
         loss = (values - batch.labels).abs().square().sum() / batch.labels.abs().square().sum()
-        return loss, {"nmse": loss}
+        return loss, {"relative_error": loss}
 
 
 class Strided(L1Ssim):

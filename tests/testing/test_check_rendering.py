@@ -145,8 +145,15 @@ def test_a_broken_rasterizer_is_found(rasterizer, message):
 class Unseeing(Aperture):
     """Takes what has no direction for visible."""
 
-    def fields(self, splats, *others):
-        return super().fields(replace(splats, visible=torch.ones_like(splats.visible)), *others)
+    def fields(self, points, *others):
+        return super().fields(points + (points == 0).all(-1, keepdim=True), *others)
+
+
+class Flat(Aperture):
+    """Has waves as strong at all elements as in the middle."""
+
+    def fields(self, points, semi_axes, amplitudes, lengths, *others):
+        return super().fields(1e3 * points, 1e3 * semi_axes, amplitudes, lengths, *others)
 
 
 class Pointed(Aperture):
@@ -170,8 +177,9 @@ class Conjugated(Aperture):
 
 
 class Silenced(Aperture):
-    def fields(self, splats, amplitudes, *others):
-        return super().fields(splats, torch.view_as_complex(torch.view_as_real(amplitudes).nan_to_num()), *others)
+    def fields(self, points, semi_axes, amplitudes, *others):
+        told = torch.view_as_complex(torch.view_as_real(amplitudes).nan_to_num())
+        return super().fields(points, semi_axes, told, *others)
 
 
 class Averaged(Aperture):
@@ -183,7 +191,8 @@ class Averaged(Aperture):
 @pytest.mark.parametrize(
     ("rasterizer", "message"),
     [
-        (Unseeing, "random: fields must be that of the formula"),
+        (Unseeing, "fields must be that of the formula"),
+        (Flat, "random: fields must be that of the formula"),
         (Pointed, "random: lags must be that of the formula"),
         (Narrowband, "random: lags must be that of the formula"),
         (Unlearnt, "random: gradient of lags by coherences must be that of the formula"),

@@ -12,7 +12,7 @@ from torch.optim.lr_scheduler import ConstantLR
 from gaigs.checkpoint import KEY
 from gaigs.loss.absolute import Absolute
 from gaigs.loss.huber import Huber
-from gaigs.loss.nmse import Nmse
+from gaigs.loss.relative_error import RelativeError
 from gaigs.loss.squared import Squared
 from gaigs.model import Model, Prediction
 from gaigs.registry import registry
@@ -385,7 +385,7 @@ def test_complex_channels_are_trained_and_scored_by_snr(links, tmp_path):
     generator = torch.Generator().manual_seed(0)
     labels = torch.randn(12, 2, 5, dtype=torch.complex64, generator=generator)
     channels = replace(links, labels=labels, task=Csi(2, 1e9 + 1e6 * torch.arange(5)))
-    options = {"loss": Nmse(channels.task), "thinning": {}, "penalties": {}, "learning_rates": {"network": 0.1}}
+    options = {"loss": RelativeError(channels.task), "thinning": {}, "penalties": {}, "learning_rates": {"network": 0.1}}
     module = make_module(channels, Slope(channels.scene), jitter=0.01, **options)
     trainer = fit(module, channels, tmp_path, 5)
     assert module.model.slope.item() != 2.0

@@ -1,6 +1,5 @@
 """Rooms that are no boxes, simulated by the independent ray tracer Sionna RT."""
 
-import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -18,7 +17,7 @@ from gaigs.data.sionna.tracing import frequency_offsets, respond
 from gaigs.data.synthetic import SIDE, last_fifth
 from gaigs.data.synthetic.image_source import bartlett, min_max
 from gaigs.directions import Grid
-from gaigs.query import Query
+from gaigs.query import Query, check_carrier
 from gaigs.registry import check_type, register
 from gaigs.scene import Array, Receiver
 from gaigs.task.spectrum import Spectrum
@@ -57,10 +56,9 @@ def traced_room(
     carriers = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
     for carrier in carriers:
         check_type("frequency", carrier, float)
+        check_carrier("frequency", carrier)
     if not carriers or len(set(carriers)) < len(carriers):
         raise ValueError(f"frequency must be a carrier or several different ones [Hz], got {frequency}")
-    if not min(carriers) > 0:
-        raise ValueError(f"frequency must be positive [Hz], got {frequency}")
     if spectrum not in ("band", "carrier"):
         raise ValueError(f"spectrum must be 'band' or 'carrier', got {spectrum!r}")
     walls = find_room(room)
@@ -103,10 +101,9 @@ def patch_array(room: Room, frequency: float) -> Receiver:
     """A room's receiver: a square array of patches, half a wavelength of the frequency [Hz] apart.
 
     Raises:
-        ValueError: The frequency is not positive.
+        ValueError: The frequency is out of range.
     """
-    if not 0 < frequency < math.inf:
-        raise ValueError(f"frequency must be positive [Hz], got {frequency}")
+    check_carrier("frequency", frequency)
     return Receiver("gateway1", room.pose(), Array.planar(SIDE, SIDE, speed_of_light / frequency / 2, "cosine"))
 
 

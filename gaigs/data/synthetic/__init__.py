@@ -1,7 +1,6 @@
 """The built-in scene: a furnished room, simulated by the image-source method."""
 
 import itertools
-import math
 from collections.abc import Sequence
 from functools import partial
 
@@ -15,7 +14,7 @@ from gaigs.data.nerf2_spectrum import NORMALISATION
 from gaigs.data.synthetic.image_source import Box, Room, bartlett, frequency_offsets, is_free, min_max, respond
 from gaigs.directions import Grid
 from gaigs.geometry import Pose
-from gaigs.query import Query
+from gaigs.query import Query, check_carrier
 from gaigs.registry import check_type, register
 from gaigs.scene import Array, Receiver
 from gaigs.task.spectrum import Spectrum
@@ -75,10 +74,9 @@ def furnished_room(
     carriers = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
     for carrier in carriers:
         check_type("frequency", carrier, float)
+        check_carrier("frequency", carrier)
     if not carriers or len(set(carriers)) < len(carriers):
         raise ValueError(f"frequency must be a carrier or several different ones [Hz], got {frequency}")
-    if not min(carriers) > 0:
-        raise ValueError(f"frequency must be positive [Hz], got {frequency}")
     positions = place(transmitters, seed)
     receiver = patch_array(max(carriers))
     grid = Grid.degrees()
@@ -101,10 +99,9 @@ def patch_array(frequency: float) -> Receiver:
     """The default room's receiver: a square array of patches, half a wavelength of the frequency [Hz] apart.
 
     Raises:
-        ValueError: The frequency is not positive.
+        ValueError: The frequency is out of range.
     """
-    if not 0 < frequency < math.inf:
-        raise ValueError(f"frequency must be positive [Hz], got {frequency}")
+    check_carrier("frequency", frequency)
     return Receiver("gateway1", POSE, Array.planar(SIDE, SIDE, speed_of_light / frequency / 2, "cosine"))
 
 

@@ -1,9 +1,8 @@
-"""GSRF's loss: three terms of spectra, one of levels and of channels."""
+"""GSRF's loss: three terms of spectra, one of levels."""
 
 from torch import Tensor
 
 from gaigs.loss.l1_ssim import find_window, structural_similarity
-from gaigs.loss.nmse import Nmse
 from gaigs.query import Batch
 from gaigs.task import Task
 from gaigs_gsrf.mean_amplitude import RANGE
@@ -16,8 +15,7 @@ L1, SSIM, FOURIER = 0.44, 0.37, 0.19
 
 
 class GsrfLoss:
-    """Of spectra 0.44 L1 + 0.37 (1 - SSIM) + 0.19 Fourier; of levels the squared error of amplitudes; of channels the
-    normalised squared error.
+    """Of spectra 0.44 L1 + 0.37 (1 - SSIM) + 0.19 Fourier; of levels the squared error of amplitudes.
 
     The SSIM window spans 11 pixels of the label's own grid; its weights are uniform, as those of ``l1_ssim``. The
     Fourier term is the mean squared difference of the two-dimensional discrete Fourier transforms, in the form that
@@ -26,12 +24,16 @@ class GsrfLoss:
     Args:
         task: Whose labels are compared.
 
-    Source: GSRF (NeurIPS 2025), but for channels, whose loss is not published.
+    Raises:
+        ValueError: The labels are complex: a loss of channels is not published.
+
+    Source: GSRF (NeurIPS 2025).
     """
 
     def __init__(self, task: Task):
-        self.directions, self.is_complex = task.directions, task.dtype.is_complex
-        self.nmse = Nmse(task) if self.is_complex else None
+        if task.dtype.is_complex:
+            raise ValueError("loss 'gsrf' takes spectra or levels, got complex labels; take loss=log_relative_error")
+        self.directions = task.directions
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms; see ``gaigs.loss.Loss``.
@@ -39,8 +41,6 @@ class GsrfLoss:
         Raises:
             ValueError: The batch asks for a list of directions, which has no windows, or for fewer than 3 x 3.
         """
-        if self.is_complex:
-            return self.nmse(values, batch)
         errors = values - batch.labels
         if self.directions is None:
             squared = (errors / RANGE).square().mean()

@@ -11,7 +11,7 @@ from gaigs.data import Links
 from gaigs.directions import Directions, Grid
 from gaigs.geometry import magnitudes
 from gaigs.propagation import array_sign, check_elements, direct_waves, phase_sign
-from gaigs.query import Query
+from gaigs.query import Query, check_carrier
 from gaigs.scene import Scene
 
 REACH = 0.025
@@ -167,8 +167,7 @@ def make_reading(scene: Scene, rays: list[int], frequency: float) -> Reading:
         )
     if len(rays) != 2:
         raise ValueError(f"model.rays must be [rows, columns], got {rays}")
-    if not 0 < frequency < math.inf:
-        raise ValueError(f"model.frequency must be positive [Hz], got {frequency}")
+    check_carrier("model.frequency", frequency)
     match task.name:
         case "spectrum":
             return Spectrum()

@@ -27,7 +27,8 @@ class LabelImage(nn.Module):
     | complex channel | elements | subcarriers | 2: real and imaginary part |
 
     A spectrum's image has every so-manieth row and column of the label, and between them it is interpolated linearly.
-    Complex labels are scaled to a mean power of 1 and not shifted: 0 means the same at every phase.
+    Complex labels are scaled by the median link's amplitude, which no single link rules, and not shifted: 0 means the
+    same at every phase.
 
     Args:
         scene: Whose labels.
@@ -58,12 +59,17 @@ class LabelImage(nn.Module):
 
     def fit(self, links: Links) -> None:
         """Takes mean and scale from the training links."""
+        if self.task.dtype.is_complex:
+            parts = [links.labels[index].flatten(1).to(torch.complex128) for index in links.split.train.split(PART)]
+            powers = torch.cat([part.abs().square().mean(1) for part in parts])
+            self.scale.fill_(powers.quantile(0.5).sqrt())
+            return
         total, power, count = 0.0, 0.0, 0
         for index in links.split.train.split(PART):
             labels = links.labels[index]
             labels = labels.to(torch.promote_types(labels.dtype, torch.float64))
-            total += 0.0 if labels.is_complex() else labels.sum().item()
-            power += labels.abs().square().sum().item()
+            total += labels.sum().item()
+            power += labels.square().sum().item()
             count += labels.numel()
         mean = total / count
         variance = power / count - mean**2

@@ -13,8 +13,8 @@ from gaigs.data.sionna.tracing import frequency_offsets, respond
 from gaigs.data.synthetic.image_source import MATERIALS, Paths
 from gaigs.model import Model, Prediction
 from gaigs.pooling.array_response import ArrayResponse
-from gaigs.propagation import carriers, check_elements, direct_waves, free_space, phase_sign
-from gaigs.query import Batch, Query
+from gaigs.propagation import carriers, check_elements, direct_waves, fit_gain, free_space, phase_sign
+from gaigs.query import Batch, Query, check_carrier
 from gaigs.scene import Array, Scene
 
 from .fields import Slabs, gains, padded
@@ -77,8 +77,8 @@ class RayTracing(Model):
         super().__init__(scene)
         if mesh is None:
             check_room(room)
-        if frequency is not None and not 0 < frequency < math.inf:
-            raise ValueError(f"model.frequency must be positive [Hz], or null, got {frequency}")
+        if frequency is not None:
+            check_carrier("model.frequency", frequency)
         if not 1 <= depth <= 8:
             raise ValueError(f"model.depth must be in 1..8, got {depth}")
         if rays < 1:
@@ -158,14 +158,9 @@ class RayTracing(Model):
         for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver
             if is_complex:
-                # Not by least squares: links that are dimmed more than is known would pull it down by decibels.
-                h, guess = labels[own].to(torch.complex128).flatten(1), values[own].to(torch.complex128).flatten(1)
-                sizes, found = h.norm(dim=1), guess.norm(dim=1)
-                heard = (sizes > 0) & (found > 0)
-                if heard.any():
-                    amplitude = (sizes / found)[heard].median().log()
-                    alike = (guess.conj() * h).sum(1)[heard] / (sizes * found)[heard]
-                    self.log_gains[receiver] = torch.stack((amplitude, -int(self.sign) * alike.sum().angle()))
+                gain = fit_gain(labels[own], values[own])
+                if gain != 0:
+                    self.log_gains[receiver] = torch.stack((gain.abs().log(), -int(self.sign) * gain.angle()))
             else:
                 self.log_gains[receiver, 0] = (labels[own] - values[own]).median() / NEPER
         trained = query.receivers.unique()

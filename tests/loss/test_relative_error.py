@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.loss.nmse import Nmse
+from gaigs.loss.relative_error import RelativeError
 from gaigs.query import Batch, Query
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
@@ -14,7 +14,7 @@ TASK = Csi(3, 1e9 + 1e6 * torch.arange(5))
 
 def loss_of(values, labels):
     query = Query(torch.zeros(len(labels), 3), torch.zeros(len(labels), dtype=torch.long))
-    return Nmse(TASK)(values, Batch(query, None, labels))
+    return RelativeError(TASK)(values, Batch(query, None, labels))
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def test_it_is_the_mean_over_links_of_their_normalised_error(pair):
     each = (abs(values - labels) ** 2).sum((1, 2)) / (abs(labels) ** 2).sum((1, 2))
     loss, terms = loss_of(*pair)
     assert loss.item() == pytest.approx(each.mean(), rel=1e-12)
-    assert terms == {"nmse": loss}
+    assert terms == {"relative_error": loss}
 
 
 def test_it_is_the_snr_of_the_score():
@@ -65,5 +65,5 @@ def test_a_perfect_channel_costs_nothing_and_does_not_pull(pair):
 
 
 def test_real_labels_are_refused():
-    with pytest.raises(ValueError, match="'rssi' are real, and loss 'nmse' takes complex channels; take loss=squared"):
-        Nmse(Rssi())
+    with pytest.raises(ValueError, match="'rssi' are real, and loss 'relative_error' takes complex channels; take loss=squared"):
+        RelativeError(Rssi())

@@ -1,5 +1,6 @@
-"""Normalised mean squared error of complex channels."""
+"""The relative error of complex channels."""
 
+from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.geometry import FAINTEST
@@ -8,9 +9,12 @@ from gaigs.registry import register
 from gaigs.task import Task
 
 
-@register("loss", "nmse")
-class Nmse:
-    """The mean over the links of |h - h'|² / |h|²: each link counts alike, however weak its channel is.
+@register("loss", "relative_error")
+class RelativeError:
+    """The mean over the links of r = |h - h'|² / |h|².
+
+    A link in deep shadow, where any prediction is many times too strong, outweighs all others: the least of this mean
+    over a room is next to no prediction at all. ``log_relative_error`` is the loss without that fault.
 
     Args:
         task: Whose labels are compared.
@@ -18,13 +22,16 @@ class Nmse:
     Raises:
         ValueError: The labels are real.
 
-    Source: NeWRF, 2024.
+    Source: NeWRF, 2024, where it is called NMSE.
     """
+
+    name = "relative_error"
 
     def __init__(self, task: Task):
         if not task.dtype.is_complex:
             raise ValueError(
-                f"labels of task {task.name!r} are real, and loss 'nmse' takes complex channels; take loss=squared"
+                f"labels of task {task.name!r} are real, and loss {self.name!r} takes complex channels; take "
+                "loss=squared"
             )
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -33,5 +40,9 @@ class Nmse:
         labels = batch.labels.flatten(1)
         largest = labels.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
         errors, powers = ((part / largest).abs().square().sum(1) for part in (values.flatten(1) - labels, labels))
-        nmse = (errors / powers).mean()
-        return nmse, {"nmse": nmse}
+        loss = self.mean(errors / powers)
+        return loss, {self.name: loss}
+
+    def mean(self, errors: Float[Tensor, "b"]) -> Float[Tensor, ""]:
+        """The loss of relative errors."""
+        return errors.mean()
