@@ -72,15 +72,18 @@ class Aperture:
         points = torch.where(visible[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
         ways = torch.where(visible, ways, 1)[..., None]
         elements = array.elements.to(points)
-        to_elements = (points[:, :, None] - elements).norm(dim=-1).clamp_min(NEAREST)
-        # The difference of two lengths, without the digits that it would lose.
-        longer = (elements.square().sum(-1) - 2 * points @ elements.T) / (to_elements + ways)
-        wavelengths = speed_of_light / carriers.to(points)[:, None, None]
-        units = points / ways
-        aside = elements - (units @ elements.T)[..., None] * units[:, :, None]  # as the point sees the element
-        turns = (aside @ semi_axes) * (2 * math.pi / (wavelengths * ways))[..., None]
-        weights = (turns.square().sum(-1) / -2).exp() * (ways.clamp_min(NEAREST) / to_elements)
-        waves = torch.where(visible, amplitudes, 0)[..., None] * polar(weights, -2 * math.pi / wavelengths * longer)
+        # By how much squares differ, so that the difference of two lengths loses no digits.
+        more = elements.square().sum(-1) - 2 * points @ elements.T
+        to_elements = (ways.square() + more).clamp_min(NEAREST**2).sqrt()
+        longer = more / (to_elements + ways)
+        wavenumbers = 2 * math.pi / speed_of_light * carriers.to(points)[:, None, None]
+        # Semi-axes across the way, in radians as the middle sees them.
+        units = (points / ways)[..., None]
+        across = (semi_axes - units * (units * semi_axes).sum(-2, keepdim=True)) * (wavenumbers / ways)[..., None]
+        turns = (elements @ across.movedim(-2, 0).flatten(1)).view(len(elements), *across.shape[:2], 3)
+        spread = turns.square().sum(-1).movedim(0, -1)
+        weights = (spread / -2).exp() * (ways.clamp_min(NEAREST) / to_elements)
+        waves = torch.where(visible, amplitudes, 0)[..., None] * polar(weights, -wavenumbers * longer)
         reach = float(elements.norm(dim=-1).amax()) / speed_of_light
         rates = -2 * math.pi * offsets.to(lengths)
         turned = lambda delays: torch.polar(torch.ones_like(delays), delays)
