@@ -639,3 +639,20 @@ def test_rssi_that_learns_nothing_keeps_its_trend(tmp_path):
     rssi_run(tmp_path, "training.learning_rates.signal=1e3", "training.learning_rates.network=0")
     best, last = (torch.load(tmp_path / f"{name}.ckpt", weights_only=True) for name in ("best", "last"))
     assert (best["global_step"], last["global_step"]) == (0, 6)
+
+
+def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path):
+    """Whatever the steps do: here they drive all apart. The start is looked at before the first revision."""
+    options = (
+        "+experiment=mirrored_csi", "data.transmitters=60", "split.validation=0.5", "kriging=false", "baselines=[{name: friis}]",
+        "trainer.max_steps=6", "trainer.val_check_interval=3", *SMALL[9:11],
+        "training.learning_rates={planes: 10, paths: 10, obstacles: 10}",
+    )  # fmt: skip
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config = OmegaConf.to_container(compose("config", [*options]), resolve=True)
+    metrics = experiment.run(config, tmp_path)
+    own, free_space = (metrics["validation"][name] for name in ("mirrored", "friis"))
+    for name in ("sinad_db_mean", "snr_db_median", "nmse_db"):
+        assert own[name] == pytest.approx(free_space[name], abs=1e-2)
+    assert (metrics["paths_kept"], metrics["planes_kept"]) == (1, 0)
+    assert gaigs.load(tmp_path / "best.ckpt").predict([[1.0, 2.0, 1.5]]).abs().max() > 0
