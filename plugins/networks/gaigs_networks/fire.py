@@ -23,7 +23,7 @@ class Fire(Network):
     A prediction has no label to look at, and takes the mean of the prior, z = 0.
 
     The penalty ``kl`` is KL over the count of numbers in an image, in the unit of a mean squared error: times the
-    variance of the labels; of complex ones times 1, as their error is relative to their power. With the weight 2 s, it
+    variance of the labels; of complex ones times 1, as their loss has no unit. With the weight 2 s, it
     is the bound on the likelihood of labels with independent noise of s times their variance.
 
     Args:
