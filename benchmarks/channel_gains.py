@@ -4,8 +4,8 @@
     python benchmarks/channel_gains.py l_shape slanted furnished         rooms of the ray tracer; needs gaigs[sionna]
 
 Gains are fitted to the training links, scores are of the validation links, a quarter of those that are not tested on.
-Prints a table in Markdown: median SNR and mean SINAD [dB], and by how much the gain changes [dB] where one training link
-is 1e-6 of what it was, ten are 1e-3, and one is 1e3. docs/results.md has the numbers.
+Prints a table in Markdown: median SNR and mean SINAD [dB], and by how much the gain changes [dB] where one training
+link is 1e-6 of what it was, ten are 1e-3, and one is 1e3. docs/results.md has the numbers.
 """
 
 import sys

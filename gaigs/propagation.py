@@ -13,6 +13,9 @@ from gaigs.scene import Scene
 NEAREST = 1e-2
 """Smaller distances count as this one [m]: at 0 a spherical wave has no value."""
 
+TELLING = 5
+"""Fewest links a receiver that can tell a sign: of fewer chance may keep all of the power."""
+
 KEPT = 0.01
 """Share of the channels' power that must follow the direct distance for a sign to be told, beside what chance keeps."""
 
@@ -148,12 +151,27 @@ def fit_gain(channels: Complex[Tensor, "k *shape"], waves: Complex[Tensor, "k *s
     return (sizes / strengths)[heard].quantile(0.5) * alike.sum().sgn()
 
 
+def strength(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, "k"]) -> float:
+    """How strong channels are over waves: the median link's amplitude of each receiver, their geometric mean.
+
+    Args:
+        channels, waves: As for ``fit_gain``.
+        receivers: Of each link.
+
+    Returns:
+        The strength; 1 where nothing is heard.
+    """
+    gains = [fit_gain(channels[own], waves[own]).abs() for own in (receivers == k for k in receivers.unique())]
+    heard = [gain.log() for gain in gains if gain > 0]
+    return torch.stack(heard).mean().exp().item() if heard else 1.0
+
+
 def phase_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, "k"]) -> int:
     """The sign with which the phases of channels follow the direct distance.
 
     The direct path alone, over free space, would be one number at all links of a receiver. What the mean over links
-    keeps of the power is compared for both signs; by chance alone it is about one part in the number of links. All links
-    count alike, however weak or loud they are.
+    keeps of the power is compared for both signs; by chance alone it is about one part in the number of links. All
+    links count alike, however weak or loud they are.
 
     Args:
         channels: Measured.
@@ -161,7 +179,8 @@ def phase_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s
         receivers: Of each link.
 
     Returns:
-        -1 or 1; 0 where neither keeps ``KEPT`` more than four times what chance does.
+        -1 or 1; 0 where neither keeps ``KEPT`` more than four times what chance does. Of fewer than ``TELLING`` links a
+        receiver none can.
     """
     relative, phases = _normalised(channels / waves.abs()), waves.angle()
     kept = {-1: 0.0, 1: 0.0}

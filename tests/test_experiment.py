@@ -644,8 +644,8 @@ def test_rssi_that_learns_nothing_keeps_its_trend(tmp_path):
 def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path):
     """Whatever the steps do: here they drive all apart. The start is looked at before the first revision."""
     options = (
-        "+experiment=mirrored_csi", "data.transmitters=60", "split.validation=0.5", "kriging=false", "baselines=[{name: friis}]",
-        "trainer.max_steps=6", "trainer.val_check_interval=3", *SMALL[9:11],
+        "+experiment=mirrored_csi", "data.transmitters=60", "split.validation=0.5", "kriging=false",
+        "baselines=[{name: friis}]", "trainer.max_steps=6", "trainer.val_check_interval=3", *SMALL[9:11],
         "training.learning_rates={planes: 10, paths: 10, obstacles: 10}",
     )  # fmt: skip
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):

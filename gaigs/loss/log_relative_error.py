@@ -10,7 +10,7 @@ from gaigs.task import Task
 
 @register("loss", "log_relative_error")
 class LogRelativeError(RelativeError):
-    """The mean over the links of ln(1 + r / floor), r = |h - h'|² / |h|²: next to the SNR, in which each link has a vote.
+    """The mean over the links of ln(1 + r / floor), r = |h - h'|² / |h|²: near the SNR in dB, each link with one vote.
 
     A link pulls by r / (r + floor) of what it would pull by if its error had to vanish: by 1 at the most, however deep
     its shadow is, and by less and less once its error is below the floor.

@@ -97,7 +97,7 @@ def damping(
     for receiver in receivers.unique():
         own = receivers == receiver
         most = LOUDEST * labels[own].quantile(0.5)
-        factors[own] = most / residuals[own].clamp_min(most)
+        factors[own] = torch.where(residuals[own] > most, most / residuals[own], 1)
     return factors.float()
 
 

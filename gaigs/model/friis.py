@@ -7,7 +7,7 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.model import Model, Prediction
 from gaigs.model._known import known_links
-from gaigs.propagation import check_elements, direct_gains, direct_waves, fit_gain, phase_sign
+from gaigs.propagation import TELLING, check_elements, direct_gains, direct_waves, fit_gain, phase_sign
 from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.scene import Scene
@@ -19,7 +19,8 @@ class Friis(Model):
 
     a is the elements' pattern towards the transmitter. The gain, ``fit_gain`` of the known links, stands for transmit
     power, cables and the clock's phase. The sign of the phase is what the known links show, as either time convention
-    is in use. Where they show none, as without a common clock, no gain is better than 0. NaN until it is fitted.
+    is in use. Where they show none, as without a common clock, no gain is better than 0; of fewer than ``TELLING``
+    links a receiver the sign is -1. NaN until it is fitted.
 
     Raises:
         ValueError: The labels are no channels, or an array has another number of elements than they.
@@ -47,7 +48,8 @@ class Friis(Model):
         sign = phase_sign(labels, waves, query.receivers)
         self.sign.fill_(sign or -1)
         self.gains.zero_()
-        for receiver, own in enumerate(known if sign else ()):
+        is_told = sign != 0 or len(index) < TELLING * len(known)
+        for receiver, own in enumerate(known if is_told else ()):
             self.gains[receiver] = fit_gain(links.labels[own], self._waves(links.query[own])).to(self.gains)
 
     def forward(self, batch: Batch) -> Prediction:

@@ -309,7 +309,8 @@ class GaussianSplatting(Model):
             return self.rasterizer.fields(*heard)
         splats = self._splats(stands, axes, which, receiver)
         coherences = lengths.new_ones(n) if placed.coherences is None else placed.coherences
-        return self.rasterizer.lags(splats, amplitudes, lengths, coherences, placed.bandwidth, antenna.array, frequencies)
+        heard = splats, amplitudes, lengths, coherences, placed.bandwidth, antenna.array, frequencies
+        return self.rasterizer.lags(*heard)
 
     def _carriers(self, query: Query) -> Float[Tensor, "b"]:
         """The links' frequencies [Hz]; single antennas hear powers alike at any, so they need none."""

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -10,12 +9,11 @@ from jaxtyping import Bool, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.data import Links, Split
+from gaigs.data import Links
 from gaigs.model import _learnt_room
 from gaigs.model._plane_search import fewer, find_planes
-from gaigs.model.friis import Friis
 from gaigs.model.gaigs import GaussianSplatting
-from gaigs.propagation import carriers
+from gaigs.propagation import carriers, direct_gains, direct_waves, fit_gain
 from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.report.shapes import LearntRoom
@@ -33,6 +31,9 @@ TOLERANCE = 1e-3
 BANDWIDTHS = (0.01, 1.0, 3.0, 10.0, 30.0, 100.0)
 """Tried where the data say none, times the speed of light over the room's diagonal: from a carrier, where all paths
 interfere, to a band in which hardly two do."""
+
+QUIET = 0.1
+"""Amplitude of the start over the channels' where free space has no gain: louder it would be worse than nothing."""
 
 STEPS = 10
 """Steps of that search a wavelength: a reflected path changes by twice of it."""
@@ -60,17 +61,20 @@ class Mirrored(GaussianSplatting):
     def fit(self, links: Links) -> None:
         """As the pipeline's; and remembers some places, by which the paths' powers are told.
 
-        Channels start from free space as ``friis`` has it, fitted to the training links alone; where that has no gain,
-        from the median link's strength.
+        Channels start from free space with each receiver's gain over its training links, as ``friis`` has it. Where
+        phases say nothing, they start ``QUIET``.
         """
         super().fit(links)
         self.places = _learnt_room.some(links.query[links.split.train])
         if not self.scene.task.dtype.is_complex:
             return
-        split, free_space = links.split, Friis(self.scene)
-        free_space.fit(replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation)))
-        gains = torch.where(free_space.gains == 0, 1, free_space.gains / self.pooling.strength)
-        self.placement.strip(gains.conj() if self.pooling.array_sign > 0 else gains)
+        train, sign, frequencies = links.split.train, int(self.pooling.sign), self.scene.task.frequencies
+        labels, query = links.labels[train], links.query[train]
+        waves = direct_gains(self.scene, query)[:, None, None] * direct_waves(self.scene, query, frequencies, sign)
+        own = [query.receivers == receiver for receiver in range(len(self.scene.receivers))]
+        gains = torch.stack([fit_gain(labels[some], waves[some]) for some in own]) / self.pooling.strength
+        gains = torch.where((gains != 0) & (sign != 0), gains, QUIET)
+        self.placement.strip(gains.conj() if sign > 0 else gains)
         self.placement.sharpen(speed_of_light / self.scene.task.frequencies.mean().item())
 
     @property

@@ -68,11 +68,13 @@ class Mirrored(Placement):
     In projective geometric algebra a plane is a vector, and its sandwich product mirrors. Planes are shared by all
     paths and receivers, so direction, path length L and spreading follow from geometry. The field of path k is
 
-        a_k = F(u_k) / L_k  exp(g_k + g_r + j phi_k - tau_k - j 2 pi L_k / lambda)  prod_w exp(g_w) Gamma_w(theta)
+        a_k = F(u_k) / L_k  exp(g_k + g_r + j phi_k + j phi_r - tau_k - j 2 pi L_k / lambda)
+              prod_w exp(g_w) Gamma_w(theta)
 
     with F the element's pattern towards the image, times a learnt power of the cosine; g and phi a path's own gain and
-    phase, g_r a receiver's gain, g_w a plane's, which falls off as a Gaussian about the plane's middle; Gamma_w
-    Fresnel's reflection with a learnt permittivity; and tau_k the optical depth of the obstacles along the folded path.
+    phase, g_r a receiver's gain and of channels phi_r its phase, g_w a plane's, which falls off as a Gaussian about the
+    plane's middle; Gamma_w Fresnel's reflection with a learnt permittivity; and tau_k the optical depth of the
+    obstacles along the folded path.
     Polarisation is taken as vertical: TE at upright planes, TM at level ones, by n_z² in between. A path that does not
     meet its planes in their order does not exist.
 
@@ -191,8 +193,13 @@ class Mirrored(Placement):
         self.kept.copy_(self.words_of(torch.arange(len(planes), device=self.kept.device)))
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        """Planes of earlier checkpoints, which have no pivot, turn about the world's origin."""
+        """Planes of earlier checkpoints, which have no pivot, turn about the world's origin; their channels have no
+        phase of a receiver, and are furnished."""
         state_dict.setdefault(f"{prefix}pivot", torch.zeros_like(self.pivot))
+        if self.receiver_phases is not None:
+            state_dict.setdefault(f"{prefix}receiver_phases", torch.zeros_like(self.receiver_phases))
+            state_dict.setdefault(f"{prefix}is_bare", torch.zeros_like(self.is_bare))
+            state_dict.setdefault(f"{prefix}planned", torch.zeros_like(self.planned))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     # --- the room ---
@@ -322,10 +329,10 @@ class Mirrored(Placement):
         """Field gain of a receiver's elements in its frame; of an array also what was learnt, cos^q."""
         array = self.scene.receivers[receiver].array
         gain = array.gain(directions)
-        if len(array) == 1:
+        normal = self.boresights[receiver]
+        if len(array) == 1 or not normal.any():
             return gain
-        cosines = directions @ self.boresights[receiver].to(directions)
-        return gain * cosines.clamp_min(GRAZING) ** self.directivity
+        return gain * (directions @ normal.to(directions)).clamp_min(GRAZING) ** self.directivity
 
     def _patterns(self, query: Query, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
         """Field gain of the receivers' elements towards points."""

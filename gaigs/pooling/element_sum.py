@@ -10,7 +10,7 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.directions import Directions
 from gaigs.pooling import Pooling, sphere
-from gaigs.propagation import array_sign, check_elements, direct_waves, fit_gain, phase_sign
+from gaigs.propagation import array_sign, check_elements, direct_waves, phase_sign, strength
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene
@@ -22,8 +22,8 @@ class ElementSum(Pooling):
 
     m_f is the map at subcarrier f, complex: its real parts are the map's channels before all imaginary ones. x_e is an
     element's place, a its pattern, w the share of the direction's solid angle. F is the wave of free space over the
-    direct distance d, and g its median strength: the map holds what is relative to them, so that a direct path is the
-    same in it from everywhere.
+    direct distance d, and g the channels' ``strength`` over it: the map holds what is relative to them, so that a
+    direct path is the same in it from everywhere.
 
     The sign s of phases, -1 as for the time dependence exp(+j omega t), or +1, is what the training channels show.
     Where their phases follow the distance with neither sign, as without a common clock, F is its amplitude alone, and s
@@ -57,7 +57,7 @@ class ElementSum(Pooling):
         train = links.split.train
         labels, query = links.labels[train].to(torch.complex128), links.query[train]
         waves = direct_waves(self.scene, query, self.scene.task.frequencies)
-        self.strength.copy_(fit_gain(labels, waves).abs())
+        self.strength.fill_(strength(labels, waves, query.receivers))
         self.sign.fill_(phase_sign(labels, waves, query.receivers))
         self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))
 

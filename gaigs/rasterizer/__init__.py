@@ -36,8 +36,8 @@ class Rasterizer(Protocol):
     not ``visible`` do nothing. Every input but depths is differentiable: means2d, factors, signal, opacities,
     attenuations. A signal may have any number of channels.
 
-    A rasterizer with ``draws_map = False`` is not called. It has two methods instead, with complex amplitudes (b, n) and
-    path lengths (b, n) [m]; ``aperture`` says their arguments. ``fields`` is what each element of an array hears of
+    A rasterizer with ``draws_map = False`` is not called. It has two methods instead, with complex amplitudes (b, n)
+    and path lengths (b, n) [m]; ``aperture`` says their arguments. ``fields`` is what each element of an array hears of
     Gaussians at each frequency (b, e, s), ``lags`` the mean covariance of elements at each of ``array.lags`` (b, l), of
     splats of the plane of direction cosines. ``Pooling.takes`` says which of them is asked for.
 

@@ -8,13 +8,13 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.geometry import magnitudes, polar
-from gaigs.projection import NEAR, Splats
+from gaigs.projection import Splats
 from gaigs.propagation import NEAREST
 from gaigs.registry import register
 from gaigs.scene import Array
 
 WIDE = 3.0
-"""Largest phase by which a band turns over an array [rad] for which its power series is summed: terms then stay small."""
+"""Largest phase by which a band turns over an array [rad] for which a power series is summed: its terms stay small."""
 
 FLAT = 1e-6
 """An array whose elements leave its plane by no more than this is planar [m]: float32 places metres no better."""
@@ -24,8 +24,8 @@ FLAT = 1e-6
 class Aperture:
     """Sums Gaussians in the array's aperture, where a footprint's integral is known.
 
-    As a splat of the plane of direction cosines, one holds in all the amplitude A, spread over directions u about its centre as a Gaussian with covariance S. An
-    element at x, in wavelengths, hears of it
+    As a splat of the plane of direction cosines, one holds in all the amplitude A, spread over directions u about its
+    centre as a Gaussian with covariance S. An element at x, in wavelengths, hears of it
 
         y(x) = A exp(-(2 pi)² x' S x / 2 + j 2 pi x . u)
 
@@ -54,8 +54,8 @@ class Aperture:
         """What each element hears at several frequencies, all paths interfering.
 
         A path is longer to an element by as much as the element is farther from the path's point than the array's
-        middle is, and its wave is weaker by the ratio: a spherical wave, at an array of any shape and orientation. It is
-        weaker too by the footprint above, of the Gaussian as the array's middle sees it.
+        middle is, and its wave is weaker by the ratio: a spherical wave, at an array of any shape and orientation. It
+        is weaker too by the footprint above, of the Gaussian as the array's middle sees it.
 
         Args:
             points: Where the Gaussians stand, in the array's frame [m].
@@ -66,24 +66,22 @@ class Aperture:
             carriers: Of each query [Hz].
             offsets: Frequencies over the carrier [Hz].
         """
-        ways = points.norm(dim=-1)
-        visible = ~(ways < NEAR)  # a point that is NaN is no reason to hide it
-        # One on the middle has no direction: a stand-in keeps values and gradients finite, and it sends nothing.
-        points = torch.where(visible[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
-        ways = torch.where(visible, ways, 1)[..., None]
-        elements = array.elements.to(points)
-        # By how much squares differ, so that the difference of two lengths loses no digits.
-        more = elements.square().sum(-1) - 2 * points @ elements.T
-        to_elements = (ways.square() + more).clamp_min(NEAREST**2).sqrt()
-        longer = more / (to_elements + ways)
+        # Distances below NEAREST count as that: of the amplitudes they are the unit.
+        elements, exact = array.elements.to(points), points.norm(dim=-1, keepdim=True)
+        # Plain differences: by the matrix product an element far from a near point would lose its digits.
+        own = torch.cdist(points, elements, compute_mode="donot_use_mm_for_euclid_dist")
+        to_elements, ways = own.clamp_min(NEAREST), exact.clamp_min(NEAREST)
+        # The difference of two lengths, without the digits that it would lose.
+        both = own + exact
+        longer = (elements.square().sum(-1) - 2 * points @ elements.T) / torch.where(both > 0, both, 1)
+        longer = longer + (to_elements - own) - (ways - exact)
         wavenumbers = 2 * math.pi / speed_of_light * carriers.to(points)[:, None, None]
         # Semi-axes across the way, in radians as the middle sees them.
         units = (points / ways)[..., None]
         across = (semi_axes - units * (units * semi_axes).sum(-2, keepdim=True)) * (wavenumbers / ways)[..., None]
         turns = (elements @ across.movedim(-2, 0).flatten(1)).view(len(elements), *across.shape[:2], 3)
         spread = turns.square().sum(-1).movedim(0, -1)
-        weights = (spread / -2).exp() * (ways.clamp_min(NEAREST) / to_elements)
-        waves = torch.where(visible, amplitudes, 0)[..., None] * polar(weights, -wavenumbers * longer)
+        waves = amplitudes[..., None] * polar((spread / -2).exp() * (ways / to_elements), -wavenumbers * longer)
         reach = float(elements.norm(dim=-1).amax()) / speed_of_light
         rates = -2 * math.pi * offsets.to(lengths)
         turned = lambda delays: torch.polar(torch.ones_like(delays), delays)

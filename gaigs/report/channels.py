@@ -1,5 +1,6 @@
 """Complex channels beside their predictions: over frequency, and as impulse responses over delay."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -26,6 +27,9 @@ DELAYS = 256, 2**14
 
 FAINT = 25
 """A panel of an impulse response ends where all that follows is so far below the label's peak [dB]."""
+
+LABEL = 48
+"""Characters for which an axis of one column has room."""
 
 LOOKS = {
     "predicted": {"color": SKY, "linewidth": 2.4, "markersize": 5},
@@ -205,11 +209,19 @@ def error_against_power(powers: Float[ndarray, "k"], errors: Mapping[str, Float[
         ax = figure.subplots()
         x = 10 * np.log10(powers)
         ax.axline((x.max(), x.max()), slope=1, color="0.75", linewidth=0.8, zorder=0, label="SNR 0 dB")
-        for name, look in zip([own, *baselines[:1]], MARKERS, strict=False):
+        for order, (name, look) in enumerate(zip([own, *baselines[:1]], MARKERS, strict=False)):
             error = np.maximum(errors[name], 1e-14 * powers)  # the highest SNR that is told
             nmse = 10 * np.log10(error.sum() / powers.sum())
-            ax.plot(x, 10 * np.log10(error), linestyle="", markersize=3, label=f"{name}, NMSE {nmse:.1f} dB", **look)
-        ax.set(xlabel="power of the channel [dB]", ylabel="power of the error [dB]", title=f"Test links, split {split}")
+            look = look | {
+                "linestyle": "",
+                "markersize": 3,
+                "zorder": 3 - order,
+                "label": f"{name}, NMSE {nmse:.1f} dB",
+            }
+            ax.plot(x, 10 * np.log10(error), **look)
+        lower, upper = x.min() - 5, x.max() + 5  # of a few links, too, the line of 0 dB has a slope
+        label = textwrap.fill(f"power of the channel [dB], split {split}", LABEL)
+        ax.set(xlabel=label, ylabel="power of the error [dB]", xlim=(lower, upper))
         ax.grid()
         ax.legend()
     return figure

@@ -27,8 +27,9 @@ class Csi(Task):
 
     - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is that after the global phase of the prediction that suits
       the label best, as where receiver and transmitter share no clock.
-    - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²): the SNR, but never below 0. Links in deep shadow may have an SNR of
-      -50 dB, of which a few decide a mean; so the mean SINAD is watched.
+    - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²): near the SNR where that is high, 3 dB for a prediction of 0, and at
+      least 0. Links in deep shadow may have an SNR of -50 dB, of which a few decide a mean; so the mean SINAD is
+      watched.
 
     And of all links together NMSE [dB], 10 log10(sum |e|² / sum |h|²): the error of a link budget, in which loud links
     count most.
@@ -160,4 +161,3 @@ class Csi(Task):
 def decibels(error: Float[Tensor, "*k"], power: Float[Tensor, "*k"]) -> Float[Tensor, "*k"]:
     """Of an error's power over a label's; at least -``HIGHEST``."""
     return 10 * (error / power).clamp(min=10 ** (-HIGHEST / 10)).log10()
-

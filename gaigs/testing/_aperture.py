@@ -10,6 +10,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.projection import Splats
+from gaigs.propagation import NEAREST
 from gaigs.scene import Array
 from gaigs.testing._checks import PRECISION, fixed_sum, require, require_close, require_tensor
 
@@ -48,17 +49,16 @@ def sum_fields(
     offsets: Tensor,
 ) -> Complex[Tensor, "b e s"]:
     """What each element hears at each frequency: one spherical wave a path, each with its own phase."""
-    hidden = (points == 0).all(-1)
-    points = torch.where(hidden[..., None], torch.ones_like(points), points)
     covariances = (semi_axes @ semi_axes.mT).expand(len(points), -1, -1, -1)
     wavenumbers = 2 * math.pi / speed_of_light * carriers[:, None]
+    ways = points.norm(dim=-1).clamp_min(NEAREST)
+    units = points / ways[..., None]
     heard = []
     for element in array.elements.to(points):
-        ways, own = points.norm(dim=-1), (points - element).norm(dim=-1)
-        units = points / ways[..., None]
+        own = (points - element).norm(dim=-1).clamp_min(NEAREST)
         aside = element - (units @ element)[..., None] * units
         spread = torch.einsum("bni,bnij,bnj->bn", aside, covariances, aside) / ways.square()
-        strengths = torch.where(hidden, 0, amplitudes) * ways / own * torch.exp(-wavenumbers.square() * spread / 2)
+        strengths = amplitudes * ways / own * torch.exp(-wavenumbers.square() * spread / 2)
         delays = (lengths + own - ways) / speed_of_light
         phases = (wavenumbers * (own - ways))[..., None] + 2 * math.pi * delays[..., None] * offsets[:, None]
         heard.append((strengths[..., None] * torch.exp(-1j * phases)).sum(1))

@@ -62,5 +62,5 @@ def test_a_perfect_channel_costs_nothing_and_does_not_pull(pair):
 
 @pytest.mark.parametrize("floor", [0.0, -1.0, float("nan")])
 def test_a_floor_that_is_not_positive_is_refused(floor):
-    with pytest.raises(ValueError, match="loss.floor must be more than 0"):
+    with pytest.raises(ValueError, match=r"loss\.floor must be more than 0"):
         LogRelativeError(TASK, floor)

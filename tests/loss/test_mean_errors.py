@@ -81,6 +81,6 @@ def test_a_bend_that_is_not_positive_is_refused(delta):
 @every
 def test_complex_labels_are_refused(name):
     with pytest.raises(
-        ValueError, match="labels of task 'csi' are complex, and this loss takes real ones; take loss=log_relative_error"
+        ValueError, match="labels of task 'csi' are complex, and this loss takes real ones; take loss=log_relative"
     ):
         build(name, Csi(2, torch.tensor([1e9])))

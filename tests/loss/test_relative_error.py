@@ -65,5 +65,6 @@ def test_a_perfect_channel_costs_nothing_and_does_not_pull(pair):
 
 
 def test_real_labels_are_refused():
-    with pytest.raises(ValueError, match="'rssi' are real, and loss 'relative_error' takes complex channels; take loss=squared"):
+    message = "'rssi' are real, and loss 'relative_error' takes complex channels; take loss=squared"
+    with pytest.raises(ValueError, match=message):
         RelativeError(Rssi())

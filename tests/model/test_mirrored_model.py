@@ -117,7 +117,8 @@ def test_channels_start_from_free_space(array, conjugated):
     poses = POSE, replace(POSE, position=torch.tensor([4.0, 3.0, 2.0]))
     receivers = tuple(Receiver(f"gateway{k}", pose, array) for k, pose in enumerate(poses))
     offsets, places, gains = FREQUENCIES - CARRIER, place(60, 0), (3e-3j, 50.0 - 20j)
-    each = [gain * respond(EMPTY, places, receiver, CARRIER, offsets, 1) for gain, receiver in zip(gains, receivers, strict=True)]
+    each = [respond(EMPTY, places, receiver, CARRIER, offsets, 1) for receiver in receivers]
+    each = [gain * waves for gain, waves in zip(gains, each, strict=True)]
     labels = torch.stack(each, 1).flatten(0, 1).to(torch.complex64)
     links = Links(
         query=Query(places.repeat_interleave(2, 0), torch.arange(2).repeat(60)),

@@ -94,7 +94,7 @@ def test_an_array_of_any_shape_hears_free_space(dtype):
 
 
 def test_an_array_may_be_turned_with_all_it_hears():
-    splats, amplitudes, lengths = draw()
+    _, amplitudes, lengths = draw()
     points, axes = torch.randn(2, 6, 3).double() + 2, 0.1 * torch.randn(2, 6, 3, 3).double()
     offsets = torch.tensor([[0.0, 1e8], [-2e8, 3e7]]).double()
     upright, rotation = turned(ARRAY, (0.3, -0.5, 0.2, 0.7))

@@ -142,8 +142,8 @@ def test_a_broken_rasterizer_is_found(rasterizer, message):
         check_rasterizer(rasterizer())
 
 
-class Unseeing(Aperture):
-    """Takes what has no direction for visible."""
+class Elsewhere(Aperture):
+    """Puts what stands on the array's middle somewhere else."""
 
     def fields(self, points, *others):
         return super().fields(points + (points == 0).all(-1, keepdim=True), *others)
@@ -191,7 +191,7 @@ class Averaged(Aperture):
 @pytest.mark.parametrize(
     ("rasterizer", "message"),
     [
-        (Unseeing, "fields must be that of the formula"),
+        (Elsewhere, "fields must be that of the formula"),
         (Flat, "random: fields must be that of the formula"),
         (Pointed, "random: lags must be that of the formula"),
         (Narrowband, "random: lags must be that of the formula"),

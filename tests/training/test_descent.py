@@ -385,7 +385,8 @@ def test_complex_channels_are_trained_and_scored_by_snr(links, tmp_path):
     generator = torch.Generator().manual_seed(0)
     labels = torch.randn(12, 2, 5, dtype=torch.complex64, generator=generator)
     channels = replace(links, labels=labels, task=Csi(2, 1e9 + 1e6 * torch.arange(5)))
-    options = {"loss": RelativeError(channels.task), "thinning": {}, "penalties": {}, "learning_rates": {"network": 0.1}}
+    options = {"loss": RelativeError(channels.task), "thinning": {}, "penalties": {}}
+    options["learning_rates"] = {"network": 0.1}
     module = make_module(channels, Slope(channels.scene), jitter=0.01, **options)
     trainer = fit(module, channels, tmp_path, 5)
     assert module.model.slope.item() != 2.0

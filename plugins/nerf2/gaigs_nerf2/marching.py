@@ -133,10 +133,11 @@ class RayMarching(Model):
                 batch, directions=batch.directions.flatten()[::stride], labels=batch.labels.flatten(1)[:, ::stride]
             )
         self.unit.fill_(1.0)
-        wanted, given = (
-            self.reading.amplitudes(values, batch.query).mean() for values in (batch.labels, self(batch).value)
-        )
-        self.unit.copy_(wanted / given)
+        wanted, given = (self.reading.amplitudes(values, batch.query) for values in (batch.labels, self(batch).value))
+        if batch.labels.is_complex():  # each link has a vote, however weak or loud it is
+            wanted = self.reading.amplitudes(links.labels[train], links.query[train])
+            wanted, given = (part.flatten(1).mean(1).quantile(0.5) for part in (wanted, given))
+        self.unit.copy_(wanted.mean() / given.mean())
 
     def forward(self, batch: Batch) -> Prediction:
         directions = (self.grid or batch.directions or self.scene.task.directions).to(self.middle)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.directions import Directions, Grid
+from gaigs.propagation import direct_waves, strength
 from gaigs.scene import Scene
 
 LARGEST = 90.0
@@ -27,8 +28,8 @@ class LabelImage(nn.Module):
     | complex channel | elements | subcarriers | 2: real and imaginary part |
 
     A spectrum's image has every so-manieth row and column of the label, and between them it is interpolated linearly.
-    Complex labels are scaled by the median link's amplitude, which no single link rules, and not shifted: 0 means the
-    same at every phase.
+    Complex labels are scaled by the amplitude that free space has at the median link, times their ``strength`` over
+    free space, which no single link rules. They are not shifted: 0 means the same at every phase.
 
     Args:
         scene: Whose labels.
@@ -46,7 +47,7 @@ class LabelImage(nn.Module):
         super().__init__()
         if not 0 < pixel <= LARGEST:
             raise ValueError(f"model.pixel must be above 0 and at most {LARGEST:g} [deg], got {pixel}")
-        self.task, self.grid = scene.task, None
+        self.scene, self.task, self.grid = scene, scene.task, None
         shape = scene.task.shape
         rows, columns = (shape[0], math.prod(shape[1:])) if len(shape) > 1 else (1, math.prod(shape))
         if scene.task.directions is not None:
@@ -60,9 +61,10 @@ class LabelImage(nn.Module):
     def fit(self, links: Links) -> None:
         """Takes mean and scale from the training links."""
         if self.task.dtype.is_complex:
-            parts = [links.labels[index].flatten(1).to(torch.complex128) for index in links.split.train.split(PART)]
-            powers = torch.cat([part.abs().square().mean(1) for part in parts])
-            self.scale.fill_(powers.quantile(0.5).sqrt())
+            labels, query = links.labels[links.split.train], links.query[links.split.train]
+            waves = direct_waves(self.scene, query, self.task.frequencies, at_elements=False).expand_as(labels)
+            usual = waves.abs().square().mean((1, 2)).sqrt().quantile(0.5).item()
+            self.scale.fill_(usual * strength(labels, waves, query.receivers))
             return
         total, power, count = 0.0, 0.0, 0
         for index in links.split.train.split(PART):
