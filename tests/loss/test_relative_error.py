@@ -1,9 +1,10 @@
-"""The normalised error of channels against numpy, and links whose channels are weak."""
+"""The relative error of channels and its logarithm against numpy, links whose channels are weak, and deep shadow."""
 
 import numpy as np
 import pytest
 import torch
 
+from gaigs.loss.log_relative_error import LogRelativeError
 from gaigs.loss.relative_error import RelativeError
 from gaigs.query import Batch, Query
 from gaigs.task.csi import Csi
@@ -12,9 +13,14 @@ from gaigs.task.rssi import Rssi
 TASK = Csi(3, 1e9 + 1e6 * torch.arange(5))
 
 
-def loss_of(values, labels):
+FLOOR = 1e-3
+LOSSES = RelativeError(TASK), LogRelativeError(TASK, FLOOR)
+both = pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: loss.name)
+
+
+def loss_of(values, labels, loss=LOSSES[0]):
     query = Query(torch.zeros(len(labels), 3), torch.zeros(len(labels), dtype=torch.long))
-    return RelativeError(TASK)(values, Batch(query, None, labels))
+    return loss(values, Batch(query, None, labels))
 
 
 @pytest.fixture
@@ -29,6 +35,9 @@ def test_it_is_the_mean_over_links_of_their_normalised_error(pair):
     loss, terms = loss_of(*pair)
     assert loss.item() == pytest.approx(each.mean(), rel=1e-12)
     assert terms == {"relative_error": loss}
+    loss, terms = loss_of(*pair, LOSSES[1])
+    assert loss.item() == pytest.approx(np.log(1 + each / FLOOR).mean(), rel=1e-12)
+    assert terms == {"log_relative_error": loss}
 
 
 def test_it_is_the_snr_of_the_score():
@@ -51,14 +60,16 @@ def test_each_link_counts_alike_however_weak_its_channel_is(pair):
     assert values.grad.flatten(1).any(1).all()
 
 
-def test_gradients_are_the_derivatives(pair):
+@both
+def test_gradients_are_the_derivatives(pair, loss):
     values, labels = pair
-    assert torch.autograd.gradcheck(lambda values: loss_of(values, labels)[0], values.clone().requires_grad_())
+    assert torch.autograd.gradcheck(lambda values: loss_of(values, labels, loss)[0], values.clone().requires_grad_())
 
 
-def test_a_perfect_channel_costs_nothing_and_does_not_pull(pair):
+@both
+def test_a_perfect_channel_costs_nothing_and_does_not_pull(pair, loss):
     values = pair[1].clone().requires_grad_()
-    loss, _ = loss_of(values, pair[1])
+    loss, _ = loss_of(values, pair[1], loss)
     loss.backward()
     assert loss == 0
     assert not values.grad.any()
@@ -68,3 +79,25 @@ def test_real_labels_are_refused():
     message = "'rssi' are real, and loss 'relative_error' takes complex channels; take loss=squared"
     with pytest.raises(ValueError, match=message):
         RelativeError(Rssi())
+
+
+@pytest.mark.parametrize("shadow", [1e-3, 1e-6, 1e-15])
+def test_a_link_in_deep_shadow_pulls_no_harder_than_others(pair, shadow):
+    """Pull: the derivative by the logarithm of all predictions' amplitude."""
+
+    def pulls(labels):
+        scales = torch.zeros(6, 1, 1, dtype=torch.float64, requires_grad=True)
+        loss, _ = loss_of(2 * pair[1].to(torch.complex64) * scales.exp(), labels.to(torch.complex64), LOSSES[1])
+        (gradient,) = torch.autograd.grad(loss, scales)
+        return gradient.flatten()
+
+    labels = pair[1].clone()
+    labels[0] *= shadow
+    assert pulls(labels)[0] == pytest.approx(2 / 6, rel=0.01)  # of an error as large as the prediction, of six links
+    assert pulls(labels)[1:] == pytest.approx(pulls(pair[1])[1:])
+
+
+@pytest.mark.parametrize("floor", [0.0, -1.0, float("nan")])
+def test_a_floor_that_is_not_positive_is_refused(floor):
+    with pytest.raises(ValueError, match=r"loss\.floor must be more than 0"):
+        LogRelativeError(TASK, floor)
