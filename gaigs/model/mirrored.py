@@ -13,6 +13,7 @@ from gaigs.data import Links
 from gaigs.model import _learnt_room
 from gaigs.model._plane_search import fewer, find_planes
 from gaigs.model.gaigs import GaussianSplatting
+from gaigs.pooling.element_sum import ElementSum
 from gaigs.propagation import carriers, direct_gains, direct_waves, fit_gain
 from gaigs.query import Batch, Query
 from gaigs.registry import register
@@ -61,12 +62,12 @@ class Mirrored(GaussianSplatting):
     def fit(self, links: Links) -> None:
         """As the pipeline's; and remembers some places, by which the paths' powers are told.
 
-        Channels start from free space with each receiver's gain over its training links, as ``friis`` has it. Where
-        phases say nothing, they start ``QUIET``.
+        Channels without a trend start from free space with each receiver's gain over its training links, as ``friis``
+        has it. Where phases say nothing, they start ``QUIET``.
         """
         super().fit(links)
         self.places = _learnt_room.some(links.query[links.split.train])
-        if not self.scene.task.dtype.is_complex:
+        if not isinstance(self.pooling, ElementSum) or self.trend is not None:
             return
         train, sign, frequencies = links.split.train, int(self.pooling.sign), self.scene.task.frequencies
         labels, query = links.labels[train], links.query[train]
@@ -79,7 +80,7 @@ class Mirrored(GaussianSplatting):
 
     @property
     def predicts_untrained(self) -> bool:
-        return super().predicts_untrained or self.scene.task.dtype.is_complex
+        return super().predicts_untrained or bool(self.placement.is_bare)
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
         """Looks for more planes; has phases count; searches planes by them; drops what does not help."""
