@@ -36,7 +36,7 @@ def test_it_is_the_mean_over_links_of_their_normalised_error(pair):
     assert loss.item() == pytest.approx(each.mean(), rel=1e-12)
     assert terms == {"relative_error": loss}
     loss, terms = loss_of(*pair, LOSSES[1])
-    assert loss.item() == pytest.approx(np.log(1 + each / FLOOR).mean(), rel=1e-12)
+    assert loss.item() == pytest.approx(np.log((1 + each / FLOOR) / (1 + each * FLOOR)).mean(), rel=1e-12)
     assert terms == {"log_relative_error": loss}
 
 
@@ -81,9 +81,9 @@ def test_real_labels_are_refused():
         RelativeError(Rssi())
 
 
-@pytest.mark.parametrize("shadow", [1e-3, 1e-6, 1e-15])
-def test_a_link_in_deep_shadow_pulls_no_harder_than_others(pair, shadow):
-    """Pull: the derivative by the logarithm of all predictions' amplitude."""
+@pytest.mark.parametrize("shadow", [0.3, 0.1, 1e-3, 1e-6, 1e-15])
+def test_a_link_pulls_the_less_the_deeper_its_shadow_is(pair, shadow):
+    """Pull: the derivative by the logarithm of the prediction's amplitude, which is twice that out of the shadow."""
 
     def pulls(labels):
         scales = torch.zeros(6, 1, 1, dtype=torch.float64, requires_grad=True)
@@ -93,11 +93,14 @@ def test_a_link_in_deep_shadow_pulls_no_harder_than_others(pair, shadow):
 
     labels = pair[1].clone()
     labels[0] *= shadow
-    assert pulls(labels)[0] == pytest.approx(2 / 6, rel=0.01)  # of an error as large as the prediction, of six links
+    error, change = (2 / shadow - 1) ** 2, 4 / (2 - shadow)  # relative error, and by what power it goes
+    expected = change * (error / (error + FLOOR) - error * FLOOR / (1 + error * FLOOR)) / 6
+    assert pulls(labels)[0].item() == pytest.approx(expected, rel=1e-4)
+    assert expected < change / 6
     assert pulls(labels)[1:] == pytest.approx(pulls(pair[1])[1:])
 
 
-@pytest.mark.parametrize("floor", [0.0, -1.0, float("nan")])
-def test_a_floor_that_is_not_positive_is_refused(floor):
-    with pytest.raises(ValueError, match=r"loss\.floor must be more than 0"):
+@pytest.mark.parametrize("floor", [0.0, -1.0, 1.0, float("nan")])
+def test_a_floor_out_of_range_is_refused(floor):
+    with pytest.raises(ValueError, match=r"loss\.floor must be more than 0 and less than 1"):
         LogRelativeError(TASK, floor)
