@@ -133,7 +133,7 @@ def fit_gain(channels: Complex[Tensor, "k *shape"], waves: Complex[Tensor, "k *s
 
     Its magnitude is the median over the links of |h| / |w|, its phase that of the sum of w* h / (|w| |h|). So each link
     has one vote, however weak or loud it is: a fit of least squares follows the loudest links, one of least relative
-    errors those in the deepest shadow (docs/methods.md has both figures).
+    errors those in the deepest shadow (docs/results.md has both figures).
 
     Args:
         channels: Measured, h of each link.

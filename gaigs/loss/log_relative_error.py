@@ -23,7 +23,7 @@ class LogRelativeError(RelativeError):
     Raises:
         ValueError: The floor is not in (0, 1), or the labels are real.
 
-    Source: ours; docs/methods.md has what other losses cost.
+    Source: ours; docs/results.md has what other losses cost.
     """
 
     name = "log_relative_error"

@@ -60,7 +60,7 @@ class Mirrored(GaussianSplatting):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """As the pipeline's; and remembers some places, by which the paths' powers are told.
+        """As the pipeline's; and keeps some places, at which the paths' powers are reported.
 
         Channels without a trend start from free space with each receiver's gain over its training links, as ``friis``
         has it. Where phases say nothing, they start ``QUIET``.
