@@ -5,10 +5,10 @@ import logging
 import traceback
 from collections.abc import Mapping
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
 
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
@@ -37,6 +37,9 @@ KEYS = {
 TASK_KEYS = {"name": str, "trend": dict | None, "baselines": list[dict]}
 """The same under ``task``, of which all but the name may be missing."""
 
+CONSTRUCTED = tuple(kind for kind in KINDS if kind not in ("task", "training", "benchmark"))
+"""Kinds whose components need no configuration file: their constructors say what there is to set."""
+
 LONGEST = 200
 """Bytes in the name of a job's folder; most file systems end at 255."""
 
@@ -56,20 +59,28 @@ def plugin_conf_dirs() -> list[Path]:
     """
     folders = [*Path.cwd().glob("plugins/conf"), *sorted(Path.cwd().glob("plugins/[!_.]*/conf"))]
     for holder in (holder for kind in KINDS for holder in find_holders(kind)[0]):
-        if holder.root is not None:
-            folders.append(holder.root / holder.package / "conf")
-        elif holder.file is None:
-            spec = find_spec(holder.package)  # imports nothing, as the name has no dots
-            folders += [Path(place) / "conf" for place in (spec and spec.submodule_search_locations) or ()]
+        if holder.file is None and holder.folder is not None:
+            folders.append(holder.folder / "conf")
     return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
 
 
 class PluginConfigurations(SearchPathPlugin):
-    """Puts the conf folders of plug-ins behind gaigs's own, so that none of them replaces a file of ours."""
+    """Puts the conf folders of plug-ins behind gaigs's own, so that none of them replaces a file of ours.
+
+    Behind them all comes for each component its constructor: the options with their defaults.
+    """
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for folder in plugin_conf_dirs():
+        folders = plugin_conf_dirs()
+        for folder in folders:
             search_path.append(provider="gaigs plug-in", path=f"file://{folder}")
+        store = ConfigStore.instance()
+        for kind in CONSTRUCTED:
+            store.repo.pop(kind, None)  # that of another working directory
+            written = {file.stem for folder in (conf_dir(), *folders) for file in folder.glob(f"{kind}/*.yaml")}
+            for holder in find_holders(kind)[0]:
+                if holder.name not in written:  # Hydra would join the two
+                    store.store(holder.name, {"name": holder.name, **holder.options(kind)}, kind, provider="gaigs")
 
 
 def differences(there: dict, here: dict) -> dict[str, tuple]:
@@ -184,9 +195,10 @@ def installed(*names: str) -> str:
 
 
 def known(kind: str, name: str, otherwise: str) -> str:
-    """A name of a kind where some configuration folder has its file, and else another: for choices by task."""
+    """A name of a kind where a configuration file or a component has it, and else another: for choices by task."""
     folders = (conf_dir(), *plugin_conf_dirs())
-    return name if any((folder / kind / f"{name}.yaml").is_file() for folder in folders) else otherwise
+    has_file = any((folder / kind / f"{name}.yaml").is_file() for folder in folders)
+    return name if has_file or any(holder.name == name for holder in find_holders(kind)[0]) else otherwise
 
 
 def by_task(values: Mapping, otherwise: object, *, _root_: DictConfig) -> object:

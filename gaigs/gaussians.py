@@ -58,12 +58,12 @@ class Gaussians(nn.Module):
         scene: Scene,
         zone: tuple[float, float],
         channels: int,
-        count: int,
-        near: float,
-        far: float,
-        spread: float,
-        opacity: float,
-        signal: float,
+        count: int = 300,
+        near: float = 3.0,
+        far: float = 6.0,
+        spread: float = 1.0,
+        opacity: float = 0.1,
+        signal: float = 1.0,
         degree: int = 0,
     ):
         super().__init__()

@@ -7,7 +7,7 @@ import torch
 
 from gaigs.data import Links
 from gaigs.data._files import find_file, number_places, read_lines, refuse, to_cells, to_columns, to_coordinates
-from gaigs.data.nerf2_rssi import LOUDEST, NOT_HEARD, gateway, read_walls, to_dbm
+from gaigs.data.nerf2_rssi import LOUDEST, gateway, read_walls, to_dbm
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.task.rssi import Rssi
@@ -28,7 +28,7 @@ def read(
     file: str | Path,
     layout: str | Path | None = None,
     fixed: str | None = None,
-    not_heard: float = NOT_HEARD,
+    not_heard: float = -100.0,
 ) -> Links:
     """A data set from a table with a heading, one reading a line: one link for each reading that was heard.
 

@@ -1,6 +1,7 @@
 """The paper's scene mapping network: an attenuation branch and a signal branch."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -88,10 +89,10 @@ class TwoBranch(Deformation):
         self,
         tokenizer_widths: tuple[int, int, int],
         channels: int,
-        width: int,
-        attenuation_layers: int,
-        signal_layers: int,
-        heads: list[str],
+        width: int = 64,
+        attenuation_layers: int = 2,
+        signal_layers: int = 1,
+        heads: Sequence[str] = ("signal", "opacity"),
     ):
         super().__init__()
         unknown = set(heads) - set(HEADS)

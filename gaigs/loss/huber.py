@@ -22,7 +22,7 @@ class Huber(MeanError):
     Source: Huber, Robust estimation of a location parameter, 1964.
     """
 
-    def __init__(self, task: Task, delta: float):
+    def __init__(self, task: Task, delta: float = 5.0):
         super().__init__(task)
         if not delta > 0:
             raise ValueError(f"loss.delta must be more than 0, got {delta}")

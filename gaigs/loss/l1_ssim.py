@@ -29,7 +29,7 @@ class L1Ssim:
     Source: GAI-GS, "Results": L_MAE and L_SSIM.
     """
 
-    def __init__(self, task: Task, ssim: float):
+    def __init__(self, task: Task, ssim: float = 0.2):
         if not 0 <= ssim <= 1:
             raise ValueError(f"loss.ssim must be in [0, 1], got {ssim}")
         if task.directions is None:

@@ -28,7 +28,7 @@ class LogRelativeError(RelativeError):
 
     name = "log_relative_error"
 
-    def __init__(self, task: Task, floor: float):
+    def __init__(self, task: Task, floor: float = 1e-3):
         super().__init__(task)
         if not 0 < floor < 1:
             raise ValueError(f"loss.floor must be more than 0 and less than 1, got {floor}")

@@ -41,7 +41,7 @@ class KNearestNeighbours(Model):
     Source: reference look-up of the data sets' own README; Shepard, 1968.
     """
 
-    def __init__(self, scene: Scene, k: int, power: float = 2.0):
+    def __init__(self, scene: Scene, k: int = 3, power: float = 2.0):
         super().__init__(scene)
         if k < 1:
             raise ValueError(f"model.k must be at least 1, got {k}")

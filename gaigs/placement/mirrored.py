@@ -109,9 +109,9 @@ class Mirrored(Placement):
         self,
         scene: Scene,
         channels: int,
-        planes: int,
-        order: int,
-        obstacles: int,
+        planes: int = 10,
+        order: int = 2,
+        obstacles: int = 60,
         walls: str | None = None,
         fixed: bool = False,
     ):

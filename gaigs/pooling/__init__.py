@@ -2,6 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
@@ -54,7 +55,7 @@ class Pooling(nn.Module, ABC):
         raise NotImplementedError
 
 
-def sphere(option: str, shape: list[int]) -> Grid:
+def sphere(option: str, shape: Sequence[int]) -> Grid:
     """A pooling's own grid from its option [rows, columns].
 
     Raises:

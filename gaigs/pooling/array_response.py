@@ -1,6 +1,7 @@
 """The spatial spectrum as an array sees it: beamforming with what its elements hear."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Complex, Float
@@ -52,7 +53,7 @@ class ArrayResponse(Pooling):
     channels = 2
     takes = "lags"
 
-    def __init__(self, scene: Scene, grid: list[int]):
+    def __init__(self, scene: Scene, grid: Sequence[int] = (24, 48)):
         super().__init__()
         task = scene.task
         if task.directions is None:

@@ -1,6 +1,7 @@
 """Complex channels: the map's waves summed up at each element of the receiver's array."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Complex, Float
@@ -39,7 +40,7 @@ class ElementSum(Pooling):
 
     takes = "fields"
 
-    def __init__(self, scene: Scene, grid: list[int]):
+    def __init__(self, scene: Scene, grid: Sequence[int] = (8, 16)):
         super().__init__()
         check_elements("pooling 'element_sum'", scene)
         self.scene = scene

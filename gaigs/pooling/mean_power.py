@@ -1,5 +1,7 @@
 """RSSI by physics: the power that arrives from all directions together."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
@@ -28,7 +30,7 @@ class MeanPower(Pooling):
 
     takes = "lags"
 
-    def __init__(self, grid: list[int], channels: int, floor_db: float):
+    def __init__(self, grid: Sequence[int] = (4, 8), channels: int = 2, floor_db: float = -60.0):
         super().__init__()
         if channels not in (1, 2):
             raise ValueError(f"pooling 'mean_power' renders 1 real or 2 complex channels, got channels={channels}")

@@ -1,6 +1,7 @@
 """RSSI by attention: the brightest directions of the map count most."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -34,7 +35,9 @@ class SoftmaxAttention(Pooling):
 
     channels = 1
 
-    def __init__(self, grid: list[int], temperature: float, prior: float, learn: bool = False):
+    def __init__(
+        self, grid: Sequence[int] = (4, 8), temperature: float = 0.434, prior: float = 0.1, learn: bool = False
+    ):
         super().__init__()
         if not 1e-6 <= temperature <= 1e6:
             raise ValueError(

@@ -19,7 +19,7 @@ class Spectrum(Pooling):
         channels: 1 (real) or 2 (complex).
     """
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int = 2):
         super().__init__()
         if channels not in (1, 2):
             raise ValueError(f"pooling 'spectrum' renders 1 real or 2 complex channels, got channels={channels}")

@@ -7,10 +7,27 @@ import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
 """Of gaigs."""
+
+GIVEN = {
+    "split": ("links",),
+    "placement": ("scene", "channels"),
+    "tokenizer": ("scene",),
+    "deformation": ("scene", "channels", "tokenizer_widths"),
+    "projection": ("pixel",),
+    "pooling": ("scene",),
+    "loss": ("task",),
+    "model": ("scene",),
+    "training": ("model", "loss", "identity", "seed"),
+}
+"""Arguments of a kind's components that whoever builds them knows; all others are options."""
+
+MISSING = "???"
+"""What stands for an option that must be given."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +57,32 @@ class Holder:
         """Whether a component comes from the holder's file or, for an entry point, from the package it points into."""
         module = getattr(component, "__module__", "")
         return module == self.target if self.file else module.split(".")[0] == self.package
+
+    @property
+    def folder(self) -> Path | None:
+        """Of the top-level package of an entry point, which is not imported; None where it is not there."""
+        if self.root is not None:
+            return self.root / self.package
+        spec = find_spec(self.package)  # imports nothing, as the name has no dots
+        places = (spec and spec.submodule_search_locations) or ()
+        return next(map(Path, places), None)
+
+    def options(self, kind: str) -> dict:
+        """The arguments that the component takes from a configuration, with their defaults, as its source has them.
+
+        Those that it inherits, and those whose default is no literal, are left out.
+        """
+        if self.file is not None:
+            stat = self.file.stat()
+            claims = _claims(self.file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size)
+            return next(_options(kind, node) for own, name, node in claims if (own, name) == (kind, self.name))
+        module, _, attribute = self.target.partition(":")
+        if self.folder is None:
+            return {}
+        place = self.folder.parent.joinpath(*module.strip().split("."))
+        file = next((file for file in (place / "__init__.py", place.with_suffix(".py")) if file.is_file()), None)
+        nodes = ast.parse(file.read_bytes()).body if file else ()
+        return next((_options(kind, node) for node in nodes if getattr(node, "name", None) == attribute.strip()), {})
 
 
 def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
@@ -117,12 +160,12 @@ def _entry_points(kind: str, file: Path) -> Iterable[tuple[str, str]]:
 def _decorated(kind: str, file: Path) -> list[str]:
     """Names of a kind that a file's top-level ``@register(kind, name)`` decorators claim."""
     stat = file.stat()
-    return [name for own, name in _claims(file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size) if own == kind]
+    return [name for own, name, _ in _claims(file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size) if own == kind]
 
 
 @functools.cache  # a file is asked for the names of each kind
-def _claims(file: Path, *_state: int) -> list[tuple[str, str]]:
-    """Kinds and names that the decorators of a file claim, as it stands now."""
+def _claims(file: Path, *_state: int) -> list[tuple[str, str, ast.stmt]]:
+    """Kinds and names that the decorators of a file claim, as it stands now, and what they decorate."""
     found = []
     for node in ast.parse(file.read_bytes(), file.name).body:
         for decorator in getattr(node, "decorator_list", ()):
@@ -131,5 +174,27 @@ def _claims(file: Path, *_state: int) -> list[tuple[str, str]]:
                     func=ast.Name(id="register") | ast.Attribute(attr="register"),
                     args=[ast.Constant(value=str(kind)), ast.Constant(value=str(name))],
                 ):
-                    found.append((kind, name))
+                    found.append((kind, name, node))
     return found
+
+
+def _options(kind: str, node: ast.stmt) -> dict:
+    """Options of a class or function, see ``Holder.options``."""
+    if isinstance(node, ast.ClassDef):
+        methods = (each for each in node.body if isinstance(each, ast.FunctionDef) and each.name == "__init__")
+        node = next(methods, None)
+    if not isinstance(node, ast.FunctionDef):
+        return {}
+    positional = [*node.args.posonlyargs, *node.args.args]
+    defaults = [None] * (len(positional) - len(node.args.defaults)) + node.args.defaults
+    options = {}
+    for argument, default in zip(
+        (*positional, *node.args.kwonlyargs), (*defaults, *node.args.kw_defaults), strict=True
+    ):
+        if argument.arg == "self" or argument.arg in GIVEN.get(kind, ()):
+            continue
+        try:
+            options[argument.arg] = MISSING if default is None else ast.literal_eval(default)
+        except ValueError:  # e.g. a constant's name
+            continue
+    return options

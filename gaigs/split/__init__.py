@@ -11,9 +11,6 @@ from torch import Tensor
 
 from gaigs.data import Links, Split
 
-TEST = 0.2
-"""Fraction of the links that test where none is given; the published s23 split has 0.20 too."""
-
 
 def rows_of(links: Links) -> Int[Tensor, "n"]:
     """Row of each link in the order of measurement."""

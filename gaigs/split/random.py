@@ -2,11 +2,11 @@
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
-from gaigs.split import TEST, part, rows_of
+from gaigs.split import part, rows_of
 
 
 @register("split", "random")
-def random(links: Links, test: float = TEST, validation: float = 0.1, seed: int = 0) -> Split:
+def random(links: Links, test: float = 0.2, validation: float = 0.1, seed: int = 0) -> Split:
     """Random rows test: interpolation, as on dense trajectories a neighbour is always near.
 
     Args:

@@ -2,11 +2,11 @@
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
-from gaigs.split import TEST, part, runs_of
+from gaigs.split import part, runs_of
 
 
 @register("split", "runs")
-def runs(links: Links, length: int, test: float = TEST, validation: float = 0.1, seed: int = 0) -> Split:
+def runs(links: Links, length: int, test: float = 0.2, validation: float = 0.1, seed: int = 0) -> Split:
     """Random runs test: a trajectory with gaps.
 
     Args:

@@ -4,11 +4,11 @@ import torch
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
-from gaigs.split import TEST, check, check_fractions, generator_of, hold_out, rows_of
+from gaigs.split import check, check_fractions, generator_of, hold_out, rows_of
 
 
 @register("split", "sparse")
-def sparse(links: Links, train: int, test: float = TEST, validation: float = 0.1, seed: int = 0) -> Split:
+def sparse(links: Links, train: int, test: float = 0.2, validation: float = 0.1, seed: int = 0) -> Split:
     """The test rows are those of ``random``; of the others so many train and validate, and fewer are part of more.
 
     Args:

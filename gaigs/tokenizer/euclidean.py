@@ -55,10 +55,10 @@ class EuclideanTokenizer(nn.Module):
     def __init__(
         self,
         scene: Scene,
-        gaussian_octaves: tuple[int, int],
-        transmitter_octaves: tuple[int, int] | None,
-        hidden: int | None,
-        width: int | None,
+        gaussian_octaves: tuple[int, int] = (-3, 2),
+        transmitter_octaves: tuple[int, int] | None = None,
+        hidden: int | None = 256,
+        width: int | None = 64,
     ):
         super().__init__()
         if (hidden is None) != (width is None):
