@@ -9,15 +9,14 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
 from gaigs.files import whole
-from gaigs.model import Model
 from gaigs.processes import lacks_memory
-from gaigs.registry import check_type, registry
+from gaigs.registry import check_type, configuration_of, name_of, registry
 from gaigs.scene import Scene
 
 KEY = "gaigs"
@@ -112,11 +111,23 @@ def read(path: str | Path) -> dict:
         return content if version else _from_version_0(content)
 
 
-def load(path: str | Path) -> Model:
+def save(model: nn.Module, path: str | Path) -> None:
+    """Writes a model with its configuration and scene; see ``gaigs.Model.save``."""
+    state = model.state_dict()
+    if not state:
+        raise ValueError(
+            f"model {name_of(model)!r} has no state that a file could hold: it looks its answers up in the links that "
+            "it was fitted to; keep those, and fit it again"
+        )
+    part = {"version": VERSION, "model": configuration_of(model), "scene": model.scene.state()}
+    write({KEY: part, "state_dict": {f"model.{key}": value.cpu() for key, value in state.items()}}, Path(path))
+
+
+def load(path: str | Path) -> nn.Module:
     """The model of a checkpoint, ready to predict; needs neither data nor Hydra.
 
     Args:
-        path: A file ``best.ckpt`` or ``last.ckpt`` of a run.
+        path: A file ``best.ckpt`` or ``last.ckpt`` of a run, or what ``Model.save`` wrote.
 
     Returns:
         The model in evaluation mode, on the CPU: ``load(path).predict(transmitters)``.
@@ -126,6 +137,12 @@ def load(path: str | Path) -> Model:
         ValueError: It is no checkpoint of gaigs, or damaged; its components are not installed here; its weights are not
             theirs, or not finite; or the model would be far larger than the file.
         ImportError: A component cannot be imported.
+
+    Example:
+        >>> gaigs.train("mean", gaigs.links("synthetic_rssi", transmitters=50)).save("room.ckpt")
+        >>> model = gaigs.load("room.ckpt")
+        >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]], receiver="west").shape  # [dBm]
+        torch.Size([2])
     """
     content = read(path)
     weights, scene = content["state_dict"], content[KEY]["scene"]
@@ -151,16 +168,15 @@ def trained_weights(content: dict) -> dict:
     return {f"model.{key.removeprefix(trend)}": value for key, value in weights.items() if key.startswith(trend)}
 
 
-def exchange_model(path: Path, config: dict, model: Model) -> None:
+def exchange_model(path: Path, model: nn.Module) -> None:
     """Puts another model into a checkpoint, whole or not at all.
 
     Args:
         path: The file, which is rewritten.
-        config: Of the model.
         model: In its place, of the same scene.
     """
     content = read(path)
-    content[KEY] |= {"version": VERSION, "model": config}
+    content[KEY] |= {"version": VERSION, "model": configuration_of(model)}
     content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
     write(content, path)
 

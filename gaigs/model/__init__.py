@@ -3,7 +3,7 @@
 import math
 import reprlib
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from gaigs import checkpoint
 from gaigs.data import Links
 from gaigs.data._files import NEAR
 from gaigs.directions import Directions, Grid, Rays
@@ -120,6 +121,21 @@ class Model(nn.Module):
 
     def export(self, folder: Path) -> None:
         """Writes files for other programs into a run's folder; by default none."""
+
+    def save(self, path: str | Path) -> None:
+        """Writes the model into one file, which ``gaigs.load`` reads anywhere, without the data.
+
+        Raises:
+            ValueError: It is a look-up, whose links are its whole state; or a part of it has no registered name.
+            OSError: The file cannot be written; what was there before stands.
+
+        Example:
+            >>> links = gaigs.links("synthetic_rssi", transmitters=50)
+            >>> gaigs.train("path_loss", links).save("room.ckpt")
+            >>> gaigs.load("room.ckpt").predict([[1.0, 2.0, 1.5]], receiver="west").shape
+            torch.Size([1])
+        """
+        checkpoint.save(self, path)
 
     # --- prediction ---
 
@@ -371,12 +387,12 @@ def as_directions(directions: Directions) -> Directions:
     return (Rays if isinstance(directions, Rays) else Grid)(**angles)
 
 
-def build_trend(config: dict, scene: Scene) -> Model:
-    """The model that a trend's configuration names.
+def build_trend(trend: str | Mapping | Model, scene: Scene) -> Model:
+    """The model that a trend is, or that its name or configuration stands for.
 
     Raises:
         ValueError: It names none, or that model cannot be made so.
     """
-    if "name" not in config:
-        raise ValueError(f"model.trend must have the name of a model, such as mean, got {config}")
-    return registry("model").build(config, scene=scene)
+    if isinstance(trend, Mapping) and "name" not in trend:
+        raise ValueError(f"model.trend must have the name of a model, such as mean, got {trend}")
+    return registry("model").build(trend, scene=scene)

@@ -1,24 +1,27 @@
 """The splatting pipeline: GAI-GS, its ablations and its neighbours, put together from registered parts."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.deformation import Residuals
+from gaigs.deformation import Deformation, Residuals
 from gaigs.directions import Directions
 from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.geometry import magnitudes, semi_axes, spherical_harmonics
 from gaigs.model import Model, Prediction, build_trend
-from gaigs.placement import Placed
-from gaigs.projection import Splats
+from gaigs.placement import Placed, Placement
+from gaigs.pooling import Pooling
+from gaigs.projection import Projection, Splats
 from gaigs.propagation import carriers
 from gaigs.query import Batch, Query
-from gaigs.registry import call, register, registry
+from gaigs.rasterizer import Rasterizer
+from gaigs.registry import call, is_built, name_of, register, registry
 from gaigs.scene import Scene
 
 BESIDE = 0.05
@@ -31,15 +34,25 @@ class GaussianSplatting(Model):
 
     Args:
         scene: Receivers and task.
-        gaussians: Options of ``gaigs.gaussians.Gaussians``; None for none, where the placement brings its own.
-        placement, tokenizer, deformation, projection, rasterizer, pooling: Configurations of registered components.
-        trend: Configuration of a model whose value the pooled map is added to; None for none.
+        placement, tokenizer, deformation, projection, rasterizer, pooling: Registered components: each the name, the
+            configuration (a mapping with ``name`` and options), or the object itself. Pooling None is the label's own.
+        gaussians: Options of ``gaigs.gaussians.Gaussians`` [m]; None for none, where the placement brings its own.
+        trend: Model whose value the pooled map is added to, likewise; None for none.
 
     Raises:
         ValueError: The pooling does not give the task's labels; the projection does not see all of the map; parts do
             not go together; the trend needs its data or a training of its own.
 
     Source: GAI-GS, section "Framework"; the trend is ours (docs/methods.md).
+
+    Example:
+        >>> from gaigs.model.gaigs import GaussianSplatting
+        >>> from gaigs.tokenizer.euclidean import EuclideanTokenizer
+        >>> links = gaigs.links("synthetic", transmitters=20, order=0)
+        >>> tokenizer = EuclideanTokenizer(links.scene, width=32)
+        >>> model = GaussianSplatting(links.scene, tokenizer=tokenizer, rasterizer="torch", gaussians={"count": 50})
+        >>> model.predict([[1.0, 2.0, 1.5]]).shape
+        torch.Size([1, 90, 360])
     """
 
     name = "gaigs"
@@ -48,14 +61,14 @@ class GaussianSplatting(Model):
     def __init__(
         self,
         scene: Scene,
-        gaussians: dict | None,
-        placement: dict,
-        tokenizer: dict,
-        deformation: dict,
-        projection: dict,
-        rasterizer: dict,
-        pooling: dict,
-        trend: dict | None = None,
+        placement: str | Mapping | Placement = "free",
+        tokenizer: str | Mapping | nn.Module = "multiview",
+        deformation: str | Mapping | Deformation = "two_branch",
+        projection: str | Mapping | Projection = "mercator",
+        rasterizer: str | Mapping | Rasterizer = "fastest",
+        pooling: str | Mapping | Pooling | None = None,
+        gaussians: Mapping | None = MappingProxyType({}),
+        trend: str | Mapping | Model | None = None,
     ):
         super().__init__(scene)
         self.trend = None
@@ -64,37 +77,38 @@ class GaussianSplatting(Model):
             if not self.trend.state_dict() or [*self.trend.parameters()]:
                 kind = "needs its data" if not self.trend.state_dict() else "has to be trained itself"
                 raise ValueError(
-                    f"the trend must be fitted at once and stored in a checkpoint, and {trend['name']} {kind}; take "
-                    "path_loss, friis or mean with task.trend.name"
+                    f"the trend must be fitted at once and stored in a checkpoint, and {name_of(self.trend)} {kind}; "
+                    "take path_loss, friis or mean with task.trend.name"
                 )
             self.register_buffer("level", torch.zeros(()))  # of the untrained map, in the label's unit
-        self.pooling = registry("pooling").build(pooling, scene=scene)
+        self.pooling = registry("pooling").build(self.own_pooling(scene) if pooling is None else pooling, scene=scene)
         grid = self.pooling.grid or scene.task.directions
         if grid is None:
             raise ValueError(
                 f"labels of task {scene.task.name!r} have no directions, so the pooling must have a grid of its own, "
-                f"and {pooling['name']} has none; take the task's own pooling"
+                f"and {name_of(self.pooling)} has none; take the task's own pooling"
             )
         carrier = torch.tensor([1e9])  # whichever
         nothing = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), carrier)
         gives = tuple(self.pooling(torch.zeros(1, self.pooling.channels, *grid.shape), nothing).shape[1:])
         if gives != scene.task.shape:
             raise ValueError(
-                f"the pooling must give labels of task {scene.task.name!r}, {scene.task.shape}, and {pooling['name']} "
-                f"gives {gives}; take the task's own pooling"
+                f"the pooling must give labels of task {scene.task.name!r}, {scene.task.shape}, and "
+                f"{name_of(self.pooling)} gives {gives}; take the task's own pooling"
             )
         self.projection = registry("projection").build(projection, pixel=grid.pitch)
         self.rasterizer = registry("rasterizer").build(rasterizer)
         self.draws_map = getattr(self.rasterizer, "draws_map", True)
-        if not self.draws_map and (self.pooling.takes is None or projection["name"] != "direction_cosine"):
+        plane = name_of(self.projection)
+        if not self.draws_map and (self.pooling.takes is None or plane != "direction_cosine"):
             raise ValueError(
-                f"rasterizer {rasterizer['name']!r} draws no map; it takes projection=direction_cosine and a pooling "
-                f"for it (array_response, mean_power or element_sum), got {projection['name']} and {pooling['name']}"
+                f"rasterizer {name_of(self.rasterizer)!r} draws no map; it takes projection=direction_cosine and a "
+                f"pooling for it (array_response, mean_power or element_sum), got {plane} and {name_of(self.pooling)}"
             )
         if self.draws_map and grid.elevations.min() < 0 and not self.projection.sees_below:
             raise ValueError(
-                f"the map's grid reaches below the array's plane, which {projection['name']} folds onto what is above; "
-                "take mercator or equirectangular"
+                f"the map's grid reaches below the array's plane, which {plane} folds onto what is above; take "
+                "mercator or equirectangular"
             )
         zone = self.pooling.zone
         if self.pooling.grid is None:
@@ -103,31 +117,44 @@ class GaussianSplatting(Model):
         self.placement = registry("placement").build(placement, scene=scene, channels=channels)
         if self.placement.model not in (None, self.name):
             raise ValueError(
-                f"placement {placement['name']!r} makes another predictor, whose results have a name of their own; set "
-                f"model={self.placement.model}"
+                f"placement {name_of(self.placement)!r} makes another predictor, whose results have a name of their "
+                f"own; set model={self.placement.model}"
             )
-        if self.own_placement not in (None, placement["name"]):
+        if self.own_placement not in (None, name_of(self.placement)):
             raise ValueError(
-                f"model {self.name!r} takes placement={self.own_placement}, got {placement['name']}; take "
+                f"model {self.name!r} takes placement={self.own_placement}, got {name_of(self.placement)}; take "
                 f"+experiment={self.name}, which has all its parts"
             )
         if gaussians is None and not self.placement.has_own:
-            raise ValueError(f"placement {placement['name']!r} places free Gaussians alone; set gaussians=lattice")
+            raise ValueError(
+                f"placement {name_of(self.placement)!r} places free Gaussians alone; set gaussians=lattice"
+            )
         self.gaussians = None
         if gaussians is not None:
             self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels)
             if self.placement.has_own and self.gaussians.degree:
                 raise ValueError(
-                    f"Gaussians beside those of placement {placement['name']!r} must have gaussians.degree=0, got "
-                    f"{self.gaussians.degree}"
+                    f"Gaussians beside those of placement {name_of(self.placement)!r} must have gaussians.degree=0, "
+                    f"got {self.gaussians.degree}"
                 )
-        reads_tokens = registry("deformation").get(deformation["name"]).reads_tokens
+        kind = deformation
+        if not is_built(deformation):
+            name = deformation if isinstance(deformation, str) else deformation["name"]
+            kind = registry("deformation").get(name)
+        reads_tokens = kind.reads_tokens
         self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene) if reads_tokens else None
         context = {"scene": scene, "channels": channels}
         if reads_tokens:
             parts = self.tokenizer
             context["tokenizer_widths"] = parts.scene_width, parts.gaussian_width, parts.transmitter_width
         self.deformation = registry("deformation").build(deformation, **context)
+
+    @staticmethod
+    def own_pooling(scene: Scene) -> str | dict:
+        """The pooling that suits the scene's labels."""
+        if scene.task.directions is not None:
+            return "spectrum"
+        return "element_sum" if scene.task.dtype.is_complex else "softmax_attention"
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:

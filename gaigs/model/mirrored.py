@@ -1,23 +1,29 @@
 """Mirrored Gaussians: our own predictor, which learns the walls of the room."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from scipy.constants import speed_of_light
-from torch import Tensor
+from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.model import _learnt_room
+from gaigs.deformation import Deformation
+from gaigs.model import Model, _learnt_room
 from gaigs.model._plane_search import fewer, find_planes
 from gaigs.model.gaigs import GaussianSplatting
+from gaigs.placement import Placement
+from gaigs.pooling import Pooling
 from gaigs.pooling.element_sum import ElementSum
+from gaigs.projection import Projection
 from gaigs.propagation import carriers, direct_gains, direct_waves, fit_gain
 from gaigs.query import Batch, Query
+from gaigs.rasterizer import Rasterizer
 from gaigs.registry import register
 from gaigs.report.shapes import LearntRoom
+from gaigs.scene import Scene
 
 REACH, ROOM = 4.0, 0.03
 """How far a plane is looked for on either side of where it is: in wavelengths, and the first time at least in diagonals
@@ -48,7 +54,7 @@ class Mirrored(GaussianSplatting):
     along its normal to where the loss is least, by steps of a fraction of the wavelength, and descent goes on.
 
     Args:
-        As for ``GaussianSplatting``, with a placement ``mirrored``.
+        As for ``GaussianSplatting``, with a placement ``mirrored``; each part is by default what suits it.
 
     Source: ours; docs/methods.md.
     """
@@ -57,6 +63,26 @@ class Mirrored(GaussianSplatting):
     revisions = (0.0, 0.06, 0.25, 0.5, 0.75)
 
     places: Query | None = None  # set by fit
+
+    def __init__(
+        self,
+        scene: Scene,
+        placement: str | Mapping | Placement = "mirrored",
+        tokenizer: str | Mapping | nn.Module = "multiview",
+        deformation: str | Mapping | Deformation = "none",
+        projection: str | Mapping | Projection = "direction_cosine",
+        rasterizer: str | Mapping | Rasterizer = "aperture",
+        pooling: str | Mapping | Pooling | None = None,
+        gaussians: Mapping | None = None,
+        trend: str | Mapping | Model | None = None,
+    ):
+        super().__init__(scene, placement, tokenizer, deformation, projection, rasterizer, pooling, gaussians, trend)
+
+    @staticmethod
+    def own_pooling(scene: Scene) -> str | dict:
+        if scene.task.directions is not None:
+            return "array_response"
+        return "element_sum" if scene.task.dtype.is_complex else {"name": "mean_power", "floor_db": -120.0}
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:

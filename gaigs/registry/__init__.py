@@ -17,7 +17,7 @@ from types import MappingProxyType, NoneType, UnionType
 
 from omegaconf import OmegaConf
 
-from gaigs.registry._holders import Holder, find_holders, sources
+from gaigs.registry._holders import GIVEN, Holder, find_holders, sources
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
@@ -76,7 +76,7 @@ class Registry:
             if holders and not any(holder.owns(component) for holder in holders):
                 raise self._taken(name, holders[0].where, _origin(component))
             self._registered[name] = component
-            return component
+            return _noting(self.kind, name, component)
 
         return decorate
 
@@ -102,20 +102,23 @@ class Registry:
         causes = "".join(f"; cannot read {cause}" for cause in unreadable)
         raise ValueError(f"unknown {self.kind} {suggest(name, names)}; there are: {_listed(names)}{causes}")
 
-    def build(self, config: Mapping, **context):
+    def build(self, config: str | Mapping | object, **context):
         """The component that a configuration names, made with its options.
 
         Args:
-            config: The key ``name``; every other key is an option of the component.
+            config: The name, or a mapping with the key ``name``, whose other keys are options of the component. A
+                component that is built already is given back.
             context: What the caller knows and no configuration says, e.g. ``scene``; passed where the component has a
                 parameter of that name.
 
         Raises:
-            TypeError: The configuration is no mapping.
+            TypeError: The configuration is none of these.
             ValueError: The name is missing, unknown or taken twice; an option is missing or unknown.
             ImportError: The component cannot be imported.
         """
-        options = _plain(config, self.kind)
+        if is_built(config):
+            return config
+        options = {"name": config} if isinstance(config, str) else _plain(config, self.kind)
         if "name" not in options:
             raise ValueError(
                 f"a {self.kind} configuration needs the key 'name', got {options}; there are: {_listed(self.names())}"
@@ -135,7 +138,7 @@ class Registry:
             if holder.file is not None and not holder.file.samefile(module.__file__):
                 raise ImportError(f"{module.__file__} is imported as {name!r} already; rename one of the two")
             if attribute:
-                return functools.reduce(getattr, attribute.strip().split("."), module)
+                return _noting(self.kind, holder.name, functools.reduce(getattr, attribute.strip().split("."), module))
             return self._registered[holder.name]
         except KeyboardInterrupt as error:  # Ctrl-C, or of the module's own
             error.args = error.args or (f"stopped while {self.kind} {holder.name!r} of {holder.where} was loaded",)
@@ -174,6 +177,80 @@ def register(kind: str, name: str, /) -> Callable:
         ValueError: There is no such kind, or the name is taken by another component.
     """
     return registry(kind).register(name)
+
+
+def is_built(config: object) -> bool:
+    """Whether what stands for a component is the component itself, and neither its name nor its configuration."""
+    return not isinstance(config, str | bytes | Mapping | NoneType | numbers.Number | list | tuple | type)
+
+
+def name_of(component: object) -> str:
+    """What errors call a component: its registered name, or its class's."""
+    return getattr(component, "configuration", {}).get("name", type(component).__name__)
+
+
+def configuration_of(component: object) -> dict:
+    """The configuration that makes a component anew: ``build`` takes it.
+
+    Raises:
+        ValueError: The component, or a part of it, has no registered name, or was made with what no file can hold.
+    """
+    if not hasattr(component, "configuration"):
+        raise ValueError(
+            f"{type(component).__name__} must have a name to be stored; put @gaigs.register(kind, name) over the class"
+        )
+    return _storable(component.configuration, name_of(component))
+
+
+def _storable(value: object, where: str):
+    """A value in plain dictionaries, lists, numbers and strings."""
+    if isinstance(value, Mapping):
+        return {key: _storable(entry, f"{where}, {key}") for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_storable(entry, where) for entry in value]
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if hasattr(value, "item") and getattr(value, "ndim", None) == 0:  # a number of numpy or torch
+        return value.item()
+    if hasattr(value, "configuration"):
+        return configuration_of(value)
+    raise ValueError(
+        f"{where} must be a number, a text, a list or a registered component to be stored, got {type(value).__name__}"
+    )
+
+
+def _noting(kind: str, name: str, component: Callable) -> Callable:
+    """A class whose instances note as ``configuration`` what they were made with; functions as they are."""
+    make = getattr(component, "__init__", None)
+    if not isinstance(component, type) or getattr(make, "notes", None) is component:
+        return component
+    signature = inspect.signature(make)
+    itself = next(iter(signature.parameters))
+    given = {itself, *GIVEN.get(kind, ())}
+
+    @functools.wraps(make)
+    def noting(self, *args, **kwargs) -> None:
+        make(self, *args, **kwargs)
+        if type(self) is component:  # and no subclass, which has a name of its own, or none
+            bound = signature.bind(self, *args, **kwargs)
+            bound.apply_defaults()
+            options = {}
+            for key, value in bound.arguments.items():
+                match signature.parameters[key].kind:
+                    case inspect.Parameter.VAR_KEYWORD:
+                        options |= value
+                    case inspect.Parameter.VAR_POSITIONAL:
+                        pass
+                    case _:
+                        options[key] = value
+            options = {key: value for key, value in options.items() if key not in given}
+            object.__setattr__(self, "configuration", {"name": name, **options})
+
+    noting.notes = component
+    component.__init__ = noting
+    return component
 
 
 def call(what: str, function: Callable, options: Mapping, /, **context):

@@ -1,5 +1,7 @@
 """The paper's tokenizer: geometric algebra and Euclidean embeddings together."""
 
+from collections.abc import Mapping
+
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -16,13 +18,15 @@ class MultiviewTokenizer(nn.Module):
 
     Args:
         scene: Handed to both.
-        ga: Configuration of the tokenizer that gives the scene token.
-        euclidean: Configuration of the tokenizer that gives the position embeddings.
+        ga: The tokenizer that gives the scene token, its name or its configuration.
+        euclidean: The one that gives the position embeddings, likewise.
 
     Source: GAI-GS, "Multi-view Tokenizer".
     """
 
-    def __init__(self, scene: Scene, ga: dict, euclidean: dict):
+    def __init__(
+        self, scene: Scene, ga: str | Mapping | nn.Module = "ga", euclidean: str | Mapping | nn.Module = "euclidean"
+    ):
         super().__init__()
         self.ga = registry("tokenizer").build(ga, scene=scene)
         self.euclidean = registry("tokenizer").build(euclidean, scene=scene)

@@ -87,9 +87,7 @@ def krige(model: Model, links: Links, config: dict, folder: Path, train: Callabl
     kriged.solve(links, all_values)
     blind = kriged.without_validation(links, all_values)
     kriged.weigh(links, all_values, blind)
-    checkpoint.exchange_model(
-        folder / "best.ckpt", {"name": "kriging", "trend": config["model"], "fallback": fallback}, kriged
-    )
+    checkpoint.exchange_model(folder / "best.ckpt", kriged)
     seconds += time.monotonic() - start
     facts = kriged.facts()["kriging"]
     log.info(
