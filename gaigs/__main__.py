@@ -7,18 +7,18 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
-from gaigs import configuration, files, processes
-from gaigs.processes import Stopped, forward_to_children, lacks_memory, limit_threads, only_run, stopping
+from gaigs import commands, configuration, files, processes
+from gaigs.processes import Stopped, forward_to_children, lacks_memory, limited_threads, stopping
 from gaigs.report import at_end
 
 log = logging.getLogger("gaigs")
@@ -31,134 +31,31 @@ JOBLIB_LAUNCHER = "hydra_plugins.hydra_joblib_launcher.joblib_launcher.JoblibLau
 
 
 def run(config: DictConfig) -> float | None:
-    """Does the command of a configuration.
+    """One job: ``gaigs.run`` in Hydra's run folder.
 
     Returns:
-        Of a training the validation score that sweepers look at; see ``train``.
-
-    Raises:
-        CompactHydraException: There is no such command, or it fails for a reason that a user can mend.
-    """
-    match config.get("command"):  # None where it is missing
-        case "train":
-            try:
-                return train(config)
-            except Exception as error:
-                if HydraConfig.get().mode is RunMode.MULTIRUN:
-                    # Hydra prints that of the first job that failed alone: so each says it in its log, in one line.
-                    log.error("gaigs: %s", " ".join(str(error).removeprefix("gaigs: ").split()) or repr(error))
-                raise
-        case "benchmark":
-            return benchmark(config)
-        case "devices":
-            return list_devices()
-        case "agreement":
-            return compare_labels(config)
-        case unknown:
-            raise CompactHydraException(
-                f"gaigs: command must be train, benchmark, agreement or devices, got {unknown!r}"
-            )
-
-
-def train(config: DictConfig) -> float | None:
-    """Runs one configuration in Hydra's run folder.
-
-    Returns:
-        The mean of the task's watched score over the validation links, for sweepers; None where nothing validates.
+        Of a training the mean of the task's watched score over the validation links, for sweepers; None where nothing
+        validates.
 
     Raises:
         CompactHydraException: What a user can mend, as one message; Hydra prints it without the traceback and exits
             with 1, after the other jobs of a multirun. With ``hydra.verbose=true`` the traceback comes before it.
         SystemExit: A signal has stopped the run: 128 and the signal's number, as shells report it.
     """
-    plain, folder = resolved(config), Path(HydraConfig.get().runtime.output_dir)
-
-    def work() -> dict | None:
-        from gaigs import experiment  # slow to import
-
-        return experiment.run(plain, folder)
-
-    metrics = going_on_later(work)
-    return None if metrics is None else metrics["validation_score"]
-
-
-def benchmark(config: DictConfig) -> None:
-    """Runs a benchmark in Hydra's run folder.
-
-    Raises:
-        CompactHydraException, SystemExit: As of ``train``.
-    """
-    plain, folder = resolved(config), Path(HydraConfig.get().runtime.output_dir)
-    own = ("command=", "benchmark=", "benchmark.")
-    overrides = [word for word in HydraConfig.get().overrides.task if not word.lstrip("+~").startswith(own)]
-
-    def work() -> None:
-        from gaigs.benchmark import Context, devices  # slow to import
-        from gaigs.registry import registry
-
-        chosen = registry("benchmark").build(plain["benchmark"])
-        with only_run(folder):
-            chosen.run(folder, Context(tuple(overrides), devices()))
-        log.info("results: %s", folder)
-
-    going_on_later(work)
-
-
-def compare_labels(config: DictConfig) -> None:
-    """Writes how far the labels of a data set agree into Hydra's run folder.
-
-    Raises:
-        CompactHydraException: As for ``train``.
-    """
-    plain = resolved(config)
-    with mendable("the same command does it anew"):
-        from gaigs import agreement  # slow to import
-
-        agreement.run(plain, Path(HydraConfig.get().runtime.output_dir))
-
-
-def resolved(config: DictConfig) -> dict:
-    """The configuration in plain dictionaries, checked; from here on so many threads are taken as it says.
-
-    Raises:
-        CompactHydraException: It is not complete, a value does not suit its key, or the multirun has been stopped.
-    """
-    settings = HydraConfig.get()
-    if processes.received:
-        raise CompactHydraException("gaigs: not started, as the multirun has been stopped")
-    try:
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        configuration.check(plain)
-        if plain["command"] == "train":
-            processes.check_ranks()
-        is_sweep = settings.mode is RunMode.MULTIRUN
-        limit_threads(plain["threads"], settings.launcher.get("n_jobs", 1) if is_sweep else 1)
-    except MissingMandatoryValue as error:
-        key = error.full_key
-        raise CompactHydraException(f"gaigs: {key} must be given, as it has no default; add {key}=...") from None
-    except OmegaConfBaseException as error:  # whose message Hydra adds
-        raise CompactHydraException("gaigs: the configuration is not complete") from error
-    except (TypeError, ValueError) as error:
-        raise CompactHydraException(f"gaigs: {error}") from error
-    return plain
-
-
-def going_on_later(work: Callable):
-    """What ``work`` gives, which goes on in the same folder where it was stopped.
-
-    Raises:
-        CompactHydraException, SystemExit: As of ``train``.
-    """
     settings = HydraConfig.get()
     is_sweep = settings.mode is RunMode.MULTIRUN
-    mode = "sweep" if is_sweep else "run"
+    folder, mode = Path(settings.runtime.output_dir), "sweep" if is_sweep else "run"
     goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
+    own = ("command=", "benchmark=", "benchmark.")
+    overrides = [word for word in settings.overrides.task if not word.lstrip("+~").startswith(own)]
     try:
         with mendable(goes_on), stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
-            importlib.import_module("lightning.pytorch")  # slow: here, once the configuration has proved good
-            for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
-                logging.getLogger(name).setLevel(logging.WARNING)
-            return work()
+            plain = configuration.resolve(config)
+            if plain["command"] == "train":
+                processes.check_ranks()
+                importlib.import_module("lightning.pytorch")  # slow: here, once the configuration has proved good
+            with limited_threads(None, settings.launcher.get("n_jobs", 1) if is_sweep else 1):
+                metrics = commands.run(plain, folder, overrides)
     except KeyboardInterrupt as stop:
         told = f"gaigs: {str(stop) or 'stopped'}; {goes_on}"
         number = getattr(stop, "number", signal.SIGINT)
@@ -170,6 +67,12 @@ def going_on_later(work: Callable):
             raise SystemExit(0) from None
         print(told, file=sys.stderr)
         raise SystemExit(128 + number) from None
+    except Exception as error:
+        if is_sweep:
+            # Hydra prints that of the first job that failed alone: so each says it in its log, in one line.
+            log.error("gaigs: %s", " ".join(str(error).removeprefix("gaigs: ").split()) or repr(error))
+        raise
+    return None if metrics is None else metrics["validation_score"]
 
 
 @contextlib.contextmanager
@@ -217,22 +120,6 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
     from lightning.pytorch.utilities.exceptions import MisconfigurationException  # slow to import
 
     return str(error) if isinstance(error, MisconfigurationException) else None
-
-
-def list_devices() -> None:
-    """Prints the OpenCL devices, one a line, and which of them ``rasterizer=opencl`` takes by default.
-
-    Raises:
-        CompactHydraException: There is no OpenCL driver, or GAIGS_OPENCL_DEVICE names no device.
-    """
-    try:
-        from gaigs.rasterizer import opencl  # slow to import
-
-        names, default = opencl.devices(), opencl.default_device()
-    except (ValueError, ImportError, RuntimeError) as error:
-        raise CompactHydraException(f"gaigs: {error}") from error
-    for number, name in enumerate(names):
-        print(f"{name}  <- rasterizer=opencl takes this one" if number == names.index(default) else name)
 
 
 def compose_and_run() -> None:

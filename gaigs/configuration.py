@@ -3,19 +3,28 @@
 import hashlib
 import logging
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from importlib import metadata
 from pathlib import Path
 
+import hydra
+from hydra import initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+)
 
-from gaigs.registry import KINDS, check_type, find_holders, suggest
+from gaigs.registry import KINDS, check_type, find_holders, storable, suggest
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +45,9 @@ KEYS = {
 
 TASK_KEYS = {"name": str, "trend": dict | None, "baselines": list[dict]}
 """The same under ``task``, of which all but the name may be missing."""
+
+CHOSEN = (*KINDS, "gaussians", "density", "trainer")
+"""Keys of which each is a choice of one file or component."""
 
 CONSTRUCTED = tuple(kind for kind in KINDS if kind not in ("task", "training", "benchmark"))
 """Kinds whose components need no configuration file: their constructors say what there is to set."""
@@ -121,6 +133,135 @@ def check(config: dict) -> None:
         raise ValueError(f"seed must be in 0..{2**32 - 1}, got {config['seed']}")
     if config["save_every"] < 0:
         raise ValueError(f"save_every must be at least 0 s, got {config['save_every']}")
+
+
+def compose(*overrides: str, **options) -> dict:
+    """The whole configuration of a run, as the command line makes it: presets, then overrides, then options.
+
+    Args:
+        overrides: Words of the command line, e.g. ``"+experiment=mirrored"`` or ``"trainer.max_steps=300"``.
+        options: Values by their keys, ``**{"trainer.max_steps": 300}``, or by an option's name alone where only one
+            part has it, ``max_steps=300``. A part is chosen by its name, ``tokenizer="ga"``, by a mapping with a name
+            and options, or by an object.
+
+    Returns:
+        Plain dictionaries, lists, numbers and strings: what ``gaigs.run`` takes.
+
+    Raises:
+        TypeError: A value is not of its key's type.
+        ValueError: A word or an option is unknown, a value out of range, or one that must be given is missing.
+
+    Example:
+        >>> configuration = gaigs.compose("+experiment=mirrored", "trainer.max_steps=300", planes=8)
+        >>> configuration["model"]["name"], configuration["trainer"]["max_steps"], configuration["placement"]["planes"]
+        ('mirrored', 300, 8)
+    """
+    return composed(overrides, options)
+
+
+def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str] = ()) -> dict:
+    """As ``compose``; with sections, the options are those of the first one that has such a name."""
+    install()
+    choices, values = _choices(options)
+    is_ready = GlobalHydra.instance().is_initialized()  # by Hydra's main, which allows no other
+    try:
+        with nullcontext() if is_ready else initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            config = hydra.compose("config", [*overrides, *choices])
+    except Exception as error:
+        if not isinstance(error, HydraException | OmegaConfBaseException | ValueError) and not is_composing(error):
+            raise
+        raise ValueError(explain(error)) from None
+    for key, value in values.items():
+        path = _path(config, key, sections)
+        with open_dict(config) if key.startswith("+") else nullcontext():
+            OmegaConf.update(config, path, value, merge=isinstance(value, Mapping), force_add=key.startswith("+"))
+    return resolve(config)
+
+
+def has_preset(task: str) -> bool:
+    """Whether a task has a configuration file, which one of a plug-in may be without."""
+    return any((folder / "task" / f"{task}.yaml").is_file() for folder in (conf_dir(), *plugin_conf_dirs()))
+
+
+def resolve(config: DictConfig) -> dict:
+    """A composed configuration in plain dictionaries, checked.
+
+    Raises:
+        TypeError: A value is not of its key's type.
+        ValueError: It is not complete, a key is unknown, or a value out of range.
+    """
+    try:
+        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except MissingMandatoryValue as error:
+        raise ValueError(f"{error.full_key} must be given, as it has no default; add {error.full_key}=...") from None
+    except OmegaConfBaseException as error:
+        raise ValueError(f"the configuration is not complete\n{error}") from error
+    check(plain)
+    return plain
+
+
+def _choices(options: Mapping) -> tuple[list[str], dict]:
+    """Of options the words that choose a part, and the values to be set then."""
+    choices, values = [], {}
+    for key, value in options.items():
+        value = storable(value, key)
+        if key not in CHOSEN:
+            values[key] = value
+        elif value is None or isinstance(value, str):
+            choices.append(f"{key}={'null' if value is None else value}")
+        elif isinstance(value, Mapping):
+            choices += [f"{key}={value['name']}"] if "name" in value else []
+            values[key] = {name: entry for name, entry in value.items() if name != "name"}
+        else:
+            raise TypeError(f"{key} must be a name, a mapping with a name and options, or a component, got {value!r}")
+    return choices, values
+
+
+def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
+    """The key that a name stands for: itself if there are dots in it or it stands at the top, else where a part has it.
+
+    Raises:
+        ValueError: There is no such key, or several parts have one.
+    """
+    is_new, name = name.startswith("+"), name.removeprefix("+")
+    plain = OmegaConf.to_container(config)
+    if sections:
+        places = [section for section in sections if name in plain[section]]
+        if not places:
+            has = sorted({key for section in sections for key in plain[section]} - {"name"})
+            parts = " and ".join(f"{section} {plain[section]['name']!r}" for section in sections)
+            raise ValueError(f"{parts} have no option {suggest(name, has)}; they have: {', '.join(has)}")
+        return f"{places[0]}.{name}"
+    if "." in name or name in plain:
+        parent = plain
+        for part in name.split(".")[:-1]:
+            parent = parent.get(part) if isinstance(parent, dict) else None
+        if not is_new and (not isinstance(parent, dict) or name.rpartition(".")[2] not in parent):
+            has = parent if isinstance(parent, dict) else ()
+            raise ValueError(
+                f"{name.rpartition('.')[0]} has no key {suggest(name.rpartition('.')[2], has)}; it has: "
+                f"{', '.join(sorted(has)) or 'none'}"
+            )
+        return name
+    found = {key for key in _options(plain, "") if key.rpartition(".")[2] == name}
+    # The model is joined from the parts; of its own options none is another's.
+    found = found & {f"model.{name}"} or found
+    if len(found) == 1:
+        return found.pop()
+    if found:
+        raise ValueError(f"{name} is an option of several parts; say which: {', '.join(sorted(found))}")
+    known = {key.rpartition(".")[2] for key in _options(plain, "")} | plain.keys()
+    raise ValueError(f"there is no option {suggest(name, known)}; python -m gaigs --help lists all")
+
+
+def _options(config: Mapping, prefix: str) -> Iterator[str]:
+    """Keys of all options of parts; what parts are made of others refers to them by ${...}."""
+    for key, value in config.items():
+        is_part = isinstance(value, Mapping) and (not prefix or "name" in value)
+        if is_part and key not in ("data", "split", "task"):
+            yield from _options(value, f"{prefix}{key}.")
+        elif prefix and not str(value).startswith("${"):
+            yield f"{prefix}{key}"
 
 
 def is_composing(error: Exception) -> bool:
@@ -224,5 +365,6 @@ OmegaConf.register_new_resolver("launcher", launcher, replace=True)
 
 
 def install() -> None:
-    """Makes Hydra look into the conf folders of plug-ins too; to be called before ``hydra.main`` composes."""
-    Plugins.instance().register(PluginConfigurations)
+    """Makes Hydra look into the conf folders of plug-ins too; to be called before it composes."""
+    if PluginConfigurations not in Plugins.instance().discover(SearchPathPlugin):
+        Plugins.instance().register(PluginConfigurations)

@@ -17,6 +17,10 @@ class Rays:
     Attributes:
         elevations: One a ray [rad].
         azimuths: One a ray [rad].
+
+    Example:
+        >>> gaigs.Rays(elevations=torch.tensor([0.0, 0.5]), azimuths=torch.tensor([0.0, 3.0])).vectors().shape
+        torch.Size([2, 3])
     """
 
     elevations: Float[Tensor, "k"]
@@ -49,6 +53,10 @@ class Grid:
     Attributes:
         elevations: One a row [rad].
         azimuths: One a column [rad].
+
+    Example:
+        >>> gaigs.Grid.degrees().shape, gaigs.Grid.degrees(elevations=range(-30, 31, 10), azimuths=range(8)).shape
+        ((90, 360), (7, 8))
     """
 
     elevations: Float[Tensor, "rows"]

@@ -1,24 +1,30 @@
 """What a run reports of a trained model and its baselines: scores, times, predictions, figures."""
 
+import io
 import platform
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Int
+from rich.console import Console, Group
+from rich.jupyter import JupyterMixin
 from torch import Tensor
 
+from gaigs.configuration import composed, has_preset
 from gaigs.data import Links, Split
 from gaigs.files import whole
 from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.model import Model
-from gaigs.registry import registry
+from gaigs.registry import name_of, registry
 from gaigs.report.shapes import LearntRoom
+from gaigs.report.table import metrics_table, verdict
 from gaigs.scene import Scene
+from gaigs.task import Task
 
 BATCH = 64
 """Links predicted at a time."""
@@ -66,14 +72,86 @@ def predict(model: Model, links: Links, index: Int[Tensor, "k"]) -> Tensor:
     return torch.cat([model.predict(links.query[part], batch_size=BATCH).cpu() for part in index.split(BATCH)])
 
 
-def test(models: Mapping[str, Model], baselines: Mapping[str, Mapping], links: Links, folder: Path) -> Scores:
-    """Scores of a run's models and their baselines on every test link; writes ``predictions.npz``.
+@dataclass(frozen=True)
+class Evaluation(JupyterMixin):
+    """Scores on the test links; prints as a table, in a notebook too.
+
+    Attributes:
+        task: What the labels are, and so what the scores are.
+        split: Its name.
+        scores: Of every test link (k,), by the model's name and the score's; the evaluated model first.
+        device: What the numbers were computed on.
+    """
+
+    task: Task
+    split: str
+    scores: Scores
+    device: str
+
+    @property
+    def models(self) -> dict[str, dict[str, float]]:
+        """The numbers of the table, by the model's name and the metric's."""
+        return {name: self.task.summarise(values) for name, values in self.scores.items()}
+
+    def __rich__(self) -> Group:
+        facts = {"task": self.task.name, "split": self.split, "device": self.device, "models": self.models}
+        return Group(metrics_table(facts), verdict(facts))
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=120)
+        console.print(self)
+        return console.file.getvalue().rstrip()
+
+
+def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | None = None) -> Evaluation:
+    """Scores of a model on the test links, beside those of baselines that are fitted to the others.
+
+    Args:
+        model: Trained, fitted or loaded, on links of the same receivers and task.
+        links: With a split.
+        baselines: Names or configurations of models without a training; None is the task's own.
+
+    Raises:
+        ValueError: The links have no test links or are of another task, or a baseline has to be trained.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=50)
+        >>> result = gaigs.evaluate(gaigs.train("knn", links), links, baselines=["mean", "path_loss"])
+        >>> list(result.models)
+        ['knn', 'mean', 'path_loss']
+        >>> print(result)
+        Test scores
+        ...
+        evaluated on ...
+    """
+    task = links.task
+    if task.name != model.scene.task.name or task.shape != model.scene.task.shape:
+        raise ValueError(
+            f"links must have the model's labels, {model.scene.task.name!r} {tuple(model.scene.task.shape)}, got "
+            f"{task.name!r} {tuple(task.shape)}"
+        )
+    own, trained = name_of(model), getattr(model, "trend", None)
+    models = {own: model}
+    if own == "kriging":
+        own = name_of(trained)
+        models = {own: model, f"{own}_trend": trained}
+    if baselines is None:
+        baselines = composed([f"task={task.name}"], {})["baselines"] if has_preset(task.name) else ()
+    named = [{"name": baseline} if isinstance(baseline, str) else baseline for baseline in baselines]
+    scores = score(models, baseline_configurations(named, own, links.scene), links)
+    return Evaluation(task, links.split.name, scores, device_name(device_of(model)))
+
+
+def score(
+    models: Mapping[str, Model], baselines: Mapping[str, Mapping], links: Links, folder: Path | None = None
+) -> Scores:
+    """Scores of models and their baselines on every test link.
 
     Args:
         models: By name; the first one's predictions are written.
         baselines: Configurations by name.
         links: All of them.
-        folder: Of the run.
+        folder: Gets ``predictions.npz``; None leaves no file.
     """
     task, index = links.task, links.split.test
     labels = torch.cat([links.labels[part] for part in index.split(BATCH)])
@@ -94,8 +172,9 @@ def test(models: Mapping[str, Model], baselines: Mapping[str, Mapping], links: L
         scores[key] = task.scores(labels, values)
         content.setdefault("prediction", task.packed(values))
         content |= {f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()}
-    with whole(folder / "predictions.npz") as part:
-        np.savez_compressed(part, **content)
+    if folder is not None:
+        with whole(folder / "predictions.npz") as part:
+            np.savez_compressed(part, **content)
     return scores
 
 

@@ -1,12 +1,15 @@
-"""One experiment from its configuration to its run folder."""
+"""Training: of a model on links, and of one run from its configuration to its folder."""
 
+import contextlib
 import hashlib
 import json
 import logging
 import signal
+import tempfile
 import threading
 import warnings
 from pathlib import Path
+from typing import NamedTuple
 
 import lightning
 import torch
@@ -16,18 +19,19 @@ from hydra.types import RunMode
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
+from lightning.pytorch.utilities.seed import isolate_rng
 from omegaconf import OmegaConf
 from rich.console import Console
 from torch import Tensor, distributed
 
 from gaigs import checkpoint, evaluation
-from gaigs.configuration import check, differences
+from gaigs.configuration import composed, differences, has_preset
 from gaigs.data import Links, load
 from gaigs.files import whole, write_text
 from gaigs.loss import Loss
 from gaigs.model import Model
-from gaigs.processes import STOPPING, Stopped, is_first, only_run
-from gaigs.registry import call, registry
+from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
+from gaigs.registry import call, configuration_of, registry
 from gaigs.report.runs import read_metrics
 from gaigs.report.table import metrics_table, verdict
 from gaigs.training.batches import Batches, InOrder
@@ -72,11 +76,21 @@ def run(config: dict, folder: Path) -> dict | None:
         OSError: A file cannot be written, e.g. as the disk is full; nothing half-written is left of it.
         KeyboardInterrupt: Ctrl-C, or ``gaigs.processes.Stopped`` for it and SIGTERM.
     """
-    check(config)
-    if not is_first():
-        logging.getLogger("gaigs").setLevel(logging.WARNING)  # one of them tells it all
-        train_and_test(config, folder)
-        return None
+    with limited_threads(config["threads"]):
+        if not is_first():
+            logging.getLogger("gaigs").setLevel(logging.WARNING)  # one of them tells it all
+            train_and_test(config, folder)
+            return None
+        metrics = _in_folder(config, folder)
+    console = Console()
+    console.print(metrics_table(metrics))
+    console.print(verdict(metrics))
+    console.print(f"results: {folder}", soft_wrap=True)
+    return metrics
+
+
+def _in_folder(config: dict, folder: Path) -> dict:
+    """The contents of ``metrics.json``, whether it is there already or not."""
     folder.mkdir(parents=True, exist_ok=True)
     with only_run(folder):
         claim(folder, config)
@@ -89,10 +103,6 @@ def run(config: dict, folder: Path) -> dict | None:
             if not is_configuration(folder / "config.yaml"):  # the folder was removed, and loggers have made it anew
                 store(config, folder)
             write_text(finished, json.dumps(metrics, indent=2) + "\n")
-    console = Console()
-    console.print(metrics_table(metrics))
-    console.print(verdict(metrics))
-    console.print(f"results: {folder}", soft_wrap=True)
     return metrics
 
 
@@ -144,6 +154,97 @@ def is_configuration(file: Path) -> bool:
     return isinstance(content, dict) and {"model", "data"} <= content.keys()
 
 
+def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Path | None = None, **options) -> Model:
+    """A model trained on links as the command line would train it, by the preset of the model and the links' task.
+
+    Args:
+        model: Name of any registered model; or one that is made already, which is trained where it stands.
+        links: What to learn from; validation links choose the best step. Test links are not looked at.
+        overrides: Words of the command line, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
+        folder: Gets the configuration, the log and the checkpoints; the same call goes on there where an earlier one
+            was stopped. None leaves no files.
+        options: Values by their keys or names, as ``gaigs.compose`` takes them: ``max_steps=300, seed=0``.
+
+    Returns:
+        The model with the best validation score, in evaluation mode; of ``mirrored`` with kriging on top.
+
+    Raises:
+        TypeError: An option is of another type than it must be.
+        ValueError: A name is unknown, an option out of range, or model and links do not fit.
+        KeyboardInterrupt: Ctrl-C.
+
+    Example:
+        >>> links = gaigs.links("synthetic", transmitters=40, order=0)
+        >>> model = gaigs.train("gaigs", links, max_steps=2, count=20, enable_progress_bar=False)
+        >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape
+        torch.Size([2, 90, 360])
+    """
+    if links.split is None:
+        raise ValueError("links must have a split to be trained on; gaigs.links(..., split='random') gives one")
+    own = None if isinstance(model, str) else model
+    name = model if own is None else configuration_of(own)["name"]
+    words = [f"model={name}", *([f"task={links.task.name}"] if has_preset(links.task.name) else [])]
+    config = composed([*words, *overrides], options)
+    config |= {"data": {"name": "arrays"}, "split": {"name": links.split.name}, **links.origin}
+    if own is not None:
+        config["model"] = configuration_of(own)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(limited_threads(config["threads"]))
+        stack.enter_context(isolate_rng())
+        place = Path(stack.enter_context(tempfile.TemporaryDirectory()) if folder is None else folder)
+        place.mkdir(parents=True, exist_ok=True)
+        stack.enter_context(only_run(place))
+        claim(place, config)
+        lightning.seed_everything(config["seed"], verbose=False)
+        loss = registry("loss").build(config["loss"], task=links.task)
+        return fit(own, loss, links, config, place).models[config["model"]["name"]].eval()
+
+
+class Fitted(NamedTuple):
+    """What ``fit`` gives.
+
+    Attributes:
+        models: By name: the model, and where it was kriged behind it the trained one alone, ``<name>_trend``.
+        unseen: The same without what validation links alone told; empty of a look-up.
+        start: Gaussians before the training.
+        seconds: Of training; None of a look-up.
+        kriging_seconds: None without kriging.
+    """
+
+    models: dict[str, Model]
+    unseen: dict[str, Model]
+    start: int
+    seconds: float | None = None
+    kriging_seconds: float | None = None
+
+
+def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
+    """Builds a model unless it is there already, fits it to links, and trains and kriges it where that is asked for.
+
+    Returns:
+        None in all but the first of several processes.
+    """
+    name = config["model"]["name"]
+    if model is None:
+        model = registry("model").build(config["model"], scene=links.scene)
+    check_kriging(config, model, links)
+    parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
+    log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
+    model.fit(links)
+    start = count_gaussians(model)
+    if not evaluation.is_trained(model):
+        return Fitted({name: model}, {}, start)
+    model, seconds = descend(model, loss, links, config, folder)
+    if not config["kriging"]:
+        return Fitted({name: model}, {name: model}, start, seconds) if is_first() else None
+    descend_fold = lambda model, part, folder: descend(model, loss, part, config, folder)
+    kriged = krige(model, links, config, folder, descend_fold)
+    if kriged is None:
+        return None
+    models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged.model, kriged.blind))
+    return Fitted(models, unseen, start, seconds, kriged.seconds)
+
+
 def train_and_test(config: dict, folder: Path) -> dict | None:
     """All of a run but the terminal's tables.
 
@@ -163,28 +264,13 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     log.info("data: training transmitters within %s m%s", box, links.remarks and f"; {links.remarks}")
     loss = registry("loss").build(config["loss"], task=task)
     baselines = evaluation.baseline_configurations(config["baselines"], name, scene)
-    model = registry("model").build(config["model"], scene=scene)
-    check_kriging(config, model, links)
-    parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
-    log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
-    model.fit(links)
-
-    start, seconds, size = count_gaussians(model), None, None
-    models, unseen, look_ups = {name: model}, {}, {name: config["model"], **baselines}
-    if evaluation.is_trained(model):
-        model, seconds = train(model, loss, links, config, folder)
-        models, unseen, look_ups = {name: model}, {name: model}, baselines
-        if config["kriging"]:
-            train_fold = lambda model, part, folder: train(model, loss, part, config, folder)
-            kriged = krige(model, links, config, folder, train_fold)
-        if not is_first():
-            return None
-        if config["kriging"]:
-            models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged.model, kriged.blind))
-        size = (folder / "best.ckpt").stat().st_size
-    model = models[name]
-    scores = evaluation.test(models, baselines, links, folder)
-    validation = evaluation.validate(unseen, look_ups, links)
+    fitted = fit(None, loss, links, config, folder)
+    if fitted is None:
+        return None
+    model, is_trained = fitted.models[name], bool(fitted.unseen)
+    scores = evaluation.score(fitted.models, baselines, links, folder)
+    look_ups = baselines if is_trained else {name: config["model"], **baselines}
+    validation = evaluation.validate(fitted.unseen, look_ups, links)
     metrics = {
         "task": task.name,
         "data": links.remarks,
@@ -192,28 +278,28 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "seed": config["seed"],
         "device": evaluation.device_name(evaluation.device_of(model)),
         "rasterizer": None,
-        "train_seconds": seconds,
+        "train_seconds": fitted.seconds,
         "inference_ms": evaluation.inference_ms(model, links),
         "render_ms": evaluation.render_ms(model, links),
         "num_gaussians": count_gaussians(model),
-        "num_gaussians_start": start,
+        "num_gaussians_start": fitted.start,
         "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
-        "checkpoint_bytes": size,
+        "checkpoint_bytes": (folder / "best.ckpt").stat().st_size if is_trained else None,
         "models": {name: task.summarise(values) for name, values in scores.items()},
         "validation": {name: task.summarise(values) for name, values in validation.items()},
         "validation_score": validation[name][task.watched].mean().item() if validation else None,
         "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
     } | model.facts()
     if config["kriging"]:
-        metrics["kriging"]["seconds"] = kriged.seconds
+        metrics["kriging"]["seconds"] = fitted.kriging_seconds
     model.export(folder)
     task.keep(folder, model)
     evaluation.write_figures(folder, links, model.primitives, model.learnt_room(links))
     return metrics
 
 
-def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Model, float]:
-    """Trains the model.
+def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Model, float]:
+    """Trains the model by gradients.
 
     Returns:
         The model at the step with the best validation score, or at the last step where nothing is held out for
@@ -243,6 +329,8 @@ def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) ->
     if config["tensorboard"]:
         loggers.append(tensorboard_logger(folder))
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
+    for name in ("lightning.pytorch", "lightning.fabric"):  # which tell of devices that are there and not taken
+        logging.getLogger(name).setLevel(logging.WARNING)
     trainer = call("trainer", lightning.Trainer, options, **context)
     check_trainer(trainer)
     steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
@@ -259,8 +347,8 @@ def train(model: Model, loss: Loss, links: Links, config: dict, folder: Path) ->
     handlers = {number: signal.getsignal(number) for number in STOPPING}
     try:
         with warnings.catch_warnings():
-            # Of Lightning's own dealings with torch, and of a split without validation links.
-            for message in (".*LeafSpec", "You defined a `validation_step` but have no `val_dataloader`"):
+            # Of Lightning's own dealings with torch, of a split without validation links, and of few steps.
+            for message in (".*LeafSpec", "You defined a `validation_step` but", "The number of training batches"):
                 warnings.filterwarnings("ignore", message)
             trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     except Interrupted as stop:

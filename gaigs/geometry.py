@@ -27,6 +27,11 @@ class Pose:
         position: Centre of the array, world frame (3,) [m].
         rotation: Columns are the array's axes in the world frame (3, 3), so a world point x
             is seen at ``rotation.T @ (x - position)``.
+
+    Example:
+        >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])  # scipy's order: looks along the axes
+        >>> pose.local(torch.tensor([3.0, 0.0, 2.0]))
+        tensor([2., 0., 0.])
     """
 
     position: Float[Tensor, "3"]

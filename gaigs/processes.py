@@ -46,8 +46,9 @@ class Stopped(KeyboardInterrupt):
         self.number = number
 
 
-def limit_threads(count: int | None, jobs: int = 1) -> None:
-    """Has torch and PoCL take so many threads; to be called before OpenCL is first used.
+@contextlib.contextmanager
+def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
+    """Has torch and PoCL take so many threads; PoCL keeps those with which it was first used.
 
     Args:
         count: Threads; None leaves everything as it is, but shares the processors where several jobs run at a time.
@@ -57,6 +58,7 @@ def limit_threads(count: int | None, jobs: int = 1) -> None:
         ValueError: The count is less than 1.
     """
     if count is None and jobs in (0, 1):
+        yield
         return
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if count is None:
@@ -65,9 +67,18 @@ def limit_threads(count: int | None, jobs: int = 1) -> None:
         raise ValueError(f"threads must be at least 1, or null for all, got {count}")
     import torch  # slow to import
 
-    for name in ("OMP_NUM_THREADS", *POCL_THREADS):
-        os.environ[name] = str(count)
+    names = ("OMP_NUM_THREADS", *POCL_THREADS)
+    before, environment = torch.get_num_threads(), {name: os.environ.get(name) for name in names}
+    os.environ |= dict.fromkeys(names, str(count))
     torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        for name, value in environment.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
 
 
 def lacks_memory(error: BaseException | None) -> bool:

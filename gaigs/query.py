@@ -1,16 +1,21 @@
 """What a model is asked: who sends, who hears, at which frequency; and a batch of such questions with their labels."""
 
+import reprlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.directions import Directions
+from gaigs.geometry import FAR
 
 CARRIERS = 1e4, 3e11
 """All carriers lie from the first to the second [Hz]; another number is in another unit."""
+
+NEAR = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
 
 UNITS = {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}
 
@@ -29,6 +34,38 @@ def check_carrier(name: str, frequency: float) -> None:
         raise ValueError(f"{name} must be {expected}, got {frequency:.7g}{unit_hint(frequency)}")
 
 
+def as_numbers(what: str, values: object, expected: str) -> Tensor:
+    """Real numbers of any kind as a float tensor.
+
+    Raises:
+        ValueError: They are none.
+    """
+    try:
+        tensor = torch.as_tensor(values)
+        if tensor.is_complex() or tensor.dtype == torch.bool or np.ma.is_masked(values):
+            raise TypeError(str(tensor.dtype))
+    except (TypeError, ValueError, RuntimeError, OverflowError):  # whatever torch meets in words, or in ragged lists
+        raise ValueError(f"{what} must be {expected} in real numbers, got {reprlib.repr(values)}") from None
+    return tensor.to(torch.float32)
+
+
+def as_positions(what: str, values: object) -> Float[Tensor, "*points 3"]:
+    """Positions of any kind as a float32 tensor (..., 3) [m].
+
+    Raises:
+        ValueError: They are none, or one is not finite or too far away.
+    """
+    positions = as_numbers(what, values, "(..., 3) positions [m]")
+    if not positions.ndim or positions.shape[-1] != 3:
+        raise ValueError(f"{what} must be (..., 3) positions [m], got shape {tuple(positions.shape)}")
+    points = positions.reshape(-1, 3)
+    for holds, expected in ((points.isfinite(), "finite"), (points.abs() < FAR, NEAR)):
+        if not holds.all():
+            row = int((~holds).any(1).nonzero()[0])
+            raise ValueError(f"{what} must be {expected}, got {points[row].tolist()} in row {row}")
+    return positions
+
+
 @dataclass
 class Query:
     """Links, each of one transmitter to one receiver. Two are alike only if all their fields are.
@@ -37,6 +74,11 @@ class Query:
         transmitters: Positions, world frame (b, 3) [m].
         receivers: Indices into the scene's receivers (b,).
         frequencies: Of the carrier (b,) [Hz], from 10 kHz to 300 GHz; None where it is unknown.
+
+    Example:
+        >>> query = gaigs.Query(torch.tensor([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]), torch.tensor([0, 0]))
+        >>> len(query), query[:1].transmitters
+        (2, tensor([[1.0000, 2.0000, 1.5000]]))
     """
 
     transmitters: Float[Tensor, "b 3"]

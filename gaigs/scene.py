@@ -37,6 +37,10 @@ class Array:
 
     Raises:
         ValueError: There is no such pattern, or the elements are not (e, 3).
+
+    Example:
+        >>> len(gaigs.Array.planar(4, 4, pitch=0.16)), len(gaigs.Array.single())
+        (16, 1)
     """
 
     elements: Float[Tensor, "e 3"]
@@ -98,7 +102,18 @@ class Array:
 
 @dataclass(frozen=True)
 class Receiver:
-    """An antenna array or gateway: its name in the files, its pose in the room, its array."""
+    """An antenna array or gateway.
+
+    Attributes:
+        name: In files and tables.
+        pose: Position [m] and orientation in the room.
+        array: Its elements; one isotropic antenna by default.
+
+    Example:
+        >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])
+        >>> len(gaigs.Receiver("door", pose, gaigs.Array.planar(4, 4, pitch=0.16)).array)
+        16
+    """
 
     name: str
     pose: Pose
@@ -117,6 +132,11 @@ class Scene:
         frequencies: The training links' different carriers, ascending (f,) [Hz]; empty where they are unknown.
         bandwidth: Of the band around each carrier that a label's power is averaged over, 0 for a carrier alone [Hz];
             None where it is unknown.
+
+    Example:
+        >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
+        >>> [receiver.name for receiver in scene.receivers], scene.task.name
+        (['west', 'south', 'east', 'north'], 'rssi')
     """
 
     receivers: tuple[Receiver, ...]

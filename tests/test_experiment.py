@@ -22,7 +22,7 @@ from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.geometry import Pose
 from gaigs.processes import Stopped, stopping
-from gaigs.radio_map import RadioMap
+from gaigs.radio_maps import RadioMap
 from gaigs.report.curves import read_curves
 from gaigs.testing import example_links
 from gaigs.training.descent import Descent

@@ -11,7 +11,7 @@ import gaigs
 from gaigs.directions import Grid
 from gaigs.geometry import ExtrapolationWarning, Pose
 from gaigs.model import Model, Prediction
-from gaigs.radio_map import FEWEST, POINTS, RadioMap, radio_map
+from gaigs.radio_maps import FEWEST, POINTS, RadioMap, radio_map
 from gaigs.scene import Receiver, Scene
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi

@@ -15,7 +15,7 @@ import gaigs
 from gaigs import checkpoint
 from gaigs.files import sentence, whole
 from gaigs.gaussians import write_ply
-from gaigs.radio_map import RadioMap
+from gaigs.radio_maps import RadioMap
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -23,12 +23,26 @@ class Algebra:
     - G(3,1,0), ``SPACETIME``: e1² = e2² = e3² = 1, e4² = -1, components
       ``1, e1, e2, e3, e4, e12, e13, e14, e23, e24, e34, e123, e124, e134, e234, e1234``.
 
-    Tables are made once for each signature, device and dtype; every operation follows those of its input.
+    Tables are made once for each signature, device and dtype; every operation follows those of its input, takes any
+    leading axes, and is differentiable.
 
     Raises:
         ValueError: A count is negative, or all are zero.
 
     Source: GAI-GS, "Geometric Algebra"; Roelfs & De Keninck, Graded Symmetry Groups, 2023.
+
+    Example:
+        >>> from gaigs.algebra import PROJECTIVE
+        >>> from gaigs.algebra.embedding import embed_plane, embed_point, extract_point
+        >>> wall = embed_plane(torch.tensor([1.0, 0.0, 0.0]), torch.tensor(4.0))  # the plane x = 4 m
+        >>> place = torch.tensor([1.0, 2.0, 1.5], requires_grad=True)
+        >>> image = extract_point(PROJECTIVE.sandwich(wall, embed_point(place)))  # where a mirror shows it
+        >>> image
+        tensor([7.0000, 2.0000, 1.5000], grad_fn=<DivBackward0>)
+        >>> line = PROJECTIVE.join(embed_point(place), embed_point(image))  # through both
+        >>> x, y = torch.randn(2, 5, 16)
+        >>> torch.allclose(PROJECTIVE.product(x, y), PROJECTIVE.product(x, y[:, None])[range(5), range(5)])
+        True
     """
 
     p: int

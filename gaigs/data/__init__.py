@@ -1,6 +1,6 @@
 """Measured and simulated links: who sent from where, who heard, and the label."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,7 +9,9 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gaigs.query import Batch, Query
+from gaigs import configuration
+from gaigs.geometry import Pose
+from gaigs.query import Batch, Query, as_positions, check_carrier
 from gaigs.registry import registry
 from gaigs.scene import Receiver, Scene
 from gaigs.task import Task
@@ -32,7 +34,7 @@ class Split:
         return {"train": self.train, "validation": self.validation, "test": self.test}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Links:
     """A data set: n links, each from one transmitter position to one receiver.
 
@@ -51,6 +53,15 @@ class Links:
             None where it is unknown.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty where unknown.
         remarks: What was read, and what was left out and why, in a sentence.
+        origin: Configurations of ``data`` and ``split`` that it was made by; empty for arrays in memory.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=50)
+        >>> links
+        <200 links of task 'rssi' to 4 receivers; split official, validation 0.1, seed 0: ...>
+        >>> batch = links.batch(links.split.test[:8])
+        >>> batch.query.transmitters.shape, batch.labels.shape
+        (torch.Size([8, 3]), torch.Size([8]))
     """
 
     query: Query
@@ -63,6 +74,14 @@ class Links:
     bandwidth: float | None = None
     edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
     remarks: str = ""
+    origin: Mapping = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        parts = "no split"
+        if self.split is not None:
+            counts = ", ".join(f"{len(part)} {name}" for name, part in self.split.parts().items())
+            parts = f"split {self.split.name}: {counts}"
+        return f"<{len(self)} links of task {self.task.name!r} to {len(self.receivers)} receivers; {parts}>"
 
     def __len__(self) -> int:
         return len(self.query)
@@ -116,4 +135,112 @@ def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
             f"the labels of data {data['name']!r} are of task {links.task.name!r}, and the configuration is for "
             f"{task!r}; add task={links.task.name}"
         )
-    return replace(links, split=registry("split").build(split, links=links))
+    origin = {"data": dict(data), "split": dict(split)}
+    return replace(links, split=registry("split").build(split, links=links), origin=origin)
+
+
+def links(reader: str | None = None, /, **options) -> Links:
+    """Links of a registered reader, or of arrays in memory, with their split.
+
+    Args:
+        reader: Name of a data set's reader, e.g. ``"synthetic"``, ``"nerf2_spectrum"``, ``"rssi_csv"``; None where
+            arrays are given.
+        options: ``split``, the name of a registered split, by default the one that suits the reader, and of arrays
+            ``"random"``; and the options of reader and split by their names. Of arrays those of ``from_arrays``:
+            ``task``, ``transmitters`` (n, 3) [m], ``receivers``, ``labels``.
+
+    Raises:
+        FileNotFoundError: The reader finds no data there.
+        TypeError: An option is of another type than it must be.
+        ValueError: A name is unknown, or the files, arrays or the split do not fit.
+
+    Example:
+        >>> gaigs.links("synthetic_rssi", transmitters=50, split="blocks", edge=2.0).split.name
+        'blocks 2 m, test 0.2, validation 0.1, seed 0'
+        >>> places = [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [2.0, 2.0, 1.0]]
+        >>> readings = [[-40.0, -52.0], [-45.0, float("nan")], [-50.0, -41.0], [-55.0, -44.0]]  # [dBm], nan: not heard
+        >>> len(gaigs.links(task="rssi", transmitters=places, receivers=[[0, 0, 2], [3, 3, 2]], labels=readings))
+        7
+    """
+    if reader is None:
+        return from_arrays(**options)
+    config = configuration.composed([f"data={reader}"], options, ("data", "split"))
+    return load(config["data"], config["split"])
+
+
+def from_arrays(
+    task: str | Task,
+    transmitters: Float[Tensor, "n 3"],
+    receivers: Receiver | Sequence[Receiver] | Float[Tensor, "k 3"],
+    labels: Tensor,
+    index: Int[Tensor, "n"] | None = None,
+    frequency: float | Float[Tensor, "n"] | None = None,
+    split: str = "random",
+    **options,
+) -> Links:
+    """Links of arrays in memory, with their split; anything that becomes a tensor is an array.
+
+    Args:
+        task: What the labels are: ``"rssi"`` (scalars [dBm]), or a task with its axes, e.g.
+            ``gaigs.task.spectrum.Spectrum(elevations, azimuths, "")`` or ``gaigs.task.csi.Csi(elements, frequencies)``.
+        transmitters: Positions, world frame (n, 3) [m].
+        receivers: ``Receiver`` objects, or positions (3,) or (k, 3) [m] of single antennas that look along the axes.
+        labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver, (n, k, ...). A
+            reading that is NaN and a channel of zeros was not heard, and is left out.
+        index: The receiver of each link (n,), from 0. Where it is missing there is one receiver; or n positions, each
+            of one link; or labels are (n, k, ...).
+        frequency: Carrier, one or one a link [Hz]; None is unknown, of channels the middle of the subcarriers.
+        split: Name of a registered split.
+        options: Of the split.
+
+    Raises:
+        TypeError: An option is of another type than it must be.
+        ValueError: Shapes do not fit, a number is not finite or out of range, or there is nothing to split.
+    """
+    config = configuration.composed([f"split={split}"], options, ("split",))["split"]
+    task = registry("task").build(task)
+    places = as_positions("transmitters", transmitters)
+    if isinstance(receivers, Receiver):
+        receivers = [receivers]
+    if not (isinstance(receivers, Sequence) and all(isinstance(each, Receiver) for each in receivers)):
+        stands, which = as_positions("receivers", receivers).unique(dim=0, return_inverse=True)
+        if index is None and len(which) == len(places) > 1 and np.ndim(labels) == 1 + len(task.shape):
+            index = which
+        else:
+            stands = as_positions("receivers", receivers)
+        receivers = [Receiver(f"rx{k}", Pose(place, torch.eye(3))) for k, place in enumerate(stands)]
+    labels = torch.as_tensor(labels).to(task.dtype)
+    count, most, shape = len(places), len(receivers), tuple(task.shape)
+    rows = torch.arange(count)
+    if tuple(labels.shape) == (count, most, *shape) and index is None:
+        rows, index = rows.repeat_interleave(most), torch.arange(most).repeat(count)
+        labels = labels.flatten(0, 1)
+    elif tuple(labels.shape) == (count, *shape) and (index is not None or most == 1):
+        index = torch.zeros(count, dtype=torch.long) if index is None else torch.as_tensor(index).long()
+    else:
+        raise ValueError(
+            f"labels of task {task.name!r} must be {(count, *shape)} with the receiver of each link in index, or "
+            f"{(count, most, *shape)}, one for each transmitter and receiver, got {tuple(labels.shape)}"
+        )
+    if index.shape != (len(rows),) or not ((index >= 0) & (index < most)).all():
+        raise ValueError(f"index must be {count} numbers from 0 to {most - 1}, got {index.tolist()[:5]} ...")
+    flat = labels.reshape(len(rows), -1)
+    heard = (flat != 0).any(1) if task.dtype.is_complex else ~flat.isnan().all(1)
+    if not heard.any() or not flat[heard].isfinite().all():
+        raise ValueError("labels must be finite where something was heard, and something must have been")
+    carriers = None
+    if frequency is None and hasattr(task, "frequencies"):
+        frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
+    if frequency is not None:
+        carriers = torch.as_tensor(frequency, dtype=torch.float32).expand(count)[rows]
+        for carrier in carriers.unique().tolist():
+            check_carrier("frequency", carrier)
+    made = Links(
+        query=Query(places[rows][heard], index[heard], None if carriers is None else carriers[heard]),
+        receivers=tuple(receivers),
+        labels=labels[heard],
+        task=task,
+        rows=rows[heard],
+        remarks=f"{int((~heard).sum())} links were not heard and are left out" if not heard.all() else "",
+    )
+    return replace(made, split=registry("split").build(config, links=made))

@@ -12,14 +12,13 @@ import torch
 from torch import Tensor
 
 from gaigs.geometry import FAR
+from gaigs.query import NEAR
 
 SHOWN = 10
 """Defects that an error lists one by one."""
 
 LONGEST = 400
 """Characters of a defect that an error shows."""
-
-NEAR = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
 
 BESIDE_QUOTE = re.compile(r"(?<=\")[ \t]+(?=,|$)")
 """Blanks behind a quoted cell."""

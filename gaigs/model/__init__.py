@@ -8,18 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs import checkpoint
 from gaigs.data import Links
-from gaigs.data._files import NEAR
 from gaigs.directions import Directions, Grid, Rays
 from gaigs.gaussians import Gaussians
-from gaigs.geometry import FAR, ExtrapolationWarning
-from gaigs.query import CARRIERS, Batch, Query, check_carrier
+from gaigs.geometry import ExtrapolationWarning
+from gaigs.query import CARRIERS, Batch, Query, as_numbers, as_positions, check_carrier
 from gaigs.registry import check_type, registry
 from gaigs.report.shapes import LearntRoom
 from gaigs.scene import Scene
@@ -56,6 +54,24 @@ class Model(nn.Module):
         trained_by: The component of kind ``training`` that trains it.
         chunk: Most pairs of a link and a direction that are evaluated at a time; None: whole labels, whatever their
             size. Training sees whatever ``training.thinning`` leaves.
+        configuration: Of a registered one the options that it was made with; ``save`` stores it.
+
+    Example:
+        >>> class Nearest(gaigs.Model):
+        ...     \"\"\"What the nearest training place has.\"\"\"
+        ...
+        ...     def fit(self, links):
+        ...         train = links.split.train
+        ...         self.places, self.values = links.query[train].transmitters, links.labels[train]
+        ...
+        ...     def forward(self, batch):
+        ...         near = torch.cdist(batch.query.transmitters, self.places).argmin(1)
+        ...         return self.values[near], {}
+        >>> links = gaigs.links("synthetic", transmitters=20, order=0)
+        >>> model = Nearest(links.scene)
+        >>> model.fit(links)
+        >>> model(links.batch(links.split.test))[0].shape
+        torch.Size([4, 90, 360])
     """
 
     trained_by = "descent"
@@ -192,6 +208,14 @@ class Model(nn.Module):
                 such receiver; a frequency is out of range, is another than the training links' only one, or is missing
                 where they have several; the batch size is less than 1; directions are asked for where the label has
                 none, or are no angles in radians; or a query is given with a receiver or a frequency beside it.
+
+        Example:
+            >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
+            >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape
+            torch.Size([2, 90, 360])
+            >>> few = gaigs.Grid.degrees(elevations=range(10, 90, 10), azimuths=range(0, 360, 10))
+            >>> model.predict([1.0, 2.0, 1.5], directions=few).shape
+            torch.Size([8, 36])
         """
         query, shape, directions = self._ask(transmitters, receiver, frequency, batch_size, directions)
         parts = [*query.parts(batch_size)] or [query]
@@ -256,15 +280,9 @@ class Model(nn.Module):
         if directions is not None and own is None:
             raise ValueError(f"labels of task {self.scene.task.name!r} have no directions; leave directions out")
         directions = own if directions is None else as_directions(directions)
-        transmitters = as_numbers("transmitters", transmitters, "(..., 3) positions [m]")
-        if not transmitters.ndim or transmitters.shape[-1] != 3:
-            raise ValueError(f"transmitters must be (..., 3) positions [m], got shape {tuple(transmitters.shape)}")
+        transmitters = as_positions("transmitters", transmitters)
         shape = transmitters.shape[:-1]
         points = transmitters.reshape(-1, 3)
-        for holds, expected in ((points.isfinite(), "finite"), (points.abs() < FAR, NEAR)):
-            if not holds.all():
-                row = int((~holds).any(1).nonzero()[0])
-                raise ValueError(f"transmitters must be {expected}, got {points[row].tolist()} in row {row}")
         receivers = self._index(receiver, shape).to(points.device)
         query = Query(points, receivers, self._frequencies(frequency, shape))
         device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
@@ -346,21 +364,6 @@ class Model(nn.Module):
                 f"receivers must be one, or one for each of the {tuple(shape)} positions, got {tuple(index.shape)}"
             )
         return index.expand(shape).reshape(-1)
-
-
-def as_numbers(what: str, values: object, expected: str) -> Tensor:
-    """Real numbers of any kind as a float tensor.
-
-    Raises:
-        ValueError: They are none.
-    """
-    try:
-        tensor = torch.as_tensor(values)
-        if tensor.is_complex() or tensor.dtype == torch.bool or np.ma.is_masked(values):
-            raise TypeError(str(tensor.dtype))
-    except (TypeError, ValueError, RuntimeError, OverflowError):  # whatever torch meets in words, or in ragged lists
-        raise ValueError(f"{what} must be {expected} in real numbers, got {reprlib.repr(values)}") from None
-    return tensor.to(torch.float32)
 
 
 def as_directions(directions: Directions) -> Directions:

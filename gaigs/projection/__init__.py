@@ -1,14 +1,17 @@
 """Projections lay Gaussians on the receiver's perception plane."""
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gaigs.directions import Directions
-from gaigs.geometry import Pose
+from gaigs.directions import Directions, Rays
+from gaigs.geometry import Pose, semi_axes
+from gaigs.registry import name_of, registry
 
 NEAR = 1e-6
 """A Gaussian nearer to the receiver than this sits on it [m]: float32 tells no direction between two positions of some
@@ -114,6 +117,63 @@ class Projection(ABC):
         points = torch.where(visible[..., None], points, points.new_tensor([1.0, 0.0, 0.0]))
         across, along = (self.jacobian(points) @ receiver.rotation.mT @ semi_axes).unbind(-2)
         return Splats(self.coordinates(points), factor(across, along, self.pixel_variance), depths, visible)
+
+
+def project(
+    means: Float[Tensor, "*b n 3"],
+    quats: Float[Tensor, "*b n 4"],
+    scales: Float[Tensor, "*b n 3"],
+    *,
+    receiver: Pose,
+    grid: Directions,
+    projection: str | Mapping | Projection = "mercator",
+) -> tuple[Splats, Plane]:
+    """Quaternions are (w, x, y, z) of any length, in the world frame: Gaussians as a receiver sees them, in 2-D.
+
+    Args:
+        means: Centres, world frame (n, 3) [m].
+        quats: Orientations, the columns of whose rotation matrices are the Gaussians' axes in the world frame (n, 4).
+        scales: Standard deviations along these axes (n, 3) [m].
+        receiver: A ``gaigs.Pose``, or a ``gaigs.Receiver``, whose pose counts.
+        grid: Directions of the pixels in the receiver's frame, ``gaigs.Grid`` or ``gaigs.Rays``; the footprints are
+            widened by a pixel of its pitch.
+        projection: Name, configuration or object.
+
+    Returns:
+        The splats, and where the pixels lie on the plane; differentiable in means, quaternions and scales. Each input
+        may have a leading axis b of transmitters.
+
+    Raises:
+        ValueError: A shape does not fit, or there is no such projection.
+
+    Example:
+        >>> from gaigs.projection import project
+        >>> means, quats = torch.tensor([[3.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+        >>> pose = gaigs.Pose.from_xyzw([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+        >>> splats, plane = project(means, quats, torch.full((1, 3), 0.1), receiver=pose, grid=gaigs.Grid.degrees())
+        >>> splats.means2d.shape, splats.covariances2d.shape, plane.shape  # (azimuth, stretched elevation)
+        (torch.Size([1, 2]), torch.Size([1, 1, 2, 2]), (90, 360))
+    """
+    for name, values, size in (("means", means, 3), ("quats", quats, 4), ("scales", scales, 3)):
+        if values.ndim not in (2, 3) or values.shape[-1] != size or values.shape[-2] != means.shape[-2]:
+            raise ValueError(
+                f"{name} must be (n, {size}) or (b, n, {size}) with the n of means, got {tuple(values.shape)} beside "
+                f"{tuple(means.shape)}"
+            )
+    if isinstance(grid, Rays):
+        pitch = (4 * math.pi / max(len(grid.elevations), 1)) ** 0.5  # as if they covered the sphere
+    else:
+        pitch = grid.pitch
+    chosen = registry("projection").build(projection, pixel=pitch)
+    grid = grid.to(means)
+    if not chosen.sees_below and grid.elevations.min() < 0:
+        raise ValueError(
+            f"the grid reaches below the receiver's plane, which {name_of(chosen)} folds onto what is above; take "
+            "mercator or equirectangular"
+        )
+    axes = semi_axes(quats, scales)
+    pose = getattr(receiver, "pose", receiver)
+    return chosen.project(means, axes if axes.ndim == 4 else axes[None], pose), chosen.plane(grid)
 
 
 def factor(

@@ -44,8 +44,16 @@ LARGEST = 2**63 - 1
 class Registry:
     """The components of one kind, by name.
 
+    ``gaigs.registries`` has one for each kind, by its name.
+
     Args:
         kind: One of ``KINDS``: a folder of gaigs, a folder of conf, and the entry-point group ``gaigs.<kind>``.
+
+    Example:
+        >>> gaigs.registries["tokenizer"].names()
+        ['euclidean', 'ga', 'multiview']
+        >>> gaigs.registries["rasterizer"].build({"name": "torch"}).used
+        'torch'
     """
 
     def __init__(self, kind: str):
@@ -175,6 +183,15 @@ def register(kind: str, name: str, /) -> Callable:
     Raises:
         TypeError: The name is no string, or the component cannot be called.
         ValueError: There is no such kind, or the name is taken by another component.
+
+    Example:
+        >>> @gaigs.register("split", "every_third")
+        ... def every_third(links):
+        ...     number = torch.arange(len(links))
+        ...     part = lambda k: number[number % 3 == k]
+        ...     return type(links.split)("every third", part(0), part(1), part(2)) if links.split else None
+        >>> "every_third" in gaigs.registries["split"].names()
+        True
     """
     return registry(kind).register(name)
 
@@ -199,15 +216,23 @@ def configuration_of(component: object) -> dict:
         raise ValueError(
             f"{type(component).__name__} must have a name to be stored; put @gaigs.register(kind, name) over the class"
         )
-    return _storable(component.configuration, name_of(component))
+    return storable(component.configuration, name_of(component))
 
 
-def _storable(value: object, where: str):
-    """A value in plain dictionaries, lists, numbers and strings."""
+def storable(value: object, where: str):
+    """A value in plain dictionaries, lists, numbers and strings.
+
+    Args:
+        value: Of those, or of registered components, paths, and numbers of numpy or torch.
+        where: What errors call it.
+
+    Raises:
+        ValueError: It is, or holds, something else.
+    """
     if isinstance(value, Mapping):
-        return {key: _storable(entry, f"{where}, {key}") for key, entry in value.items()}
+        return {key: storable(entry, f"{where}, {key}") for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_storable(entry, where) for entry in value]
+        return [storable(entry, where) for entry in value]
     if isinstance(value, Path):
         return str(value)
     if value is None or isinstance(value, bool | int | float | str):

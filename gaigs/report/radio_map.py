@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 from numpy import ndarray
 
-from gaigs.radio_map import RadioMap
+from gaigs.radio_maps import RadioMap
 from gaigs.report.panels import pages, panels
 from gaigs.report.style import GREY, ORANGE, STYLE, round_step, with_unit
 

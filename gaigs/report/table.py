@@ -80,15 +80,17 @@ def metrics_table(metrics: Mapping) -> Group:
     """Models down, metrics across, the best of each metric in bold; below it the same models at each receiver.
 
     Args:
-        metrics: Contents of ``metrics.json``: ``task``, ``split``, ``seed``, ``device``, and ``models`` with the test
-            scores of each. Where links were held out, ``validation`` has the same models' scores on those, of which the
-            first metric is shown too; where there are several receivers, ``receivers`` has ``models`` for each of them.
+        metrics: Contents of ``metrics.json``: ``task``, ``split``, ``device``, of a run ``seed``, and ``models`` with
+            the test scores of each. Where links were held out, ``validation`` has the same models' scores on those, of
+            which the first metric is shown too; where there are several receivers, ``receivers`` has ``models`` for
+            each of them.
     """
     known, models, validation = metrics_of(metrics), metrics["models"], metrics.get("validation") or {}
     has = lambda name: all(name in scores for scores in models.values())
     names = [name for name, metric in known.items() if has(name) and (metric.is_brief or len(known) <= FITTING)]
     # A split's name may end with a seed of its own.
-    caption = escape(f"split {metrics['split']}\nrun with seed {metrics['seed']} on {metrics['device']}")
+    run = f"run with seed {metrics['seed']} on" if "seed" in metrics else "evaluated on"
+    caption = escape(f"split {metrics['split']}\n{run} {metrics['device']}")
     table = Table(title="Test scores", caption=caption)
     table.add_column("model", no_wrap=True)
     columns = []

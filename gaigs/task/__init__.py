@@ -23,6 +23,10 @@ class Metric(NamedTuple):
         title: What a reader calls it, with its unit in brackets.
         larger_is_better: Whether it is a similarity; else it is an error.
         is_brief: Whether a terminal's table shows it too, which has little room.
+
+    Example:
+        >>> gaigs.registries["task"].get("rssi").metrics()["mae_db"]
+        Metric(title='MAE [dB]', larger_is_better=False, is_brief=True)
     """
 
     title: str

@@ -67,7 +67,7 @@ class Scalar(Task):
 
     def keep(self, folder: Path, model) -> None:
         """``radio_map.npz``: what each receiver would report from everywhere on a plane."""
-        from gaigs.radio_map import radio_map  # which itself asks a model
+        from gaigs.radio_maps import radio_map  # which itself asks a model
 
         radio_map(model).save(folder / "radio_map.npz")
 

@@ -8,7 +8,7 @@ import torch
 from scipy.constants import speed_of_light
 
 from gaigs.data import load
-from gaigs.data.synthetic.image_source import bartlett, min_max
+from gaigs.propagation import bartlett, min_max
 from gaigs.directions import Grid
 from gaigs.testing import check_data
 

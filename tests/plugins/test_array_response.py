@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.constants import speed_of_light
 
-from gaigs.data.synthetic.image_source import bartlett, min_max
+from gaigs.propagation import bartlett, min_max
 from gaigs.directions import Grid, Rays
 from gaigs.query import Batch, Query
 from gaigs.registry import registry

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.contour import QuadContourSet
 
-from gaigs.radio_map import RadioMap
+from gaigs.radio_maps import RadioMap
 from gaigs.report.panels import PANELS
 from gaigs.report.radio_map import DOTS, radio_maps
 

@@ -16,7 +16,7 @@ from gaigs.evaluation import write_figures
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Pose
 from gaigs.query import Query
-from gaigs.radio_map import RadioMap
+from gaigs.radio_maps import RadioMap
 from gaigs.report import channels, curves, radio_map, room, shapes, spectra, style
 from gaigs.scene import Array, Receiver
 from gaigs.task.csi import Csi

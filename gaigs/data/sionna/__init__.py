@@ -15,8 +15,8 @@ from gaigs.data.sionna.meshes import HEIGHTS, Room, edges
 from gaigs.data.sionna.rooms import ROOMS
 from gaigs.data.sionna.tracing import frequency_offsets, respond
 from gaigs.data.synthetic import SIDE, last_fifth
-from gaigs.data.synthetic.image_source import bartlett, min_max
 from gaigs.directions import Grid
+from gaigs.propagation import bartlett, min_max
 from gaigs.query import Query, check_carrier
 from gaigs.registry import check_type, register
 from gaigs.scene import Array, Receiver

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from gaigs.data import Links, Parts
 from gaigs.data.nerf2_spectrum import NORMALISATION
-from gaigs.data.synthetic.image_source import Box, Room, bartlett, frequency_offsets, is_free, min_max, respond
+from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond
 from gaigs.directions import Grid
 from gaigs.geometry import Pose
+from gaigs.propagation import bartlett, min_max
 from gaigs.query import Query, check_carrier
 from gaigs.registry import check_type, register
 from gaigs.scene import Array, Receiver

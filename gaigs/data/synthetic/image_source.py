@@ -12,9 +12,8 @@ from jaxtyping import Complex, Float, Int
 from scipy.constants import epsilon_0, speed_of_light
 from torch import Tensor
 
-from gaigs.directions import Grid
 from gaigs.propagation import fresnel
-from gaigs.scene import Array, Receiver, differences
+from gaigs.scene import Receiver
 
 MATERIALS = {
     "concrete": (5.24, 0.0462, 0.7822),
@@ -243,39 +242,6 @@ def respond(
     return torch.einsum("bp,bpnf->bnf", paths.gains * array.gain(directions), waves)
 
 
-def bartlett(
-    responses: Complex[Tensor, "b elements f"], grid: Grid, array: Array, frequency: float
-) -> Float[Tensor, "b rows columns"]:
-    """Amplitude of the conventional beamformer's output, root mean square over the frequencies.
-
-    At one frequency it is |sum_n y_n exp(-j 2 pi / lambda (r_n . u))| for element n at r_n and the direction u. Its
-    square depends on the covariance of the y_n only through the sums over pairs of elements with the same difference of
-    places; of a 4 x 4 array 49 of them instead of 256 pairs make it cheap.
-
-    Args:
-        responses: Of the array's elements.
-        grid: Directions to look into.
-        array: Its elements' places.
-        frequency: Of the carrier, which the weights are those of [Hz].
-
-    Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
-    """
-    covariances = responses @ responses.mH / responses.shape[-1]
-    steps, pair = differences(array.elements.double() * (2 * frequency / speed_of_light))  # in half wavelengths
-    lags = covariances.new_zeros(len(responses), len(steps)).index_add(1, pair, covariances.flatten(1))
-    directions = Grid(grid.elevations.double(), grid.azimuths.double()).flatten().vectors()
-    phases = math.pi * steps @ directions.T
-    power = lags.real @ torch.cos(phases) + lags.imag @ torch.sin(phases)
-    # In a null of the pattern rounding may leave the power a little below zero.
-    return power.clamp(min=0).sqrt().unflatten(1, grid.shape)
-
-
 def rss_dbm(responses: Complex[Tensor, "b elements f"], tx_power_dbm: float = 0.0) -> Float[Tensor, "b"]:
     """Received signal strength [dBm]: power averaged over elements and frequencies."""
     return tx_power_dbm + 10 * torch.log10(responses.abs().square().mean((1, 2)))
-
-
-def min_max(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b rows columns"]:
-    """Each spectrum scaled to [0, 1], as NeRF² labels are."""
-    low, high = spectra.amin((1, 2), keepdim=True), spectra.amax((1, 2), keepdim=True)
-    return (spectra - low) / (high - low)

@@ -127,6 +127,12 @@ def radio_map(
     Raises:
         TypeError: The model is none, or an option is not of its type.
         ValueError: The model predicts something else, an option is out of range, or there is no such receiver.
+
+    Example:
+        >>> model = gaigs.train("path_loss", gaigs.links("synthetic_rssi", transmitters=50))
+        >>> floor = gaigs.radio_map(model, pitch=0.5, height=1.2)
+        >>> floor.values.shape == (len(floor.receivers), len(floor.y), len(floor.x)), floor.unit
+        (True, 'dBm')
     """
     if not hasattr(model, "scene"):
         raise TypeError(f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint first")
