@@ -11,10 +11,11 @@ from pathlib import Path
 import hydra
 from hydra import initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
-from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
+from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import (
@@ -83,16 +84,51 @@ class PluginConfigurations(SearchPathPlugin):
     """
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        folders = plugin_conf_dirs()
-        for folder in folders:
+        for folder in plugin_conf_dirs():
             search_path.append(provider="gaigs plug-in", path=f"file://{folder}")
-        store = ConfigStore.instance()
-        for kind in CONSTRUCTED:
-            store.repo.pop(kind, None)  # that of another working directory
-            written = {file.stem for folder in (conf_dir(), *folders) for file in folder.glob(f"{kind}/*.yaml")}
-            for holder in find_holders(kind)[0]:
-                if holder.name not in written:  # Hydra would join the two
-                    store.store(holder.name, {"name": holder.name, **holder.options(kind)}, kind, provider="gaigs")
+        search_path.append(provider="constructors", path=f"{Constructors.scheme()}://")
+
+
+class Constructors(ConfigSource):
+    """What Hydra finds where a component has no file: ``name``, and its constructor's options with their defaults."""
+
+    def __init__(self, provider: str, path: str):
+        super().__init__(provider, path)
+        holders = ((kind, holder) for kind in CONSTRUCTED for holder in find_holders(kind)[0])
+        self.found = {f"{kind}/{holder.name}": (kind, holder) for kind, holder in holders}
+
+    def __deepcopy__(self, memo: dict) -> "Constructors":
+        return self  # Hydra copies its sources for each group that it lists
+
+    @staticmethod
+    def scheme() -> str:
+        return "constructors"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        kind, holder = self.found[config_path.removesuffix(".yaml")]
+        node = OmegaConf.create({"name": holder.name, **holder.options(kind)})
+        return ConfigResult(self.provider, f"{self.scheme()}://", node, {"package": None})
+
+    def available(self) -> bool:
+        return True
+
+    def is_group(self, config_path: str) -> bool:
+        return config_path.rstrip("/") in ("", *CONSTRUCTED)
+
+    def is_config(self, config_path: str) -> bool:
+        return config_path.removesuffix(".yaml") in self.found
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        files: list[str] = []
+        known = (
+            CONSTRUCTED
+            if config_path == ""
+            else [key.split("/")[1] for key in self.found if key.startswith(f"{config_path}/")]
+        )
+        for name in known:
+            name = name if config_path == "" else f"{name}.yaml"
+            self._list_add_result(files, f"{config_path}/{name}".strip("/"), name, results_filter)
+        return sorted(set(files))
 
 
 def differences(there: dict, here: dict) -> dict[str, tuple]:
@@ -178,9 +214,19 @@ def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str]
     return resolve(config)
 
 
-def has_preset(task: str) -> bool:
-    """Whether a task has a configuration file, which one of a plug-in may be without."""
-    return any((folder / "task" / f"{task}.yaml").is_file() for folder in (conf_dir(), *plugin_conf_dirs()))
+def has_file(kind: str, name: str) -> bool:
+    """Whether there is a configuration file of that kind and name, ours or a plug-in's."""
+    return any((folder / kind / f"{name}.yaml").is_file() for folder in (conf_dir(), *plugin_conf_dirs()))
+
+
+def preset(model: str, task: str) -> list[str]:
+    """The command line's words for a model and the task of its links.
+
+    That is the experiment of the model, of the model and the task, or, of GAI-GS, of the task, where there is one.
+    """
+    names = (task,) if model == "gaigs" else (f"{model}_{task}", model)
+    experiment = [f"+experiment={name}" for name in names if has_file("experiment", name)][:1]
+    return [*experiment, f"model={model}", *([f"task={task}"] if has_file("task", task) else [])]
 
 
 def resolve(config: DictConfig) -> dict:
@@ -337,9 +383,8 @@ def installed(*names: str) -> str:
 
 def known(kind: str, name: str, otherwise: str) -> str:
     """A name of a kind where a configuration file or a component has it, and else another: for choices by task."""
-    folders = (conf_dir(), *plugin_conf_dirs())
-    has_file = any((folder / kind / f"{name}.yaml").is_file() for folder in folders)
-    return name if has_file or any(holder.name == name for holder in find_holders(kind)[0]) else otherwise
+    is_known = has_file(kind, name) or any(holder.name == name for holder in find_holders(kind)[0])
+    return name if is_known else otherwise
 
 
 def by_task(values: Mapping, otherwise: object, *, _root_: DictConfig) -> object:
@@ -367,4 +412,5 @@ OmegaConf.register_new_resolver("launcher", launcher, replace=True)
 def install() -> None:
     """Makes Hydra look into the conf folders of plug-ins too; to be called before it composes."""
     if PluginConfigurations not in Plugins.instance().discover(SearchPathPlugin):
+        Plugins.instance().register(Constructors)
         Plugins.instance().register(PluginConfigurations)

@@ -15,7 +15,7 @@ from rich.console import Console, Group
 from rich.jupyter import JupyterMixin
 from torch import Tensor
 
-from gaigs.configuration import composed, has_preset
+from gaigs.configuration import composed, has_file
 from gaigs.data import Links, Split
 from gaigs.files import whole
 from gaigs.gaussians import SH_DC, Gaussians
@@ -136,7 +136,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | No
         own = name_of(trained)
         models = {own: model, f"{own}_trend": trained}
     if baselines is None:
-        baselines = composed([f"task={task.name}"], {})["baselines"] if has_preset(task.name) else ()
+        baselines = composed([f"task={task.name}"], {})["baselines"] if has_file("task", task.name) else ()
     named = [{"name": baseline} if isinstance(baseline, str) else baseline for baseline in baselines]
     scores = score(models, baseline_configurations(named, own, links.scene), links)
     return Evaluation(task, links.split.name, scores, device_name(device_of(model)))

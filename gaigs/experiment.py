@@ -25,7 +25,7 @@ from rich.console import Console
 from torch import Tensor, distributed
 
 from gaigs import checkpoint, evaluation
-from gaigs.configuration import composed, differences, has_preset
+from gaigs.configuration import composed, differences, preset
 from gaigs.data import Links, load
 from gaigs.files import whole, write_text
 from gaigs.loss import Loss
@@ -183,8 +183,7 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
         raise ValueError("links must have a split to be trained on; gaigs.links(..., split='random') gives one")
     own = None if isinstance(model, str) else model
     name = model if own is None else configuration_of(own)["name"]
-    words = [f"model={name}", *([f"task={links.task.name}"] if has_preset(links.task.name) else [])]
-    config = composed([*words, *overrides], options)
+    config = composed([*preset(name, links.task.name), *overrides], options)
     config |= {"data": {"name": "arrays"}, "split": {"name": links.split.name}, **links.origin}
     if own is not None:
         config["model"] = configuration_of(own)
