@@ -80,7 +80,6 @@ def main() -> None:
     options = parser.parse_intermixed_args()
     if min(options.links, options.repeats) < 1:
         parser.error(f"--links and --repeats must be at least 1, got {options.links} and {options.repeats}")
-    configuration.install()
     renderings, predictions, refusals = {}, {}, []
     for name, overrides in WAYS.items():
         try:

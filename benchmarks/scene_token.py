@@ -42,11 +42,11 @@ import gaigs
 from gaigs import configuration
 from gaigs.data import Links, load
 from gaigs.evaluation import validate
-from gaigs.experiment import train
 from gaigs.model import Model
 from gaigs.placement import Placed
 from gaigs.query import Query
 from gaigs.registry import register, registry
+from gaigs.runs.training import descend
 from gaigs.tokenizer import Tokens
 from gaigs.tokenizer.ga import GATokenizer
 from gaigs.tokenizer.multiview import MultiviewTokenizer
@@ -153,7 +153,7 @@ def compare(ways: list[str], overrides: list[str]) -> Table:
         changes = count_changes(model)
         loss = registry("loss").build(config["loss"], task=links.task)
         with tempfile.TemporaryDirectory() as folder:
-            model, seconds = train(model, loss, links, config, Path(folder))
+            model, seconds = descend(model, loss, links, config, Path(folder))
         score = mean_ssim(model, links)
         count = sum(parameter.numel() for parameter in model.parameters())
         shares = changes[1:]
@@ -337,7 +337,6 @@ def main() -> None:
     commands.add_parser("probe").add_argument("run", type=Path, nargs="+", help="folder of a run")
     commands.add_parser("train").add_argument("words", nargs="+", help=f"of {', '.join(WAYS)}, and KEY=VALUE")
     options = parser.parse_args()
-    configuration.install()
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     console = Console(width=160)
     if options.command == "train":

@@ -38,7 +38,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from gaigs import checkpoint, experiment  # noqa: F401, what a run imports
+from gaigs import checkpoint, runs  # noqa: F401, what a run imports
 from gaigs.evaluation import device_name
 from gaigs.files import whole
 from gaigs.report import curves, room, spectra, style  # noqa: F401, likewise

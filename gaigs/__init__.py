@@ -14,6 +14,8 @@
 import importlib
 from typing import TYPE_CHECKING
 
+from gaigs.version import __version__
+
 if TYPE_CHECKING:
     from gaigs.checkpoint import load
     from gaigs.commands import run
@@ -21,20 +23,18 @@ if TYPE_CHECKING:
     from gaigs.data import Links, links
     from gaigs.directions import Grid, Rays
     from gaigs.evaluation import evaluate
-    from gaigs.experiment import train
     from gaigs.geometry import Pose
     from gaigs.model import Model
     from gaigs.query import Query
     from gaigs.radio_maps import radio_map
     from gaigs.rasterizer import rasterize
     from gaigs.registry import register, registries
+    from gaigs.runs.training import train
     from gaigs.scene import Array, Receiver, Scene
     from gaigs.task import Metric
 
-__version__ = "0.2.0"
-
 PLACES = {
-    "links": "data", "train": "experiment", "evaluate": "evaluation", "load": "checkpoint",
+    "links": "data", "train": "runs.training", "evaluate": "evaluation", "load": "checkpoint",
     "compose": "configuration", "run": "commands", "rasterize": "rasterizer", "radio_map": "radio_maps",
     "register": "registry", "registries": "registry", "Model": "model", "Links": "data", "Query": "query",
     "Grid": "directions", "Rays": "directions", "Receiver": "scene", "Array": "scene", "Pose": "geometry",

@@ -14,7 +14,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException, HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gaigs import commands, configuration, files, processes
@@ -46,11 +46,16 @@ def run(config: DictConfig) -> float | None:
     is_sweep = settings.mode is RunMode.MULTIRUN
     folder, mode = Path(settings.runtime.output_dir), "sweep" if is_sweep else "run"
     goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
-    own = ("command=", "benchmark=", "benchmark.")
-    overrides = [word for word in settings.overrides.task if not word.lstrip("+~").startswith(own)]
+    if config.get("command") == "agreement":
+        goes_on = "the same command does it anew"
     try:
         with mendable(goes_on), stopping(waits=is_sweep and settings.launcher["_target_"] == JOBLIB_LAUNCHER):
+            if config.get("command") == "devices":  # whatever the rest of the configuration
+                return commands.list_devices()
             plain = configuration.resolve(config)
+            own = ("command=", "benchmark=", "benchmark.")
+            words = OmegaConf.to_container(settings.overrides.task)
+            overrides = [word for word in words if not word.lstrip("+~").startswith(own)]
             if plain["command"] == "train":
                 processes.check_ranks()
                 importlib.import_module("lightning.pytorch")  # slow: here, once the configuration has proved good
@@ -152,7 +157,6 @@ def compose_and_run() -> None:
 
 def main() -> None:
     """The console script ``gaigs``."""
-    configuration.install()
     if "command=benchmark" in sys.argv and not any(word.lstrip("+").startswith("benchmark=") for word in sys.argv):
         sys.argv.append("benchmark=all")  # before Hydra composes, so that its options may be given, too
     logging.raiseExceptions = False  # a log that finds no room tells nothing that the run's own files do not

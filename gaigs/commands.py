@@ -44,9 +44,9 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
     config, folder = dict(configuration), Path(folder)
     check(config)
     if config["command"] == "train":
-        from gaigs import experiment  # slow to import
+        from gaigs import runs  # slow to import
 
-        return experiment.run(config, folder)
+        return runs.run(config, folder)
     with limited_threads(config["threads"]):
         match config["command"]:
             case "benchmark":
@@ -62,12 +62,20 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
 
                 agreement.run(config, folder)
             case "devices":
-                from gaigs.rasterizer import opencl  # slow to import
-
-                names, default = opencl.devices(), opencl.default_device()
-                for number, name in enumerate(names):
-                    is_default = number == names.index(default)
-                    print(f"{name}  <- rasterizer=opencl takes this one" if is_default else name)
+                list_devices()
             case unknown:
                 raise ValueError(f"command must be train, benchmark, agreement or devices, got {unknown!r}")
     return None
+
+
+def list_devices() -> None:
+    """Prints the OpenCL devices, one a line, and which of them ``rasterizer=opencl`` takes by default.
+
+    Raises:
+        ValueError, ImportError, RuntimeError: There is no OpenCL driver, or GAIGS_OPENCL_DEVICE names no device.
+    """
+    from gaigs.rasterizer import opencl  # slow to import
+
+    names, default = opencl.devices(), opencl.default_device()
+    for number, name in enumerate(names):
+        print(f"{name}  <- rasterizer=opencl takes this one" if number == names.index(default) else name)

@@ -197,7 +197,6 @@ def compose(*overrides: str, **options) -> dict:
 
 def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str] = ()) -> dict:
     """As ``compose``; with sections, the options are those of the first one that has such a name."""
-    install()
     choices, values = _choices(options)
     is_ready = GlobalHydra.instance().is_initialized()  # by Hydra's main, which allows no other
     try:
@@ -339,7 +338,14 @@ def explain(error: Exception) -> str:
             return f"{place} has no key {word}; it has: {', '.join(sorted(has)) or 'none'}"
         case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:
             kind, _, name = file.rpartition("/")
-            return f"{kind} has no file {suggest(name, names)}; it has: {', '.join(names) or 'none'}"
+            packages = OmegaConf.load(conf_dir() / "published.yaml").packages if kind == "model" else {}
+            if name in packages:
+                package, folder = packages[name], packages[name].removeprefix("gaigs-").replace("-", "_")
+                return (
+                    f"there is no {kind} {name!r} here: it is in the package {package}; pip install {package}, or of a "
+                    f"copy of the repository pip install plugins/{folder}"
+                )
+            return f"there is no {kind} {suggest(name, names)}; there are: {', '.join(names) or 'none'}"
         case HydraException(), _ if str(error).startswith("gaigs: "):  # of a job, which says itself what is wrong
             reason = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
             return f"{str(error).removeprefix('gaigs: ')}{reason}"
@@ -401,16 +407,12 @@ def launcher(name: str) -> str:
     return name
 
 
-# At import: a launcher's workers need them too.
+# At import, for whoever composes: a launcher's workers need them too.
 OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
 OmegaConf.register_new_resolver("installed", installed, replace=True, use_cache=True)
 OmegaConf.register_new_resolver("known", known, replace=True)
 OmegaConf.register_new_resolver("by_task", by_task, replace=True)
 OmegaConf.register_new_resolver("launcher", launcher, replace=True)
-
-
-def install() -> None:
-    """Makes Hydra look into the conf folders of plug-ins too; to be called before it composes."""
-    if PluginConfigurations not in Plugins.instance().discover(SearchPathPlugin):
-        Plugins.instance().register(Constructors)
-        Plugins.instance().register(PluginConfigurations)
+if PluginConfigurations not in Plugins.instance().discover(SearchPathPlugin):
+    Plugins.instance().register(Constructors)
+    Plugins.instance().register(PluginConfigurations)

@@ -52,7 +52,6 @@ def by_bounds(found, watched="mae_db"):
 
 
 def composed(*overrides):
-    configuration.install()
     with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
         return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
 

@@ -84,7 +84,6 @@ def links_of(task):
 
 def compositions(kind, name):
     """Configurations that may choose the component, each with its task, the plainest first."""
-    configuration.install()
     for task in DATA:
         chosen = [f"{kind}={name}"] if kind == "data" else [f"data={DATA[task]}", f"{kind}={name}"]
         for more in {"data": [()], "model": [PLAIN, ()]}.get(kind, [PLAIN, MIRRORED] if kind in PARTS else [PLAIN]):

@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs import checkpoint, evaluation, experiment
+from gaigs import checkpoint, evaluation, runs
 from gaigs.configuration import conf_dir
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
@@ -47,7 +47,7 @@ def folder(tmp_path_factory):
     config["data"] = {"name": "nerf2_spectrum", "root": str(data), "frequency": config["data"]["frequency"]}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "write_figures", lambda *_: None)
-        experiment.run(config, folder / "run")
+        runs.run(config, folder / "run")
     shutil.rmtree(data)
     return folder / "run"
 
@@ -245,7 +245,7 @@ DEFECTS = {
         lambda content: change(content, *SCENE, "receivers", 0).pop("position"),
         "KeyError: 'position'",
     ),
-    "an option too few": (lambda content: change(content, *MODEL).pop("pooling"), "needs option pooling"),
+    "no name": (lambda content: change(content, *MODEL).pop("name"), "needs the key 'name'"),
     "a weight too few": (lambda content: change(content, *WEIGHTS).pop(MEANS), "Missing key.*gaussians.means"),
     "a weight that is a word": (lambda content: change(content, *WEIGHTS).update({MEANS: "means"}), "means"),
     "NaN": (

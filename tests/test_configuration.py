@@ -7,7 +7,6 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gaigs import configuration
 from gaigs.configuration import conf_dir, installed, known, launcher
 from gaigs.registry import registry
 
@@ -20,7 +19,6 @@ TRENDS = {"spectrum": None, "rssi": {"name": "mean"}, "csi": None}
 @pytest.fixture(scope="module")
 def configure():
     """Composes the configuration; with Hydra's own part, as it stands."""
-    configuration.install()
 
     def configure(*overrides, whole=False):
         with initialize_config_dir(str(conf_dir()), version_base="1.3"):
@@ -112,7 +110,6 @@ def test_systems_are_swept_over_as_far_as_they_are_installed(configure, task, mo
 
 
 def test_a_choice_by_task_is_made_where_there_is_one():
-    configuration.install()
     assert known("pooling", "mirrored/rssi", "spectrum") == "mirrored/rssi"
     assert known("pooling", "mirrored/delay", "mean_power") == "mean_power"
 

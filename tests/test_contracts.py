@@ -98,7 +98,6 @@ def seed():
 
 def composed(*overrides):
     """The whole configuration, as the command line would have it."""
-    configuration.install()
     with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
         return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
 

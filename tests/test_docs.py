@@ -27,6 +27,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from gaigs import configuration
+from gaigs.registry import find_holders, registry
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -41,7 +42,7 @@ BRIEF = [
     "trainer.max_steps=2", "trainer.val_check_interval=2", "trainer.accelerator=cpu", "gaussians.count=20",
     "trainer.enable_progress_bar=false", "split.validation=0.2",
 ]  # fmt: skip
-FEW = {"+experiment=delay_spread": ["data.places=20"]}
+FEW = {"+experiment=delay_spread": ["data.places=20"], "+experiment=arrival": ["data.places=20"]}
 """Little data, of an experiment that brings its own."""
 
 
@@ -98,7 +99,6 @@ def place(tmp_path_factory):
     files = written_files(PLUGINS)
     package = folder / "gaigs-plane-waves/gaigs_plane_waves"
     files[package / "__init__.py"] = files["plugins/plane_waves.py"]
-    files[package / "conf/tokenizer/plane_waves.yaml"] = files["plugins/conf/tokenizer/plane_waves.yaml"]
     for path, text in files.items():
         file = folder / path
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,6 @@ def place(tmp_path_factory):
 @pytest.fixture(scope="module")
 def composed(place):
     """Composes gaigs's configuration where the documentation's plug-ins are found."""
-    configuration.install()
 
     @functools.cache
     def composed(*words):
@@ -184,6 +183,7 @@ def test_configuration_keys_exist(page, composed, place):
             continue
         # A key that only some option of its group has, such as data.root, exists too.
         options = [file.stem for folder in folders for file in folder.glob(f"{match['top']}/*.yaml")]
+        options += registry(match["top"]).names() if match["top"] in configuration.CONSTRUCTED else []
         bases = [[f"{match['top']}={option}"] for option in options if "." in word.partition("=")[0]]
         assert any(_has(composed, base, word) for base in ([], *bases)), word
 
@@ -202,18 +202,23 @@ def _has(composed, base, word):
     return True
 
 
+def choices(kind):
+    """Names of our own components and presets of a kind."""
+    built_in = (holder.name for holder in find_holders(kind)[0] if holder.file and holder.root is None)
+    return {*built_in, *(file.stem for file in configuration.conf_dir().glob(f"{kind}/*.yaml"))}
+
+
 @pytest.mark.parametrize("kind", ["data", "split", "model", "deformation", "loss"])
 def test_the_first_page_lists_the_choices(kind):
     _, table = (ROOT / "docs/start.md").read_text().split("| option | choices |\n")
     (row,) = re.findall(rf"^\| `{kind}` \|(.*)$", table.partition("\n\n")[0], re.M)
-    files = configuration.conf_dir().glob(f"{kind}/*.yaml")
-    assert {*re.findall(r"`(\w+)`", row)} == {file.stem for file in files}
+    assert {*re.findall(r"`(\w+)`", row)} == choices(kind)
 
 
 @pytest.mark.parametrize("kind", ["data", "split"])
 def test_the_page_on_data_describes_what_there_is(kind):
     first_cells = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/data.md").read_text(), re.M)
-    assert {file.stem for file in configuration.conf_dir().glob(f"{kind}/*.yaml")} <= {*first_cells}
+    assert choices(kind) <= {*first_cells}
 
 
 def test_the_documented_file_of_channels_is_read(tmp_path):
@@ -257,6 +262,7 @@ def test_the_plug_ins_train_by_their_commands(runs):
     expected = [
         ("gaigs", "spectrum", "tokenizer.waves.weight"),
         ("gaigs", "delay_spread", "trend.levels"),
+        ("gaigs", "arrival", "gaussians.means"),
         ("direction_mlp", "spectrum", "receivers.weight"),
         ("gaigs", "spectrum", "placement.share"),
         ("judged", "spectrum", "generator.gaussians.means"),
@@ -303,7 +309,6 @@ def test_the_packages_are_found_once_installed(place, tmp_path):
 from hydra import compose, initialize_config_dir
 from gaigs import configuration
 from gaigs.registry import registry
-configuration.install()
 with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
     config = compose("config", ["tokenizer=plane_waves", "model=array_response"])
 parts = [registry(kind).get(config[kind]["name"]) for kind in ("tokenizer", "model")]

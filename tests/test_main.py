@@ -1,4 +1,4 @@
-"""The command line as a user meets it; what a run computes is in test_experiment.py."""
+"""The command line as a user meets it; what a run computes is in test_runs.py."""
 
 import contextlib
 import csv
@@ -22,7 +22,7 @@ import yaml
 
 import gaigs
 from gaigs import __main__ as command_line
-from gaigs import agreement, evaluation, experiment
+from gaigs import agreement, evaluation, runs
 from gaigs.processes import COUNTS, RANKS, Stopped, check_ranks
 from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
@@ -178,8 +178,8 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
             "gaigs: training.learning_rates has no key 'meens' (did you mean 'means'?); it has: log_scales, means",
         ),
         (["sede=3"], "gaigs: the configuration has no key 'sede' (did you mean 'seed'?); it has: baselines, command"),
-        (["tokenizer=gaa"], "gaigs: tokenizer has no file 'gaa' (did you mean 'ga'?); it has: euclidean, "),
-        (["+experiment=foo"], "gaigs: experiment has no file 'foo'; it has: claims, claims_rssi, csi, mirrored, "),
+        (["tokenizer=gaa"], "gaigs: there is no tokenizer 'gaa' (did you mean 'ga'?); there are: euclidean, "),
+        (["+experiment=foo"], "gaigs: there is no experiment 'foo'; there are: claims, claims_rssi, csi, mirrored, "),
         (["seed=["], "gaigs: Hydra cannot read it: no viable alternative at input '['"),
         (["~nothing"], "gaigs: Hydra cannot read it: Could not delete from config. 'nothing' does not exist."),
         (["density=null"], "gaigs: a word on the command line that chooses a file must be its name (Config group"),
@@ -205,7 +205,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         (["tokenizer.name=null"], "gaigs: tokenizer.name must be a string, got None"),
         (["seed=1.5"], "gaigs: seed must be a whole number, got 1.5"),
         (["command=trian"], "gaigs: command must be train, benchmark, agreement or devices, got 'trian'"),
-        (["~command"], "gaigs: command must be train, benchmark, agreement or devices, got None"),
+        (["~command"], "gaigs: the configuration needs the key 'command'"),
     ],
 )
 def test_what_a_user_can_mend_is_told_without_a_traceback(overrides, message, run):
@@ -295,7 +295,7 @@ def devices(monkeypatch):
 @pytest.mark.usefixtures("devices")
 def test_devices_are_listed_whatever_the_rest_of_the_configuration(run, tmp_path, monkeypatch):
     mark = "  <- rasterizer=opencl takes this one"
-    monkeypatch.setattr(experiment, "run", None)
+    monkeypatch.setattr(runs, "run", None)
     assert run("command=devices", "data=nerf2_spectrum", "seed=${sed}", *HERE) == (0, "")
     assert run.out == f"Maker: GPU (GPU)\nMaker: CPU (CPU){mark}\n"
     assert {path.name for path in (tmp_path / "run").iterdir()} == {".hydra", "gaigs.log"}
@@ -340,7 +340,7 @@ def test_a_command_that_is_stopped_says_so(stop, code, run, monkeypatch):
         raise stop
 
     monkeypatch.setattr(agreement, "run", stopped)
-    assert run("command=agreement", *HERE) == (code, "gaigs: stopped\n")
+    assert run("command=agreement", *HERE) == (code, "gaigs: stopped; the same command does it anew\n")
 
 
 def test_a_value_that_must_be_set_is_named(run):
@@ -357,7 +357,7 @@ def test_data_that_are_not_there(run, tmp_path):
 
 
 def test_what_only_a_developer_can_mend_has_a_traceback(run, monkeypatch):
-    monkeypatch.setattr(experiment, "train_and_test", lambda *_: {}["lost"])
+    monkeypatch.setattr(runs, "train_and_test", lambda *_: {}["lost"])
     code, err = run(*SMALL, *HERE)
     assert code == 1
     assert "KeyError: 'lost'" in err
@@ -384,7 +384,7 @@ def test_faults_of_the_machine_are_told_in_one_line(error, told, run, monkeypatc
     def fail(*_):
         raise error from (MemoryError() if isinstance(error, ValueError) else None)
 
-    monkeypatch.setattr(experiment, "train_and_test", fail)
+    monkeypatch.setattr(runs, "train_and_test", fail)
     code, err = run(*SMALL, *HERE)
     assert code == 1
     assert err.count("gaigs: ") == 1
@@ -398,7 +398,7 @@ def test_a_run_folder_that_was_removed_is_named_whatever_was_missed(run, tmp_pat
         shutil.rmtree(tmp_path / "run")
         raise FileNotFoundError("no checkpoint at run/best.ckpt")
 
-    monkeypatch.setattr(experiment, "train_and_test", remove)
+    monkeypatch.setattr(runs, "train_and_test", remove)
     code, err = run(*SMALL, *HERE)
     assert code == 1
     assert "Traceback" not in err
@@ -426,7 +426,7 @@ def test_ctrl_c_outside_of_the_training(run, monkeypatch):
     def press(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(experiment, "train_and_test", press)
+    monkeypatch.setattr(runs, "train_and_test", press)
     stopped = "gaigs: stopped; the same command with hydra.{} goes on\n"
     assert run(*SMALL, "hydra.run.dir=run") == (130, stopped.format("run.dir=run"))
     assert run("-m", *SMALL, "hydra.sweep.dir=sweep", "seed=0,1") == (130, stopped.format("sweep.dir=sweep"))

@@ -56,7 +56,6 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from gaigs import configuration
-configuration.install()
 def composed(*overrides):
     with initialize_config_dir(str(Path("primary").absolute()), version_base="1.3"):
         return OmegaConf.to_container(compose("config", list(overrides)))

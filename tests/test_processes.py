@@ -223,17 +223,18 @@ def test_jobs_of_a_launcher_share_the_processors(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
     for name in ("OMP_NUM_THREADS", *processes.POCL_THREADS):
         monkeypatch.setenv(name, "")
-    try:
-        for count, jobs, expected in ((None, 4, 2), (None, -1, 1), (None, 16, 1), (3, 4, 3)):
-            processes.limit_threads(count, jobs)
+    for count, jobs, expected in ((None, 4, 2), (None, -1, 1), (None, 16, 1), (3, 4, 3), (None, 1, threads)):
+        with processes.limited_threads(count, jobs):
             assert torch.get_num_threads() == expected
-            assert {os.environ[name] for name in ("OMP_NUM_THREADS", *processes.POCL_THREADS)} == {str(expected)}
-        processes.limit_threads(None, 1)
-        assert torch.get_num_threads() == 3, "a run alone takes what there is"
-        with pytest.raises(ValueError, match="threads must be at least 1, or null for all, got 0"):
-            processes.limit_threads(0)
-    finally:
-        torch.set_num_threads(threads)
+            if expected != threads:
+                assert {os.environ[name] for name in ("OMP_NUM_THREADS", *processes.POCL_THREADS)} == {str(expected)}
+        assert torch.get_num_threads() == threads, "undone"
+        assert os.environ["OMP_NUM_THREADS"] == ""
+    with (
+        pytest.raises(ValueError, match="threads must be at least 1, or null for all, got 0"),
+        processes.limited_threads(0),
+    ):
+        pass
 
 
 def test_a_folder_is_held_by_one_run_at_a_time(tmp_path):

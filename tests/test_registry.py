@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from torch.optim.lr_scheduler import StepLR
 
 import gaigs
-from gaigs.registry import KINDS, Registry, call, find_holders, register, registries, registry
+from gaigs.registry import KINDS, Registry, call, configuration_of, find_holders, register, registries, registry
 
 
 class Waveguide:
@@ -140,7 +140,8 @@ def test_an_unknown_name_suggests_the_nearest_and_lists_all(models):
 def test_build_passes_options_and_the_context_that_is_asked_for(models):
     config = OmegaConf.create({"lambda_": 0.33, "model": {"name": "waveguide", "width": "${lambda_}", "modes": 2}})
     built = models.build(config.model, scene="room", frequency=9e8)
-    assert vars(built) == {"scene": "room", "width": 0.33, "modes": 2}
+    assert (built.scene, built.width, built.modes) == ("room", 0.33, 2)
+    assert configuration_of(built) == {"name": "waveguide", "width": 0.33, "modes": 2}, "without the context"
 
 
 def test_build_hands_over_plain_python(models):
@@ -188,10 +189,24 @@ def test_what_is_registered_can_be_called(models):
         models.register("mast")(3)
 
 
-@pytest.mark.parametrize("config", ["horn", ["horn"], OmegaConf.create(["horn"]), None])
-def test_build_needs_a_mapping(models, config):
+@pytest.mark.parametrize("config", [["horn"], OmegaConf.create(["horn"]), None, 3])
+def test_build_needs_a_name_or_a_mapping(models, config):
     with pytest.raises(TypeError, match="must be a mapping with the key 'name', got"):
         models.build(config)
+
+
+def test_a_name_alone_and_a_component_are_built_too(models):
+    assert models.build("horn", scene="room") == models.build({"name": "horn"}, scene="room")
+    part = models.build({"name": "waveguide", "width": 0.3, "modes": 2}, scene="room")
+    assert models.build(part) is part
+
+
+def test_a_subclass_without_a_name_cannot_be_stored(models):
+    class Wider(models.get("waveguide")):
+        pass
+
+    with pytest.raises(ValueError, match=r"^Wider must have a name to be stored; put @gaigs\.register"):
+        configuration_of(Wider("room", 0.3))
 
 
 # --- types of options ---

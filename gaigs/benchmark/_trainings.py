@@ -13,7 +13,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gaigs import experiment
+from gaigs import runs
 from gaigs.benchmark import MEASURED, NOT_MEASURED, UNAVAILABLE, Context, Measured, Row, device_of, named
 from gaigs.configuration import run_folder
 from gaigs.data import load
@@ -155,7 +155,7 @@ class Trainings(Measured):
         except BAD as error:
             return [row | {"status": UNAVAILABLE + sentence(error)}]
         if folder.is_dir():
-            experiment.claim(folder, config)  # its error is no matter of this row: the folder is another command's
+            runs.folder.claim(folder, config)  # its error is no matter of this row: the folder is another command's
         if (folder / "metrics.json").is_file():
             return [row | facts(read_metrics(folder / "metrics.json"), folder) | {"status": MEASURED}]
         longest = config["trainer"].get("max_time")
@@ -163,7 +163,7 @@ class Trainings(Measured):
             return [row | {"status": NOT_MEASURED}]
         log.info("%s: %s %s", self.name, row["axis"], " ".join(words))
         try:
-            metrics = experiment.run(config, folder)
+            metrics = runs.run(config, folder)
         except Exception as error:  # of whatever system: the next one goes on
             is_of_data = isinstance(error, BAD) and folder.is_dir()  # which a removed folder is not
             if lacks_memory(error) or (isinstance(error, OSError) and not is_of_data):

@@ -15,8 +15,8 @@ from gaigs.benchmark._passes import CAUSES, start
 from gaigs.benchmark._scenes import cast, common
 from gaigs.benchmark._watch import PARTS, WARM_UP, Watch, divided
 from gaigs.data import load
-from gaigs.experiment import check_trainer, count_gaussians
 from gaigs.registry import call, register, registry
+from gaigs.runs.training import check_trainer, count_gaussians
 from gaigs.training.batches import Batches
 from gaigs.training.budget import make_budget
 

@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gaigs import configuration
 from gaigs.geometry import Pose
 from gaigs.query import Batch, Query, as_positions, check_carrier
 from gaigs.registry import registry
@@ -162,6 +161,8 @@ def links(reader: str | None = None, /, **options) -> Links:
         >>> len(gaigs.links(task="rssi", transmitters=places, receivers=[[0, 0, 2], [3, 3, 2]], labels=readings))
         7
     """
+    from gaigs import configuration  # which needs Hydra, as a checkpoint does not
+
     if reader is None:
         return from_arrays(**options)
     config = configuration.composed([f"data={reader}"], options, ("data", "split"))
@@ -197,6 +198,8 @@ def from_arrays(
         TypeError: An option is of another type than it must be.
         ValueError: Shapes do not fit, a number is not finite or out of range, or there is nothing to split.
     """
+    from gaigs import configuration
+
     config = configuration.composed([f"split={split}"], options, ("split",))["split"]
     task = registry("task").build(task)
     places = as_positions("transmitters", transmitters)

@@ -396,6 +396,7 @@ def build_trend(trend: str | Mapping | Model, scene: Scene) -> Model:
     Raises:
         ValueError: It names none, or that model cannot be made so.
     """
-    if isinstance(trend, Mapping) and "name" not in trend:
-        raise ValueError(f"model.trend must have the name of a model, such as mean, got {trend}")
+    is_known = trend in registry("model").names() if isinstance(trend, str) else True
+    if not is_known or (isinstance(trend, Mapping) and "name" not in trend):
+        raise ValueError(f"model.trend must have the name of a model, such as mean, got {trend!r}")
     return registry("model").build(trend, scene=scene)

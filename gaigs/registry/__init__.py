@@ -18,6 +18,7 @@ from types import MappingProxyType, NoneType, UnionType
 from omegaconf import OmegaConf
 
 from gaigs.registry._holders import GIVEN, Holder, find_holders, sources
+from gaigs.registry._holders import digests as digests
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
@@ -198,7 +199,7 @@ def register(kind: str, name: str, /) -> Callable:
 
 def is_built(config: object) -> bool:
     """Whether what stands for a component is the component itself, and neither its name nor its configuration."""
-    return not isinstance(config, str | bytes | Mapping | NoneType | numbers.Number | list | tuple | type)
+    return not isinstance(config, str | bytes | Mapping | Sequence | NoneType | numbers.Number | type)
 
 
 def name_of(component: object) -> str:
@@ -325,13 +326,20 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
 def check_type(what: str, value: object, annotation: object) -> None:
     """Sees to it that a value is what an annotation in ``PLAIN``, or a union of such, says; others say nothing.
 
+    In a union with other classes, their objects suit, too.
+
     Raises:
         TypeError: It is not.
     """
     is_union = typing.get_origin(annotation) in (typing.Union, UnionType)
     allowed = typing.get_args(annotation) if is_union else (annotation,)
     kinds = [typing.get_origin(kind) or kind for kind in allowed]
-    if not all(isinstance(kind, type) and kind in PLAIN for kind in kinds):
+    is_plain = [isinstance(kind, type) and kind in PLAIN for kind in kinds]
+    is_known = is_union and any(is_plain) and all(isinstance(kind, type) for kind in kinds)
+    if is_known and not all(is_plain) and not is_built(value):
+        allowed = [whole for whole, plain in zip(allowed, is_plain, strict=True) if plain]
+        kinds = [kind for kind, plain in zip(kinds, is_plain, strict=True) if plain]
+    elif not all(is_plain):
         if not isinstance(value, float):
             return
         allowed = kinds = [float]  # whatever it may be, it is finite

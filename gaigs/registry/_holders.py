@@ -2,9 +2,10 @@
 
 import ast
 import functools
+import hashlib
 import re
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -100,6 +101,45 @@ def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list
     # A package in ./plugins that is installed as well is no rival of itself.
     holders = built_in + installed + [holder for holder in dropped if (holder.name, holder.target) not in targets]
     return [holder for holder in holders if name in (None, holder.name)], unreadable + causes
+
+
+def digests(names: Container[str]) -> dict[str, str]:
+    """Digests of the sources of plug-ins that hold some of these names, by kind and name.
+
+    They are of the file in ./plugins, or of the whole package, and of what these import of other plug-ins there.
+    """
+    found = {}
+    for kind in GIVEN.keys() | {"task", "data", "rasterizer", "benchmark"}:
+        for holder in find_holders(kind)[0]:
+            if holder.name not in names or (holder.file and holder.root is None):
+                continue
+            place = holder.file or holder.folder
+            if holder.file is not None and holder.file.parent != holder.root / "plugins":
+                place = holder.root / "plugins" / holder.file.relative_to(holder.root / "plugins").parts[0]
+            digest = hashlib.sha256()
+            for file in sorted(_with_imports(place)) if place else ():
+                digest.update(file.read_bytes())
+            found[f"{kind} {holder.name}"] = digest.hexdigest()
+    return dict(sorted(found.items()))
+
+
+def _with_imports(place: Path) -> set[Path]:
+    """The source files of a module or package, and of those in ./plugins that they import."""
+    plugins = Path.cwd() / "plugins"
+    found, places = set(), [place]
+    while places:
+        place = places.pop()
+        files = {place} if place.is_file() else {*place.rglob("*.py")}
+        for file in files - found:
+            for node in ast.walk(ast.parse(file.read_bytes())):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+                for first, *others in (name.split(".") for name in names):
+                    own = [plugins / others[0]] if first == "plugins" and others else []
+                    own += [source / first for source in sources(plugins)]
+                    places += [each for path in own for each in (path, path.with_suffix(".py")) if each.exists()]
+        found |= files
+    return found
 
 
 def _scan(kind: str, folder: Path, package: str, root: Path | None = None) -> tuple[list[Holder], list[str]]:

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.text import Text
 
 from gaigs import __main__ as command_line
-from gaigs import evaluation, experiment
+from gaigs import evaluation, runs
 from gaigs.benchmark import Context
 from gaigs.benchmark._accuracy_page import LOOK_UPS, SYSTEMS, figures, highlights, tables
 from gaigs.benchmark._scale import scale_of
@@ -89,7 +89,7 @@ def test_systems_train_and_one_that_fails_says_why(done):
 
 
 def test_what_is_done_is_not_done_again(done, monkeypatch):
-    monkeypatch.setattr(experiment, "run", refuse)
+    monkeypatch.setattr(runs, "run", refuse)
     before = (done / "accuracy.csv").read_text()
     benchmark().run(done, Context(TINY))
     assert (done / "accuracy.csv").read_text() == before
@@ -100,7 +100,7 @@ def test_what_is_done_is_not_done_again(done, monkeypatch):
 
 
 def test_the_run_of_another_command_is_not_taken_over(done, tmp_path, monkeypatch):
-    monkeypatch.setattr(experiment, "run", refuse)
+    monkeypatch.setattr(runs, "run", refuse)
     (file,) = done.glob("accuracy/*/*/model=gaigs/config.yaml")
     before, rows = file.read_text(), (done / "accuracy.csv").read_text()
     file.write_text(before.replace("transmitters: 20", "transmitters: 21"))
@@ -112,28 +112,28 @@ def test_the_run_of_another_command_is_not_taken_over(done, tmp_path, monkeypatc
 
 
 def test_nothing_is_begun_that_does_not_fit(tmp_path, monkeypatch):
-    monkeypatch.setattr(experiment, "run", refuse)
+    monkeypatch.setattr(runs, "run", refuse)
     benchmark().run(tmp_path, Context(TINY, deadline=time.monotonic() + 30))
     assert {row["status"] for key, row in read(tmp_path).items() if key[1] != "friis"} == {"not measured"}
     assert "not measured, as time was up: mean, look-up" in (tmp_path / "accuracy.md").read_text()
 
 
 def test_a_benchmark_that_was_stopped_goes_on(tmp_path, monkeypatch):
-    runs, run = [], experiment.run
+    begun, run = [], runs.run
 
     def stopped(config, folder):
-        runs.append(config["model"]["name"])
-        if len(runs) == 2:
+        begun.append(config["model"]["name"])
+        if len(begun) == 2:
             raise KeyboardInterrupt
         return run(config, folder)
 
-    monkeypatch.setattr(experiment, "run", stopped)
+    monkeypatch.setattr(runs, "run", stopped)
     small = benchmark({}, ["mean", "knn"])
     with pytest.raises(KeyboardInterrupt):
         small.run(tmp_path, Context(TINY))
     assert [*read(tmp_path)] == [(LOOK_UPS, "mean"), (SYSTEMS, "mean")], "which are one run"
     small.run(tmp_path, Context(TINY))
-    assert runs == ["mean", "knn", "knn"]
+    assert begun == ["mean", "knn", "knn"]
     assert {row["status"] for row in read(tmp_path).values()} == {"measured"}
 
 
@@ -141,7 +141,7 @@ def test_a_defect_of_a_strangers_system_stops_no_other(tmp_path, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("division by zero")
 
-    monkeypatch.setattr(experiment, "run", broken)
+    monkeypatch.setattr(runs, "run", broken)
     benchmark({}, ["knn"]).run(tmp_path, Context(TINY))
     statuses = {row["status"] for row in read(tmp_path).values()}
     assert statuses == {"unavailable: ZeroDivisionError: division by zero"}
@@ -151,7 +151,7 @@ def test_a_full_disk_ends_it(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(experiment, "run", full)
+    monkeypatch.setattr(runs, "run", full)
     with pytest.raises(OSError, match="No space left"):
         benchmark({}, ["knn"]).run(tmp_path, Context(TINY))
 

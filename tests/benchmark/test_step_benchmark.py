@@ -4,7 +4,6 @@ import csv
 
 import pytest
 
-from gaigs import configuration
 from gaigs.benchmark import UNAVAILABLE, Context
 from gaigs.benchmark._watch import PARTS
 from gaigs.benchmark.step import WHOLE, StepBenchmark
@@ -14,11 +13,6 @@ BRIEF = (
     "data.transmitters=12", "data.order=0", "gaussians.count=10", "training.batch_size=3", "training.thinning.stride=8",
     "tokenizer=euclidean",
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module", autouse=True)
-def configured():
-    configuration.install()
 
 
 @pytest.mark.parametrize("overrides", [(), ("trainer.max_steps=-1", "trainer.max_time=00:00:00:00")])

@@ -13,9 +13,7 @@ from scipy.spatial.transform import Rotation
 from gaigs.data.synthetic.image_source import (
     Box,
     Room,
-    bartlett,
     frequency_offsets,
-    min_max,
     passes,
     permittivity,
     respond,
@@ -24,7 +22,7 @@ from gaigs.data.synthetic.image_source import (
 )
 from gaigs.directions import Grid
 from gaigs.geometry import Pose, from_spherical
-from gaigs.propagation import fresnel
+from gaigs.propagation import bartlett, fresnel, min_max
 from gaigs.scene import Array, Receiver
 
 FREQUENCY = 3e9

@@ -13,9 +13,9 @@ from gaigs.data import load, nerf2_spectrum
 from gaigs.data.sionna import patch_array, place
 from gaigs.data.sionna.meshes import FURNITURE_MARGIN, HEIGHTS, edges, wavefront_obj
 from gaigs.data.sionna.rooms import ROOMS
-from gaigs.propagation import bartlett, min_max
 from gaigs.directions import Grid
 from gaigs.geometry import from_spherical
+from gaigs.propagation import bartlett, min_max
 from gaigs.testing import check_data
 
 OFFICIAL = {"name": "official", "validation": 0}

@@ -8,8 +8,8 @@ import torch
 from scipy.constants import speed_of_light
 
 from gaigs.data import load
-from gaigs.propagation import bartlett, min_max
 from gaigs.directions import Grid
+from gaigs.propagation import bartlett, min_max
 from gaigs.testing import check_data
 
 OFFICIAL = {"name": "official", "validation": 0}

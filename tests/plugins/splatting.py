@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs import configuration, evaluation, experiment
+from gaigs import configuration, evaluation, runs
 from gaigs.registry import registry
 from gaigs.testing import check_model, example_links
 
@@ -42,7 +42,6 @@ def repository():
 @functools.cache
 def composed(*overrides):
     """The whole configuration, as the command line would have it."""
-    configuration.install()
     with repository(), initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
         return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
 
@@ -65,4 +64,4 @@ def run(folder, monkeypatch, *overrides):
     monkeypatch.setattr(evaluation, "write_figures", lambda *_: None)  # they take longer than all else
     config = composed(*overrides, *RUN)
     with repository():
-        return config, experiment.run(config, folder), gaigs.load(folder / "best.ckpt")
+        return config, runs.run(config, folder), gaigs.load(folder / "best.ckpt")

@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.constants import speed_of_light
 
-from gaigs.propagation import bartlett, min_max
 from gaigs.directions import Grid, Rays
+from gaigs.propagation import bartlett, min_max
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.scene import Array

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from scipy.interpolate import BSpline
 
 import gaigs
-from gaigs import configuration, evaluation, experiment
+from gaigs import configuration, evaluation, runs
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.task.scalar import Scalar
@@ -470,7 +470,6 @@ def test_options_out_of_range(name, options, message):
 
 
 def composed(name, task):
-    configuration.install()
     few = ["data.transmitters=20", "data.order=1", "split.validation=0.2", "trainer.max_steps=3"]
     if task == "csi":
         few.append("data.subcarriers=5")
@@ -511,7 +510,7 @@ def test_a_run(name, task, tmp_path, monkeypatch):
     config = composed(name, task)
     assert config["loss"]["name"] == LOSSES[name][task]
     assert config["training"]["name"] == ("adversarial" if name == "dcgan" else "descent")
-    metrics = experiment.run(config, tmp_path)
+    metrics = runs.run(config, tmp_path)
     assert [*metrics["models"]] == [name, "mean"]
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     model = gaigs.load(tmp_path / "best.ckpt")

@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from scipy.constants import epsilon_0, speed_of_light
 
 import gaigs
-from gaigs import configuration, experiment
+from gaigs import configuration, runs
 from gaigs.data import load, synthetic
 from gaigs.data.sionna import ROOMS
 from gaigs.data.sionna.meshes import THICKNESS, Cuboid, edges, wavefront_obj
@@ -61,7 +61,6 @@ def build(scene, calibrate=True, **options):
 
 def composed(*overrides):
     """The whole configuration, as the command line would have it."""
-    configuration.install()
     with repository(), initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
         return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
 
@@ -538,7 +537,7 @@ def test_a_run_trains_stores_and_tells_the_materials(tracer, tmp_path):
         "baselines=[{name: mean}]",
     )  # fmt: skip
     with repository():
-        metrics = experiment.run(config, tmp_path / "run")
+        metrics = runs.run(config, tmp_path / "run")
         model = gaigs.load(tmp_path / "run/best.ckpt")
     assert metrics["models"]["ray_tracing"]["snr_db_median"] > metrics["models"]["mean"]["snr_db_median"] + 1
     assert metrics["materials"].keys() == set(model.known)

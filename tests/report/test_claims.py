@@ -7,7 +7,6 @@ import pytest
 import yaml
 from hydra import compose, initialize_config_dir
 
-from gaigs import configuration
 from gaigs.configuration import conf_dir
 from gaigs.registry import registry
 from gaigs.report.claims import interval, read_claims
@@ -188,7 +187,6 @@ def test_a_broken_list_of_claims_is_named(broken, tmp_path):
 
 @pytest.mark.parametrize(("experiment", "task"), EXPERIMENTS.items())
 def test_variants_differ_from_the_paper_in_one_thing(experiment, task):
-    configuration.install()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         params = compose("config", [f"+experiment={experiment}"], return_hydra_config=True).hydra.sweeper.params
         names = "".join(params["+variant"].split()).split(",")

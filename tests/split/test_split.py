@@ -297,10 +297,6 @@ def test_a_configuration_has_every_option_with_its_default(file):
     assert options == defaults | ({"length": 100} if file.stem == "official_runs" else {})
 
 
-def test_every_split_has_a_configuration():
-    assert {*registry("split").names()} <= {file.stem for file in (conf_dir() / "split").glob("*.yaml")}
-
-
 # --- folds ---
 
 

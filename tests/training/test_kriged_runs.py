@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs import checkpoint, evaluation, experiment
+from gaigs import checkpoint, evaluation, runs
 from gaigs.configuration import conf_dir
 from gaigs.data import load
 from gaigs.training import kriging
@@ -49,19 +49,19 @@ def no_figures():
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
-    return experiment.run(configure(), tmp_path_factory.mktemp("plain"))
+    return runs.run(configure(), tmp_path_factory.mktemp("plain"))
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     config, folder = configure("kriging=true"), tmp_path_factory.mktemp("kriged")
-    return config, folder, experiment.run(config, folder)
+    return config, folder, runs.run(config, folder)
 
 
 @pytest.fixture(scope="module")
 def with_folds(tmp_path_factory):
     config, folder = configure(*FOLDS), tmp_path_factory.mktemp("folds")
-    return config, folder, experiment.run(config, folder)
+    return config, folder, runs.run(config, folder)
 
 
 def results(metrics):
@@ -116,12 +116,12 @@ def test_validation_scores_are_of_residuals_of_training_links(finished):
 def test_a_run_killed_behind_its_kriging_goes_on(finished, tmp_path, monkeypatch):
     config, folder, metrics = finished
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "test", lambda *_: 1 / 0)
+        patch.setattr(evaluation, "score", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
-            experiment.run(config, tmp_path)
+            runs.run(config, tmp_path)
     assert checkpoint.read(tmp_path / "best.ckpt")[checkpoint.KEY]["model"]["name"] == "kriging"
     monkeypatch.setattr(Descent, "training_step", lambda *_: 1 / 0)
-    assert results(experiment.run(config, tmp_path)) == results(metrics)
+    assert results(runs.run(config, tmp_path)) == results(metrics)
     a, b = (checkpoint.read(path / "best.ckpt")["state_dict"] for path in (folder, tmp_path))
     assert a.keys() == b.keys()
     for key in a:
@@ -153,7 +153,7 @@ def test_residuals_are_those_of_the_folds(with_folds, tmp_path, monkeypatch):
     choose = kriging.Kriging.choose
     monkeypatch.setattr(kriging.Kriging, "choose", lambda *given: seen.append(given) or choose(*given))
     (folder / "metrics.json").unlink()
-    experiment.run(config, folder)
+    runs.run(config, folder)
     ((_, links, values),) = seen
     position = {link: row for row, link in enumerate(kriging.known(links).tolist())}
     whole = gaigs.load(folder / "best.ckpt").trend
@@ -181,17 +181,17 @@ def test_a_run_stopped_within_a_fold_goes_on_there(with_folds, tmp_path, monkeyp
     with monkeypatch.context() as patch:
         patch.setattr(Descent, "training_step", interrupted)
         with pytest.raises(KeyboardInterrupt, match=r"stopped after step 2$"):
-            experiment.run(config, tmp_path)
+            runs.run(config, tmp_path)
     assert checkpoint.read(tmp_path / "fold_1" / "last.ckpt")["global_step"] == 2
     assert not (tmp_path / "metrics.json").exists()
-    assert results(experiment.run(config, tmp_path)) == results(metrics)
+    assert results(runs.run(config, tmp_path)) == results(metrics)
 
 
 @pytest.mark.parametrize(("bound", "told"), [(1e9, True), (0.0, False)])
 def test_places_learnt_by_heart_are_told_of(bound, told, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(kriging, "BY_HEART", bound)
     with caplog.at_level("INFO", "gaigs"):
-        experiment.run(configure("kriging=true", "trainer.max_steps=1"), tmp_path)
+        runs.run(configure("kriging=true", "trainer.max_steps=1"), tmp_path)
     assert ("kriging_folds=5 would tell more" in caplog.text) == told
 
 
@@ -214,14 +214,14 @@ def test_places_learnt_by_heart_are_told_of(bound, told, tmp_path, monkeypatch, 
 )
 def test_what_cannot_be_kriged_is_refused(overrides, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        experiment.run(configure(*overrides), tmp_path)
+        runs.run(configure(*overrides), tmp_path)
     assert not (tmp_path / "last.ckpt").exists()
 
 
 @pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
 def test_rssi_falls_back_on_the_trend_of_its_process(tmp_path):
     few = ["+experiment=rssi", "data.transmitters=60", "deformation.width=8", "split.validation=0.2", "kriging=true"]
-    metrics = experiment.run(configure(*few), tmp_path)
+    metrics = runs.run(configure(*few), tmp_path)
     model = gaigs.load(tmp_path / "best.ckpt")
     assert model.fallback_options == {"name": "path_loss"}
     assert [*metrics["receivers"]["west"]] == ["gaigs", "gaigs_trend", "mean"]

@@ -1,8 +1,6 @@
-"""Training: of a model on links, and of one run from its configuration to its folder."""
+"""Training of a model on links: fitted, descended, kriged."""
 
 import contextlib
-import hashlib
-import json
 import logging
 import signal
 import tempfile
@@ -12,28 +10,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 import lightning
-import torch
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from lightning.pytorch.utilities.seed import isolate_rng
-from omegaconf import OmegaConf
-from rich.console import Console
-from torch import Tensor, distributed
+from torch import distributed
 
 from gaigs import checkpoint, evaluation
-from gaigs.configuration import composed, differences, preset
-from gaigs.data import Links, load
-from gaigs.files import whole, write_text
+from gaigs.configuration import composed, preset
+from gaigs.data import Links
 from gaigs.loss import Loss
 from gaigs.model import Model
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
 from gaigs.registry import call, configuration_of, registry
-from gaigs.report.runs import read_metrics
-from gaigs.report.table import metrics_table, verdict
+from gaigs.runs.folder import check_same_links, claim, fingerprint
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS, make_budget
 from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine
@@ -41,10 +33,6 @@ from gaigs.training.kriging import check_kriging, krige
 from gaigs.training.revision import Revision
 
 log = logging.getLogger(__name__)
-
-WRITTEN = ("config.yaml", "best.ckpt", "log", "predictions.npz", "gaussians.ply", "radio_map.npz", "figures")
-"""What a run writes into its folder before there is anything to go on from."""
-
 
 RESUMED = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "epoch", "global_step", "split", "links")
 """What a training goes on from, beside the weights: the most in the words of Lightning."""
@@ -55,103 +43,6 @@ LIMITS = {
     "limit_val_batches": "all validation links decide on the best step",
 }
 """Options of Lightning that would leave batches out, and why none may be."""
-
-
-def run(config: dict, folder: Path) -> dict | None:
-    """Trains, tests, and writes the run folder; goes on where an earlier run of the same configuration stopped there.
-
-    Args:
-        config: The resolved configuration.
-        folder: Gets ``config.yaml``, ``best.ckpt``, ``last.ckpt``, ``log/``, ``predictions.npz``, what the model
-            exports and the task keeps, ``figures/`` and, last of all, ``metrics.json``. Where that is already, nothing
-            is done anew. One run holds it at a time.
-
-    Returns:
-        The contents of ``metrics.json``; None in all but the first of several processes.
-
-    Raises:
-        TypeError: A value of the configuration that is not of its key's type.
-        ValueError: A configuration that does not fit the data, another run's folder, or a damaged file in this one.
-        FileNotFoundError: Data that are not there.
-        OSError: A file cannot be written, e.g. as the disk is full; nothing half-written is left of it.
-        KeyboardInterrupt: Ctrl-C, or ``gaigs.processes.Stopped`` for it and SIGTERM.
-    """
-    with limited_threads(config["threads"]):
-        if not is_first():
-            logging.getLogger("gaigs").setLevel(logging.WARNING)  # one of them tells it all
-            train_and_test(config, folder)
-            return None
-        metrics = _in_folder(config, folder)
-    console = Console()
-    console.print(metrics_table(metrics))
-    console.print(verdict(metrics))
-    console.print(f"results: {folder}", soft_wrap=True)
-    return metrics
-
-
-def _in_folder(config: dict, folder: Path) -> dict:
-    """The contents of ``metrics.json``, whether it is there already or not."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with only_run(folder):
-        claim(folder, config)
-        finished = folder / "metrics.json"
-        if finished.is_file():
-            log.info("finished already: %s", finished)
-            metrics = read_metrics(finished)
-        else:
-            metrics = train_and_test(config, folder)
-            if not is_configuration(folder / "config.yaml"):  # the folder was removed, and loggers have made it anew
-                store(config, folder)
-            write_text(finished, json.dumps(metrics, indent=2) + "\n")
-    return metrics
-
-
-def claim(folder: Path, config: dict) -> None:
-    """Writes the configuration into a run folder, unless a run has left something there to go on from.
-
-    Raises:
-        ValueError: It has, and it was a run of another configuration; or files of that name are not a run's.
-    """
-    file = folder / "config.yaml"
-    there = [name for name in (*WRITTEN, "last.ckpt", "metrics.json") if (folder / name).exists()]
-    if there and not is_configuration(file):
-        raise ValueError(
-            f"{folder} must be free or hold a run, and it holds {', '.join(there)} of something else; choose another "
-            "folder with hydra.run.dir=DIR"
-        )
-    if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
-        store(config, folder)
-        return
-    try:
-        there = OmegaConf.to_container(OmegaConf.load(file))
-    except Exception as error:  # whatever a file meets that is YAML, but no configuration
-        raise ValueError(
-            f"{file} must be what a run wrote, and is damaged ({' '.join(str(error).split())}); take another copy of "
-            "it, or choose another folder with hydra.run.dir=DIR"
-        ) from error
-    differing = differences(there, config)
-    if differing:
-        told = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
-        listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in told)
-        raise ValueError(
-            f"{folder} must be free or hold a run of the same configuration, but {listed}; choose another folder with "
-            "hydra.run.dir=DIR (nothing was written into this one but Hydra's own .hydra/)"
-        )
-
-
-def store(config: dict, folder: Path) -> None:
-    """Writes the configuration of a run into its folder."""
-    with whole(folder / "config.yaml") as part:
-        OmegaConf.save(OmegaConf.create(config), part)
-
-
-def is_configuration(file: Path) -> bool:
-    """Whether a file is the configuration of a run."""
-    try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
-        return False
-    return isinstance(content, dict) and {"model", "data"} <= content.keys()
 
 
 def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Path | None = None, **options) -> Model:
@@ -242,59 +133,6 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         return None
     models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged.model, kriged.blind))
     return Fitted(models, unseen, start, seconds, kriged.seconds)
-
-
-def train_and_test(config: dict, folder: Path) -> dict | None:
-    """All of a run but the terminal's tables.
-
-    Returns:
-        What stands in ``metrics.json``; None for what the model does not have, and in all but the first process.
-    """
-    lightning.seed_everything(config["seed"], verbose=False)
-    links = load(config["data"], config["split"], config["task"]["name"])
-    task, name = links.task, config["model"]["name"]
-    counts = {part_name: len(part) for part_name, part in links.split.parts().items()}
-    if unused := len(links) - sum(counts.values()):
-        counts["in no part"] = unused
-    sizes = ", ".join(f"{count} {part_name}" for part_name, count in counts.items())
-    log.info("data: %s; split %s: %s", config["data"]["name"], links.split.name, sizes)
-    scene = links.scene
-    box = " x ".join(f"{edge:.2f}" for edge in scene.upper - scene.lower)
-    log.info("data: training transmitters within %s m%s", box, links.remarks and f"; {links.remarks}")
-    loss = registry("loss").build(config["loss"], task=task)
-    baselines = evaluation.baseline_configurations(config["baselines"], name, scene)
-    fitted = fit(None, loss, links, config, folder)
-    if fitted is None:
-        return None
-    model, is_trained = fitted.models[name], bool(fitted.unseen)
-    scores = evaluation.score(fitted.models, baselines, links, folder)
-    look_ups = baselines if is_trained else {name: config["model"], **baselines}
-    validation = evaluation.validate(fitted.unseen, look_ups, links)
-    metrics = {
-        "task": task.name,
-        "data": links.remarks,
-        "split": links.split.name,
-        "seed": config["seed"],
-        "device": evaluation.device_name(evaluation.device_of(model)),
-        "rasterizer": None,
-        "train_seconds": fitted.seconds,
-        "inference_ms": evaluation.inference_ms(model, links),
-        "render_ms": evaluation.render_ms(model, links),
-        "num_gaussians": count_gaussians(model),
-        "num_gaussians_start": fitted.start,
-        "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
-        "checkpoint_bytes": (folder / "best.ckpt").stat().st_size if is_trained else None,
-        "models": {name: task.summarise(values) for name, values in scores.items()},
-        "validation": {name: task.summarise(values) for name, values in validation.items()},
-        "validation_score": validation[name][task.watched].mean().item() if validation else None,
-        "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
-    } | model.facts()
-    if config["kriging"]:
-        metrics["kriging"]["seconds"] = fitted.kriging_seconds
-    model.export(folder)
-    task.keep(folder, model)
-    evaluation.write_figures(folder, links, model.primitives, model.learnt_room(links))
-    return metrics
 
 
 def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Model, float]:
@@ -418,46 +256,6 @@ def check_trainer(trainer: lightning.Trainer) -> None:
             "a job of a multirun must train in one process; run it alone, or take hydra/launcher=submitit_slurm, which "
             "starts the processes of each job"
         )
-
-
-def check_same_links(there: dict, here: dict, path: Path) -> None:
-    """Sees to it that a training goes on with the links it began with, so that none of the test has been trained on.
-
-    Raises:
-        ValueError: The split or the links are others.
-    """
-    parts = ("train", "validation", "test")
-    same = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
-    same = same and _is_same(there.get("scene"), here.get("scene"))
-    if not same or there["links"] != here["links"]:
-        raise ValueError(
-            f"{path} must be of these very data to go on, but they have another split, or other transmitters, "
-            "receivers, frequencies or labels now; choose another folder with hydra.run.dir=DIR"
-        )
-
-
-def _is_same(a: object, b: object) -> bool:
-    """Whether two nested states hold the same values."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(_is_same(a[key], b[key]) for key in a)
-    if isinstance(a, list) and isinstance(b, list):
-        return len(a) == len(b) and all(map(_is_same, a, b))
-    return torch.equal(a, b) if isinstance(a, Tensor) and isinstance(b, Tensor) else a == b
-
-
-def fingerprint(links: Links) -> str:
-    """A digest of queries and receivers, and of labels that are in memory; images would have to be decoded for it."""
-    parts = [links.query.transmitters, links.query.receivers]
-    for receiver in links.receivers:
-        parts += [receiver.pose.position, receiver.pose.rotation, receiver.array.elements]
-    if links.query.frequencies is not None:
-        parts.append(links.query.frequencies)
-    if isinstance(links.labels, Tensor):
-        parts.append(links.labels)
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part.contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def count_gaussians(model: Model) -> int:
