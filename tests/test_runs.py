@@ -244,7 +244,8 @@ def test_the_folder_holds_what_it_should_and_no_half_written_file(finished):
     _, folder, _ = finished
     names = {path.name for path in folder.iterdir()}
     assert names == {
-        "config.yaml", "best.ckpt", "last.ckpt", "log", "predictions.npz", "gaussians.ply", "metrics.json"
+        "config.yaml", "software.json", "best.ckpt", "last.ckpt", "log", "predictions.npz", "gaussians.ply",
+        "metrics.json"
     }  # fmt: skip
 
 
@@ -440,7 +441,8 @@ def test_a_folder_of_something_else_is_left_alone(name, tmp_path):
 
 def test_a_damaged_checkpoint_is_refused(finished, tmp_path):
     config, folder, _ = finished
-    (tmp_path / "config.yaml").write_text((folder / "config.yaml").read_text())
+    for name in ("config.yaml", "software.json"):
+        (tmp_path / name).write_text((folder / name).read_text())
     (tmp_path / "last.ckpt").write_bytes((folder / "last.ckpt").read_bytes()[:5000])
     with pytest.raises(ValueError, match=r"last\.ckpt must be a checkpoint of gaigs, and is damaged"):
         runs.run(config, tmp_path)
@@ -455,7 +457,8 @@ def test_look_ups_run_without_training(model, others, finished, tmp_path):
     assert (metrics["num_gaussians"], metrics["num_gaussians_start"], metrics["num_parameters"]) == (0, 0, 0)
     for key in ("rasterizer", "train_seconds", "render_ms", "checkpoint_bytes"):
         assert metrics[key] is None
-    assert {path.name for path in tmp_path.iterdir()} == {"config.yaml", "predictions.npz", "metrics.json"}
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"config.yaml", "software.json", "predictions.npz", "metrics.json"}
 
 
 def test_tensorboard_logs_beside_the_csv(tmp_path):
@@ -655,3 +658,53 @@ def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path):
         assert own[name] == pytest.approx(free_space[name], abs=1e-2)
     assert (metrics["paths_kept"], metrics["planes_kept"]) == (1, 0)
     assert gaigs.load(tmp_path / "best.ckpt").predict([[1.0, 2.0, 1.5]]).abs().max() > 0
+
+
+# --- what computed a run ---
+
+
+def test_a_folder_of_an_earlier_version_is_refused_in_one_sentence(finished, tmp_path):
+    config, folder, _ = finished
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    (copy / "software.json").unlink()
+    with pytest.raises(ValueError, match=r"copy was begun by gaigs 0.1 or earlier, and this is .*; choose another"):
+        runs.run(config, copy)
+    (copy / "software.json").write_text('{"gaigs": "0.1.3"}')
+    with pytest.raises(ValueError, match=r"copy was begun by gaigs 0.1.3, and this is"):
+        runs.run(config, copy)
+
+
+PLUGIN = """
+import gaigs
+from gaigs.model.mean import Mean
+from plugins.other import LEVEL
+
+@gaigs.register("model", "own_mean")
+class OwnMean(Mean):
+    pass
+"""
+
+
+def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch):
+    (tmp_path / "plugins").mkdir()
+    own, other = tmp_path / "plugins/own.py", tmp_path / "plugins/other.py"
+    own.write_text(PLUGIN)
+    other.write_text("LEVEL = 1")
+    monkeypatch.chdir(tmp_path)
+    there = runs.folder.software({"model": {"name": "own_mean"}, "baselines": [{"name": "mean"}]})
+    assert there.keys() == {"gaigs", "model own_mean"}
+    config = configure("model=mean") | {"baselines": [{"name": "own_mean"}]}
+    folder = tmp_path / "run"
+    folder.mkdir()
+    runs.folder.claim(folder, config)
+    (folder / "metrics.json").write_text("{}")
+    runs.folder.claim(folder, config)
+    for file in (other, own):
+        text = file.read_text()
+        file.write_text(text + "\n")
+        with pytest.raises(ValueError, match="of the same plug-ins, and the source of model own_mean has changed"):
+            runs.folder.claim(folder, config)
+        file.write_text(text)
+    (tmp_path / "plugins/unrelated.py").write_text("")
+    runs.folder.claim(folder, config)

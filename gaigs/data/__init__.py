@@ -206,11 +206,9 @@ def from_arrays(
     if isinstance(receivers, Receiver):
         receivers = [receivers]
     if not (isinstance(receivers, Sequence) and all(isinstance(each, Receiver) for each in receivers)):
-        stands, which = as_positions("receivers", receivers).unique(dim=0, return_inverse=True)
-        if index is None and len(which) == len(places) > 1 and np.ndim(labels) == 1 + len(task.shape):
-            index = which
-        else:
-            stands = as_positions("receivers", receivers)
+        stands = as_positions("receivers", receivers).reshape(-1, 3)
+        if index is None and len(stands) == len(places) > 1 and np.ndim(labels) == 1 + len(task.shape):
+            stands, index = stands.unique(dim=0, return_inverse=True)
         receivers = [Receiver(f"rx{k}", Pose(place, torch.eye(3))) for k, place in enumerate(stands)]
     labels = torch.as_tensor(labels).to(task.dtype)
     count, most, shape = len(places), len(receivers), tuple(task.shape)
