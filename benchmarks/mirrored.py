@@ -18,15 +18,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from scipy.constants import speed_of_light
 
 import gaigs
-from gaigs import configuration
 from gaigs.data import Links, load
 from gaigs.evaluation import device_name
 from gaigs.model import Model
@@ -44,9 +41,7 @@ MAPS = 8
 
 def build(overrides: list[str], checkpoint: Path | None) -> tuple[Model, Links]:
     """A model with phases, and its data."""
-    with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-        config = compose("config", ["+experiment=mirrored", *overrides])
-    config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    config = gaigs.compose("+experiment=mirrored", *overrides)
     torch.manual_seed(config["seed"])
     links = load(config["data"], config["split"])
     model = registry("model").build(config["model"], scene=links.scene)

@@ -30,16 +30,13 @@ from pathlib import Path
 import lightning
 import torch
 import yaml
-from hydra import compose, initialize_config_dir
 from jaxtyping import Float
-from omegaconf import OmegaConf
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
 import gaigs
-from gaigs import configuration
 from gaigs.data import Links, load
 from gaigs.evaluation import validate
 from gaigs.model import Model
@@ -129,9 +126,7 @@ WAYS = (*BASE, *NAMES)
 
 def configure(way: str, overrides: list[str]) -> dict:
     """The configuration of a way."""
-    with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-        config = compose("config", ["+experiment=spectrum", *BASE.get(way, BASE["multiview"]), *overrides])
-    config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    config = gaigs.compose("+experiment=spectrum", *BASE.get(way, BASE["multiview"]), *overrides)
     tokenizer = config["model"]["tokenizer"]
     tokenizer["name"] = NAMES.get(way, tokenizer["name"])
     if way in GA:

@@ -179,6 +179,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ),
         (["sede=3"], "gaigs: the configuration has no key 'sede' (did you mean 'seed'?); it has: baselines, command"),
         (["tokenizer=gaa"], "gaigs: there is no tokenizer 'gaa' (did you mean 'ga'?); there are: euclidean, "),
+        (["model=gsrf"], "gaigs: there is no model 'gsrf' here: it is in the package gaigs-gsrf; pip install"),
         (["+experiment=foo"], "gaigs: there is no experiment 'foo'; there are: claims, claims_rssi, csi, mirrored, "),
         (["seed=["], "gaigs: Hydra cannot read it: no viable alternative at input '['"),
         (["~nothing"], "gaigs: Hydra cannot read it: Could not delete from config. 'nothing' does not exist."),

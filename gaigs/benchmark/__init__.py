@@ -5,15 +5,11 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
 
 from gaigs import configuration
 from gaigs.benchmark._rows import MEASURED, NOT_MEASURED, UNAVAILABLE, Row, Rows, text_of
@@ -44,19 +40,8 @@ class Context:
     deadline: float = math.inf
 
     def compose(self, *overrides: str) -> dict:
-        """The resolved and checked configuration of a run with the command line's overrides and then these.
-
-        Raises:
-            HydraException: An override does not fit.
-            TypeError: A value is not of its key's type.
-            ValueError: A key is unknown or missing, or its value out of range.
-        """
-        running = GlobalHydra.instance().is_initialized()  # which Hydra's main has done, and allows no other
-        with nullcontext() if running else initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-            config = compose("config", [*self.overrides, *overrides])
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        configuration.check(plain)
-        return plain
+        """The configuration of a run with the command line's overrides and then these, as of ``gaigs.compose``."""
+        return configuration.compose(*self.overrides, *overrides)
 
     def seconds_left(self) -> float:
         """Until the deadline, 0 at the least."""

@@ -9,7 +9,6 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -29,7 +28,7 @@ log = logging.getLogger(__name__)
 COSTS = ("train_seconds", "inference_ms", "render_ms", "num_parameters", "num_gaussians", "checkpoint_bytes")
 """What a row takes over from ``metrics.json`` as it is, but for the training, to which kriging is added."""
 
-BAD = (HydraException, OmegaConfBaseException, ValueError, TypeError, FileNotFoundError, ImportError, RuntimeError)
+BAD = (OmegaConfBaseException, ValueError, TypeError, FileNotFoundError, ImportError, RuntimeError)
 """What says in a sentence why a run cannot be."""
 
 
@@ -111,7 +110,7 @@ class Trainings(Measured):
             try:
                 config = context.compose(*common, *axis["of"])
                 default = OmegaConf.select(OmegaConf.create(config), axis["key"])
-            except (HydraException, OmegaConfBaseException) as error:
+            except (ValueError, OmegaConfBaseException) as error:
                 raise ValueError(
                     f"benchmark.axes.{name} must have overrides and a key of a run, and the command line with "
                     f"{' '.join(axis['of'])} and {axis['key']} cannot be read ({sentence(error)}); mend them"
