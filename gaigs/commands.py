@@ -41,6 +41,8 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
         >>> list(metrics["models"])
         ['gaigs', 'mean', 'knn', 'gaussian_process']
     """
+    if not isinstance(configuration, Mapping):
+        raise TypeError(f"configuration must be what gaigs.compose gives, got {configuration!r:.80}")
     config, folder = dict(configuration), Path(folder)
     check(config)
     if config["command"] == "train":

@@ -4,7 +4,6 @@ import hashlib
 import logging
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from importlib import metadata
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
@@ -25,7 +24,7 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from gaigs.registry import KINDS, check_type, find_holders, storable, suggest
+from gaigs.registry import KINDS, check_type, find_holders, registry, storable, suggest
 
 log = logging.getLogger(__name__)
 
@@ -94,8 +93,7 @@ class Constructors(ConfigSource):
 
     def __init__(self, provider: str, path: str):
         super().__init__(provider, path)
-        holders = ((kind, holder) for kind in CONSTRUCTED for holder in find_holders(kind)[0])
-        self.found = {f"{kind}/{holder.name}": (kind, holder) for kind, holder in holders}
+        self.found = {f"{kind}/{name}": (kind, name) for kind in CONSTRUCTED for name in registry(kind).names()}
 
     def __deepcopy__(self, memo: dict) -> "Constructors":
         return self  # Hydra copies its sources for each group that it lists
@@ -105,8 +103,8 @@ class Constructors(ConfigSource):
         return "constructors"
 
     def load_config(self, config_path: str) -> ConfigResult:
-        kind, holder = self.found[config_path.removesuffix(".yaml")]
-        node = OmegaConf.create({"name": holder.name, **holder.options(kind)})
+        kind, name = self.found[config_path.removesuffix(".yaml")]
+        node = OmegaConf.create({**registry(kind).options(name), "name": name})
         return ConfigResult(self.provider, f"{self.scheme()}://", node, {"package": None})
 
     def available(self) -> bool:
@@ -196,20 +194,30 @@ def compose(*overrides: str, **options) -> dict:
 
 
 def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str] = ()) -> dict:
-    """As ``compose``; with sections, the options are those of the first one that has such a name."""
+    """As ``compose``; with sections, the options are those of these alone."""
     choices, values = _choices(options)
-    is_ready = GlobalHydra.instance().is_initialized()  # by Hydra's main, which allows no other
+    running = GlobalHydra.instance()
+    before = running.hydra
+    is_ours = before is not None and any(
+        str(conf_dir()) in str(element.path) for element in running.config_loader().get_search_path().get_path()
+    )
     try:
-        with nullcontext() if is_ready else initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        if is_ours:  # Hydra's main, which allows no other
             config = hydra.compose("config", [*overrides, *choices])
+        else:
+            running.clear()
+            with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+                config = hydra.compose("config", [*overrides, *choices])
     except Exception as error:
         if not isinstance(error, HydraException | OmegaConfBaseException | ValueError) and not is_composing(error):
             raise
         raise ValueError(explain(error)) from None
+    finally:
+        GlobalHydra.instance().hydra = before
     for key, value in values.items():
+        is_new = key.startswith("+") or key in CHOSEN  # what a part has, its constructor knows
         path = _path(config, key, sections)
-        with open_dict(config) if key.startswith("+") else nullcontext():
-            OmegaConf.update(config, path, value, merge=isinstance(value, Mapping), force_add=key.startswith("+"))
+        OmegaConf.update(config, path, value, merge=isinstance(value, Mapping), force_add=is_new)
     return resolve(config)
 
 
@@ -252,8 +260,10 @@ def _choices(options: Mapping) -> tuple[list[str], dict]:
         value = storable(value, key)
         if key not in CHOSEN:
             values[key] = value
-        elif value is None or isinstance(value, str):
-            choices.append(f"{key}={'null' if value is None else value}")
+        elif isinstance(value, str):
+            choices.append(f"{key}={value}")
+        elif value is None and key in MAY_BE_NULL:
+            values[key] = None
         elif isinstance(value, Mapping):
             choices += [f"{key}={value['name']}"] if "name" in value else []
             values[key] = {name: entry for name, entry in value.items() if name != "name"}
@@ -270,13 +280,17 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
     """
     is_new, name = name.startswith("+"), name.removeprefix("+")
     plain = OmegaConf.to_container(config)
-    if sections:
-        places = [section for section in sections if name in plain[section]]
+    if sections and name.partition(".")[0] not in sections:
+        places = [f"{section}.{name}" for section in sections if name in plain[section]]
+        if len(places) > 1:
+            raise ValueError(f"{name} is an option of {' and '.join(sections)}; say which: {', '.join(places)}")
         if not places:
             has = sorted({key for section in sections for key in plain[section]} - {"name"})
             parts = " and ".join(f"{section} {plain[section]['name']!r}" for section in sections)
-            raise ValueError(f"{parts} have no option {suggest(name, has)}; they have: {', '.join(has)}")
-        return f"{places[0]}.{name}"
+            raise ValueError(f"there is no option {suggest(name, has)} of {parts}; there are: {', '.join(has)}")
+        return places[0]
+    if name in CHOSEN:
+        return name
     if "." in name or name in plain:
         parent = plain
         for part in name.split(".")[:-1]:
@@ -296,6 +310,9 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
     if found:
         raise ValueError(f"{name} is an option of several parts; say which: {', '.join(sorted(found))}")
     known = {key.rpartition(".")[2] for key in _options(plain, "")} | plain.keys()
+    for section in ("data", "split", "task"):
+        if name in plain[section]:
+            raise ValueError(f"{name} is an option of {section}, which gaigs.links reads; say {section}.{name}")
     raise ValueError(f"there is no option {suggest(name, known)}; python -m gaigs --help lists all")
 
 
@@ -389,8 +406,7 @@ def installed(*names: str) -> str:
 
 def known(kind: str, name: str, otherwise: str) -> str:
     """A name of a kind where a configuration file or a component has it, and else another: for choices by task."""
-    is_known = has_file(kind, name) or any(holder.name == name for holder in find_holders(kind)[0])
-    return name if is_known else otherwise
+    return name if has_file(kind, name) or name in registry(kind).names() else otherwise
 
 
 def by_task(values: Mapping, otherwise: object, *, _root_: DictConfig) -> object:

@@ -16,7 +16,7 @@ from rich.jupyter import JupyterMixin
 from torch import Tensor
 
 from gaigs.configuration import composed, has_file
-from gaigs.data import Links, Split
+from gaigs.data import Links, Split, check_fit
 from gaigs.files import whole
 from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.model import Model
@@ -112,7 +112,8 @@ def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | No
         baselines: Names or configurations of models without a training; None is the task's own.
 
     Raises:
-        ValueError: The links have no test links or are of another task, or a baseline has to be trained.
+        TypeError: The model or the links are none.
+        ValueError: The links have no test links, other receivers or another task, or a baseline has to be trained.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=50)
@@ -124,12 +125,12 @@ def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | No
         ...
         evaluated on ...
     """
+    if not isinstance(model, Model) or not isinstance(links, Links):
+        raise TypeError(f"evaluate takes a model and links, got {type(model).__name__} and {type(links).__name__}")
+    check_fit(links, model.scene)
+    if not len(links.split.test):
+        raise ValueError("links must have some to test on; take another split")
     task = links.task
-    if task.name != model.scene.task.name or task.shape != model.scene.task.shape:
-        raise ValueError(
-            f"links must have the model's labels, {model.scene.task.name!r} {tuple(model.scene.task.shape)}, got "
-            f"{task.name!r} {tuple(task.shape)}"
-        )
     own, trained = name_of(model), getattr(model, "trend", None)
     models = {own: model}
     if own == "kriging":
@@ -137,6 +138,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | No
         models = {own: model, f"{own}_trend": trained}
     if baselines is None:
         baselines = composed([f"task={task.name}"], {})["baselines"] if has_file("task", task.name) else ()
+    baselines = [baselines] if isinstance(baselines, str) else baselines
     named = [{"name": baseline} if isinstance(baseline, str) else baseline for baseline in baselines]
     scores = score(models, baseline_configurations(named, own, links.scene), links)
     return Evaluation(task, links.split.name, scores, device_name(device_of(model)))

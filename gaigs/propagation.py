@@ -8,7 +8,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.directions import Directions
-from gaigs.query import Query
+from gaigs.query import Query, check_carrier
 from gaigs.scene import Array, Scene, differences
 
 NEAREST = 1e-2
@@ -57,7 +57,8 @@ def bartlett(
         (..., rows, columns), or (..., k) of rays; differentiable, with a gradient of 0 where the amplitude is 0.
 
     Raises:
-        ValueError: The responses are not of the array's elements.
+        TypeError: The responses are no complex tensor.
+        ValueError: They are not of the array's elements, or the frequency is no carrier.
 
     Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
 
@@ -69,6 +70,11 @@ def bartlett(
         >>> spectrum.shape, round(spectrum[-1, 0].item(), 3)  # elevation 90 degrees: all sixteen add up
         (torch.Size([90, 360]), 16.0)
     """
+    check_carrier("frequency", frequency)
+    if not isinstance(responses, Tensor) or not responses.is_complex():
+        raise TypeError(
+            f"responses must be a complex tensor, got {getattr(responses, 'dtype', type(responses).__name__)}"
+        )
     if responses.ndim < 2 or responses.shape[-2] != len(array):
         raise ValueError(
             f"responses must be (..., elements, frequencies) of the array's {len(array)} elements, got "

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
 import gaigs
 from gaigs import configuration
@@ -137,6 +138,7 @@ def test_threads_hold_while_it_trains_and_no_longer(tmp_path, monkeypatch):
         ({"tokenizer": "gaa"}, r"there is no tokenizer 'gaa' \(did you mean 'ga'\?\)"),
         ({"tokenizer": 3}, "tokenizer must be a name, a mapping with a name and options, or a component, got 3"),
         ({"save_every": torch.nn.GELU()}, "save_every must be a number, a text, a list or a registered component"),
+        ({"transmitters": 3}, "transmitters is an option of data, which gaigs.links reads"),
         ({"seed": -1}, "seed must be in 0..4294967295, got -1"),
         ({"model": "nerf2_"}, "there is no model 'nerf2_'"),
     ],
@@ -155,6 +157,18 @@ def test_options_are_found_by_name_and_parts_are_chosen():
     tokenizer = EuclideanTokenizer(links.scene, width=16)
     assert gaigs.compose(tokenizer=tokenizer)["model"]["tokenizer"] == configuration_of(tokenizer)
     assert gaigs.compose("model=knn", k=5)["model"]["k"] == 5
+    assert gaigs.compose(gaussians=None, density=None)["model"]["gaussians"] is None
+    assert gaigs.compose(**{"training.jitter": np.float64(0.5)})["training"]["jitter"] == 0.5
+    assert gaigs.links("synthetic_rssi", transmitters=20, split={"name": "random", "seed": 4}).split.name.endswith("4")
+    with pytest.raises(ValueError, match=r"seed is an option of data and split; say which: data.seed, split.seed"):
+        gaigs.links("synthetic_rssi", seed=4)
+
+
+def test_it_composes_inside_another_program_of_hydra(tmp_path):
+    (tmp_path / "own.yaml").write_text("a: 1")
+    with initialize_config_dir(str(tmp_path), version_base="1.3"):
+        assert gaigs.compose("model=knn", k=5)["model"]["k"] == 5
+        assert compose("own") == {"a": 1}
 
 
 # --- arrays in memory ---
@@ -172,6 +186,10 @@ def test_readings_of_all_gateways_become_links():
     assert torch.equal(links.labels, torch.tensor(readings.ravel()[heard], dtype=torch.float32))
     assert torch.equal(links.query.receivers, torch.arange(2).repeat(12)[torch.tensor(heard)])
     assert torch.equal(links.rows, torch.arange(12).repeat_interleave(2)[torch.tensor(heard)])
+    long = gaigs.links(
+        task="rssi", transmitters=PLACES.repeat(2, 0), receivers=GATEWAYS, labels=readings.ravel(), index=[0, 1] * 12
+    )
+    assert torch.equal(long.rows, links.rows), "links of one place are never parted"
     assert links.query.frequencies.unique().tolist() == [2.4e9]
     assert "1 links were not heard" in links.remarks
 
@@ -193,11 +211,11 @@ def test_each_link_has_a_receiver_of_its_own():
     [
         ({"labels": np.zeros((12, 3))}, r"labels of task 'rssi' must be \(12,\) .* or \(12, 2\).*, got \(12, 3\)"),
         ({"labels": np.zeros((12, 2)) + np.inf}, "labels must be finite where something was heard"),
-        ({"labels": np.zeros(12), "index": [5] * 12}, "index must be 12 numbers from 0 to 1"),
+        ({"labels": np.zeros(12), "index": [5] * 12}, "index must be 12 whole numbers from 0 to 1"),
         ({"transmitters": PLACES[:, :2]}, r"transmitters must be \(..., 3\) positions \[m\], got shape \(12, 2\)"),
         ({"transmitters": PLACES * np.nan}, "transmitters must be finite"),
         ({"frequency": 2.4}, "frequency must be a carrier in Hz, from 10000 to 3e.11, got 2.4; in GHz?"),
-        ({"tset": 0.5}, r"split 'random' have no option 'tset' \(did you mean 'test'\?\)"),
+        ({"tset": 0.5}, r"there is no option 'tset' \(did you mean 'test'\?\) of split 'random'"),
         ({"task": "rsi"}, r"unknown task 'rsi' \(did you mean 'rssi'\?\)"),
     ],
 )
@@ -221,6 +239,46 @@ def test_a_model_of_parts_is_trained_and_its_checkpoint_loads(reader, tmp_path):
     assert torch.equal(again.predict(places), model.predict(places))
     assert configuration_of(again) == configuration_of(model)
     assert configuration_of(model)["tokenizer"]["width"] == 8
+
+
+def test_an_object_is_trained_itself_and_no_copy_of_it():
+    links = gaigs.links("synthetic", transmitters=20, order=0)
+    tokenizer = EuclideanTokenizer(links.scene, width=8)
+    model = gaigs.train("gaigs", links, tokenizer=tokenizer, count=5, **FEW)
+    assert model.tokenizer is tokenizer
+    modes = []
+    tokenizer.register_forward_hook(lambda module, *_: modes.append(module.training))
+    gaigs.train(model, links, **FEW)
+    assert modes[0], "trained once more, it is in training mode"
+
+
+@pytest.mark.parametrize(
+    ("words", "options", "message"),
+    [
+        (["data=synthetic_csi"], {}, "data and split are the links' own"),
+        ([], {"split.seed": 4}, "data and split are the links' own"),
+        ([], {"tokenizer": "ga"}, "the model is made already"),
+    ],
+)
+def test_options_of_what_is_made_already_are_refused(words, options, message):
+    links = gaigs.links("synthetic", transmitters=20, order=0)
+    with pytest.raises(ValueError, match=message):
+        gaigs.train(GaussianSplatting(links.scene), links, *words, **options)
+
+
+def test_a_class_of_a_notebook_is_trained_by_its_name():
+    @gaigs.register("loss", "notebook")
+    class Notebook:
+        def __init__(self, task, power: float = 2.0):
+            self.power = power
+
+        def __call__(self, values, batch):
+            loss = (values - batch.labels).abs().pow(self.power).mean()
+            return loss, {"notebook": loss}
+
+    assert gaigs.compose(loss="notebook")["loss"] == {"name": "notebook", "power": 2.0}
+    links = gaigs.links("synthetic", transmitters=20, order=0)
+    gaigs.train("gaigs", links, loss={"name": "notebook", "power": 1.5}, count=5, **FEW)
 
 
 def test_mirrored_gaussians_have_parts_that_suit_them():
@@ -248,12 +306,19 @@ def test_what_cannot_be_stored_says_so(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_links_of_other_receivers_are_not_scored():
+    arrays = {"task": "rssi", "transmitters": PLACES, "labels": np.zeros((12, 2)) - 50}
+    model = gaigs.train("mean", gaigs.links(**arrays, receivers=GATEWAYS))
+    with pytest.raises(ValueError, match="links must have the model's receivers in the same order"):
+        gaigs.evaluate(model, gaigs.links(**arrays, receivers=GATEWAYS[::-1]))
+
+
 def test_links_without_their_test_or_of_another_task_are_refused():
     links = gaigs.links("synthetic_rssi", transmitters=20)
     model = gaigs.train("mean", links)
     with pytest.raises(ValueError, match="links must have the model's labels, 'rssi'"):
         gaigs.evaluate(model, gaigs.links("synthetic", transmitters=20, order=0))
-    with pytest.raises(ValueError, match="links must have a split to be trained on"):
+    with pytest.raises(ValueError, match="links must have a split"):
         gaigs.train("mean", replace(links, split=None))
 
 
@@ -306,7 +371,7 @@ def test_a_batch_is_its_maps_one_by_one(batched):
 def test_rays_are_pixels_of_the_grid():
     inputs = cloud()
     grid, _ = gaigs.rasterize(**inputs, receiver=POSE, grid=COARSE, projection=FINE, rasterizer="torch")
-    rays, left = gaigs.rasterize(**inputs, receiver=POSE, grid=COARSE.flatten(), projection=FINE, rasterizer="torch")
+    rays, left = gaigs.rasterize(**inputs, receiver=POSE, grid=COARSE.flatten(), pixel=0.1, rasterizer="torch")
     assert left.shape == (9 * 18,)
     torch.testing.assert_close(rays, grid.flatten(1))
 
@@ -317,6 +382,7 @@ def test_rays_are_pixels_of_the_grid():
         ({"quats": torch.ones(4, 4)}, r"quats must be \(5, 4\) or \('b', 5, 4\), got \(4, 4\)"),
         ({"opacities": torch.ones(5)}, "opacities must be real numbers of means' torch.float64, got torch.float32"),
         ({"signal": torch.ones(2, 5, 1).double(), "means": torch.ones(3, 5, 3).double()}, "one number of transmitters"),
+        ({"grid": COARSE.flatten()}, "pixel must be given for rays"),
         ({"rasterizer": "aperture"}, "rasterizer 'aperture' draws no map; take fastest, opencl or torch"),
         ({"rasterizer": "torhc"}, r"unknown rasterizer 'torhc' \(did you mean 'torch'\?\)"),
         (

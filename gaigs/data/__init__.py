@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gaigs.geometry import Pose
-from gaigs.query import Batch, Query, as_positions, check_carrier
+from gaigs.query import Batch, Query, as_numbers, as_positions, check_carrier
 from gaigs.registry import registry
 from gaigs.scene import Receiver, Scene
 from gaigs.task import Task
@@ -80,7 +80,8 @@ class Links:
         if self.split is not None:
             counts = ", ".join(f"{len(part)} {name}" for name, part in self.split.parts().items())
             parts = f"split {self.split.name}: {counts}"
-        return f"<{len(self)} links of task {self.task.name!r} to {len(self.receivers)} receivers; {parts}>"
+        count = len(self.receivers)
+        return f"<{len(self)} links of task {self.task.name!r} to {count} receiver{'s' * (count != 1)}; {parts}>"
 
     def __len__(self) -> int:
         return len(self.query)
@@ -164,6 +165,12 @@ def links(reader: str | None = None, /, **options) -> Links:
     from gaigs import configuration  # which needs Hydra, as a checkpoint does not
 
     if reader is None:
+        needed = ("task", "transmitters", "receivers", "labels")
+        if missing := [key for key in needed if key not in options]:
+            raise ValueError(
+                f"links takes the name of a reader first, or arrays: {', '.join(needed)}; {', '.join(missing)} must be "
+                "given"
+            )
         return from_arrays(**options)
     config = configuration.composed([f"data={reader}"], options, ("data", "split"))
     return load(config["data"], config["split"])
@@ -176,7 +183,7 @@ def from_arrays(
     labels: Tensor,
     index: Int[Tensor, "n"] | None = None,
     frequency: float | Float[Tensor, "n"] | None = None,
-    split: str = "random",
+    split: str | Mapping = "random",
     **options,
 ) -> Links:
     """Links of arrays in memory, with their split; anything that becomes a tensor is an array.
@@ -200,9 +207,11 @@ def from_arrays(
     """
     from gaigs import configuration
 
-    config = configuration.composed([f"split={split}"], options, ("split",))["split"]
+    config = configuration.composed([], {"split": split, **options}, ("split",))["split"]
     task = registry("task").build(task)
-    places = as_positions("transmitters", transmitters)
+    places = as_positions("transmitters", transmitters).detach()
+    if places.ndim != 2 or not len(places):
+        raise ValueError(f"transmitters must be (n, 3) positions [m], got shape {tuple(places.shape)}")
     if isinstance(receivers, Receiver):
         receivers = [receivers]
     if not (isinstance(receivers, Sequence) and all(isinstance(each, Receiver) for each in receivers)):
@@ -210,21 +219,27 @@ def from_arrays(
         if index is None and len(stands) == len(places) > 1 and np.ndim(labels) == 1 + len(task.shape):
             stands, index = stands.unique(dim=0, return_inverse=True)
         receivers = [Receiver(f"rx{k}", Pose(place, torch.eye(3))) for k, place in enumerate(stands)]
-    labels = torch.as_tensor(labels).to(task.dtype)
+    if np.ma.is_masked(labels):
+        raise ValueError("labels must be plain numbers, got a masked array; fill it with nan, which was not heard")
+    if task.dtype.is_complex:
+        labels = torch.as_tensor(labels).detach().to(task.dtype)
+    else:
+        labels = as_numbers("labels", labels, f"labels of task {task.name!r}").detach().to(task.dtype)
     count, most, shape = len(places), len(receivers), tuple(task.shape)
     rows = torch.arange(count)
     if tuple(labels.shape) == (count, most, *shape) and index is None:
         rows, index = rows.repeat_interleave(most), torch.arange(most).repeat(count)
         labels = labels.flatten(0, 1)
     elif tuple(labels.shape) == (count, *shape) and (index is not None or most == 1):
-        index = torch.zeros(count, dtype=torch.long) if index is None else torch.as_tensor(index).long()
+        index = torch.zeros(count, dtype=torch.long) if index is None else torch.as_tensor(index)
     else:
         raise ValueError(
             f"labels of task {task.name!r} must be {(count, *shape)} with the receiver of each link in index, or "
             f"{(count, most, *shape)}, one for each transmitter and receiver, got {tuple(labels.shape)}"
         )
-    if index.shape != (len(rows),) or not ((index >= 0) & (index < most)).all():
-        raise ValueError(f"index must be {count} numbers from 0 to {most - 1}, got {index.tolist()[:5]} ...")
+    is_whole = not (index.is_floating_point() or index.is_complex() or index.dtype == torch.bool)
+    if not is_whole or index.shape != (len(rows),) or not ((index >= 0) & (index < most)).all():
+        raise ValueError(f"index must be {count} whole numbers from 0 to {most - 1}, got {index.tolist()[:5]} ...")
     flat = labels.reshape(len(rows), -1)
     heard = (flat != 0).any(1) if task.dtype.is_complex else ~flat.isnan().all(1)
     if not heard.any() or not flat[heard].isfinite().all():
@@ -233,15 +248,67 @@ def from_arrays(
     if frequency is None and hasattr(task, "frequencies"):
         frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
     if frequency is not None:
-        carriers = torch.as_tensor(frequency, dtype=torch.float32).expand(count)[rows]
+        carriers = as_numbers("frequency", frequency, "a carrier in Hz")
+        if carriers.ndim and carriers.shape != (count,):
+            raise ValueError(f"frequency must be one number, or {count}, one for each transmitter, got {len(carriers)}")
+        carriers = carriers.expand(count)[rows]
         for carrier in carriers.unique().tolist():
             check_carrier("frequency", carrier)
     made = Links(
-        query=Query(places[rows][heard], index[heard], None if carriers is None else carriers[heard]),
+        query=Query(places[rows][heard], index[heard].long(), None if carriers is None else carriers[heard]),
         receivers=tuple(receivers),
         labels=labels[heard],
         task=task,
-        rows=rows[heard],
+        rows=_places(places)[rows][heard],
         remarks=f"{int((~heard).sum())} links were not heard and are left out" if not heard.all() else "",
     )
     return replace(made, split=registry("split").build(config, links=made))
+
+
+def _places(transmitters: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    """Which of the different places each one is, in the order in which they appear."""
+    numbers: dict[tuple, int] = {}
+    return torch.tensor([numbers.setdefault(tuple(place), len(numbers)) for place in transmitters.tolist()])
+
+
+def check_fit(links: Links, scene: Scene | None = None) -> None:
+    """Sees to it that links have a split, and are of the receivers and the task that a model was made for.
+
+    Raises:
+        ValueError: They have no split, other receivers, or labels of another task or with other axes.
+    """
+    if links.split is None:
+        raise ValueError("links must have a split; gaigs.links(..., split='random') gives one")
+    if scene is None:
+        return
+    there, here = scene.task, links.task
+    axes = lambda task: {key: value for key, value in task.state().items() if key != "normalisation"}
+    if there.name != here.name or tuple(there.shape) != tuple(here.shape) or not _are_alike(axes(there), axes(here)):
+        raise ValueError(
+            f"links must have the model's labels, {there.name!r} {tuple(there.shape)} with the same axes, got "
+            f"{here.name!r} {tuple(here.shape)}"
+        )
+    places = [
+        [(each.pose.position, each.pose.rotation, each.array.elements, each.array.pattern) for each in receivers]
+        for receivers in (scene.receivers, links.receivers)
+    ]
+    if not _are_alike(*places):
+        names = [", ".join(each.name for each in receivers) for receivers in (scene.receivers, links.receivers)]
+        raise ValueError(
+            f"links must have the model's receivers in the same order, at the same places: {names[0]}; got {names[1]}"
+        )
+
+
+def _are_alike(a: object, b: object) -> bool:
+    """Whether nested values are the same, tensors to 1e-5."""
+    if isinstance(a, Tensor):
+        return (
+            isinstance(b, Tensor)
+            and a.shape == b.shape
+            and torch.allclose(a.double(), b.double(), rtol=1e-6, atol=1e-5)
+        )
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(_are_alike(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(_are_alike, a, b))
+    return a == b

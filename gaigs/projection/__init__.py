@@ -1,6 +1,5 @@
 """Projections lay Gaussians on the receiver's perception plane."""
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gaigs.directions import Directions, Rays
+from gaigs.directions import Directions, Grid
 from gaigs.geometry import Pose, semi_axes
-from gaigs.registry import name_of, registry
+from gaigs.registry import is_built, name_of, registry
 
 NEAR = 1e-6
 """A Gaussian nearer to the receiver than this sits on it [m]: float32 tells no direction between two positions of some
@@ -127,6 +126,7 @@ def project(
     receiver: Pose,
     grid: Directions,
     projection: str | Mapping | Projection = "mercator",
+    pixel: float | None = None,
 ) -> tuple[Splats, Plane]:
     """Quaternions are (w, x, y, z) of any length, in the world frame: Gaussians as a receiver sees them, in 2-D.
 
@@ -135,9 +135,10 @@ def project(
         quats: Orientations, the columns of whose rotation matrices are the Gaussians' axes in the world frame (n, 4).
         scales: Standard deviations along these axes (n, 3) [m].
         receiver: A ``gaigs.Pose``, or a ``gaigs.Receiver``, whose pose counts.
-        grid: Directions of the pixels in the receiver's frame, ``gaigs.Grid`` or ``gaigs.Rays``; the footprints are
-            widened by a pixel of its pitch.
+        grid: Directions of the pixels in the receiver's frame [rad], ``gaigs.Grid`` or ``gaigs.Rays``.
         projection: Name, configuration or object.
+        pixel: Edge of the pixel by whose variance footprints are widened [rad]; None is the grid's pitch, which rays
+            have none of. Not looked at where the projection is an object.
 
     Returns:
         The splats, and where the pixels lie on the plane; differentiable in means, quaternions and scales. Each input
@@ -160,11 +161,13 @@ def project(
                 f"{name} must be (n, {size}) or (b, n, {size}) with the n of means, got {tuple(values.shape)} beside "
                 f"{tuple(means.shape)}"
             )
-    if isinstance(grid, Rays):
-        pitch = (4 * math.pi / max(len(grid.elevations), 1)) ** 0.5  # as if they covered the sphere
-    else:
-        pitch = grid.pitch
-    chosen = registry("projection").build(projection, pixel=pitch)
+    if pixel is None and isinstance(grid, Grid):
+        pixel = grid.pitch or grid.thin(slice(1), slice(None)).azimuths.diff().abs().sum().item() / grid.shape[1]
+    if not is_built(projection) and not pixel:
+        raise ValueError("pixel must be given for rays and for a single pixel, in rad: e.g. gaigs.Grid.degrees().pitch")
+    if not len(grid.elevations) or not len(grid.azimuths):
+        raise ValueError("the grid must have directions, got none")
+    chosen = registry("projection").build(projection, pixel=pixel)
     grid = grid.to(means)
     if not chosen.sees_below and grid.elevations.min() < 0:
         raise ValueError(

@@ -79,6 +79,7 @@ def rasterize(
     grid: Directions,
     projection: str | Mapping | Projection = "mercator",
     rasterizer: str | Mapping | Rasterizer = "fastest",
+    pixel: float | None = None,
 ) -> tuple[Float[Tensor, "*b c rows columns"], Float[Tensor, "*b rows columns"]]:
     """Quaternions are (w, x, y, z) of any length, in the world frame: the map that Gaussians make at a receiver.
 
@@ -94,6 +95,8 @@ def rasterize(
         receiver: A ``gaigs.Pose``, or a ``gaigs.Receiver``, whose pose counts.
         grid: Directions of the pixels in the receiver's frame [rad]: ``gaigs.Grid``, or ``gaigs.Rays``.
         projection, rasterizer: Names, configurations or objects.
+        pixel: Edge of the pixel by whose variance footprints are widened [rad]; None is the grid's pitch, which rays
+            have none of.
 
     Returns:
         The map (c, rows, columns), and the share that passes all Gaussians (rows, columns); of k rays (c, k) and (k,).
@@ -119,6 +122,9 @@ def rasterize(
         >>> means.grad.shape
         torch.Size([2, 3])
     """
+    given = means, quats, scales, opacities, signal, *([] if attenuations is None else [attenuations])
+    if not all(isinstance(values, Tensor) for values in given):
+        raise TypeError("means, quats, scales, opacities, signal and attenuations must be torch tensors")
     n = means.shape[-2] if means.ndim > 1 else 0
     inputs = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "scales": (scales, (n, 3))}
     inputs |= {"opacities": (opacities, (n,)), "signal": (signal, (n, *signal.shape[-1:]))}
@@ -146,7 +152,7 @@ def rasterize(
     for row in rows:
         geometry = [means[row.start if len(means) > 1 else 0] if means.ndim == 3 else means]
         geometry += [values[row] if values.ndim == 3 and len(values) > 1 else values for values in (quats, scales)]
-        splats, plane = project(*geometry, receiver=receiver, grid=grid, projection=projection)
+        splats, plane = project(*geometry, receiver=receiver, grid=grid, projection=projection, pixel=pixel)
         own = None if attenuations is None else attenuations[row]
         maps.append(chosen(splats, signal[row], opacities[row], own, plane))
     image, left = (cat(parts) for parts in zip(*maps, strict=True))

@@ -3,6 +3,7 @@
 Names are found without importing anybody's code; what a name stands for is imported when it is asked for.
 """
 
+import contextlib
 import difflib
 import functools
 import importlib
@@ -17,7 +18,7 @@ from types import MappingProxyType, NoneType, UnionType
 
 from omegaconf import OmegaConf
 
-from gaigs.registry._holders import GIVEN, Holder, find_holders, sources
+from gaigs.registry._holders import GIVEN, MISSING, Holder, find_holders, is_plain, sources
 from gaigs.registry._holders import digests as digests
 
 KINDS = (
@@ -48,7 +49,7 @@ class Registry:
     ``gaigs.registries`` has one for each kind, by its name.
 
     Args:
-        kind: One of ``KINDS``: a folder of gaigs, a folder of conf, and the entry-point group ``gaigs.<kind>``.
+        kind: One of ``KINDS``: a folder of gaigs, a group of choices, and the entry-point group ``gaigs.<kind>``.
 
     Example:
         >>> gaigs.registries["tokenizer"].names()
@@ -110,6 +111,22 @@ class Registry:
         names = self.names()
         causes = "".join(f"; cannot read {cause}" for cause in unreadable)
         raise ValueError(f"unknown {self.kind} {suggest(name, names)}; there are: {_listed(names)}{causes}")
+
+    def options(self, name: str) -> dict:
+        """The arguments that a component takes from a configuration, with their defaults; ``???`` must be given.
+
+        Those whose default a configuration cannot hold are left out, and of files so are inherited ones.
+        """
+        holders, _ = find_holders(self.kind, name)
+        if holders:
+            return holders[0].options(self.kind)
+        options = {}
+        for key, parameter in _signature(self._registered[name]).parameters.items():
+            is_own = parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+            default = MISSING if parameter.default is parameter.empty else parameter.default
+            if is_own and key not in GIVEN.get(self.kind, ()) and is_plain(default):
+                options[key] = default
+        return options
 
     def build(self, config: str | Mapping | object, **context):
         """The component that a configuration names, made with its options.
@@ -236,10 +253,10 @@ def storable(value: object, where: str):
         return [storable(entry, where) for entry in value]
     if isinstance(value, Path):
         return str(value)
+    if hasattr(value, "item") and getattr(value, "ndim", None) == 0:  # a number of numpy or torch, which may be a float
+        return value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if hasattr(value, "item") and getattr(value, "ndim", None) == 0:  # a number of numpy or torch
-        return value.item()
     if hasattr(value, "configuration"):
         return configuration_of(value)
     raise ValueError(
@@ -272,7 +289,8 @@ def _noting(kind: str, name: str, component: Callable) -> Callable:
                     case _:
                         options[key] = value
             options = {key: value for key, value in options.items() if key not in given}
-            object.__setattr__(self, "configuration", {"name": name, **options})
+            with contextlib.suppress(AttributeError):  # of a tuple, say, which holds nothing else
+                object.__setattr__(self, "configuration", {**options, "name": name})
 
     noting.notes = component
     component.__init__ = noting

@@ -131,7 +131,11 @@ def _with_imports(place: Path) -> set[Path]:
         place = places.pop()
         files = {place} if place.is_file() else {*place.rglob("*.py")}
         for file in files - found:
-            for node in ast.walk(ast.parse(file.read_bytes())):
+            try:
+                tree = ast.parse(file.read_bytes())
+            except (SyntaxError, ValueError):  # of a file that nobody imports
+                continue
+            for node in ast.walk(tree):
                 names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
                 names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
                 for first, *others in (name.split(".") for name in names):
@@ -234,7 +238,18 @@ def _options(kind: str, node: ast.stmt) -> dict:
         if argument.arg == "self" or argument.arg in GIVEN.get(kind, ()):
             continue
         try:
-            options[argument.arg] = MISSING if default is None else ast.literal_eval(default)
+            value = MISSING if default is None else ast.literal_eval(default)
         except ValueError:  # e.g. a constant's name
             continue
+        if is_plain(value):
+            options[argument.arg] = value
     return options
+
+
+def is_plain(value: object) -> bool:
+    """Whether a configuration can hold a default as it is."""
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and is_plain(entry) for key, entry in value.items())
+    if isinstance(value, list | tuple):
+        return all(map(is_plain, value))
+    return value is None or isinstance(value, bool | int | float) or (isinstance(value, str) and "${" not in value)

@@ -54,7 +54,7 @@ def claim(folder: Path, config: dict) -> None:
         listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in told)
         raise ValueError(
             f"{folder} must be free or hold a run of the same configuration, but {listed}; choose another folder with "
-            "hydra.run.dir=DIR (nothing was written into this one but Hydra's own .hydra/)"
+            "hydra.run.dir=DIR"
         )
 
 

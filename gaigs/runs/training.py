@@ -20,7 +20,7 @@ from torch import distributed
 
 from gaigs import checkpoint, evaluation
 from gaigs.configuration import composed, preset
-from gaigs.data import Links
+from gaigs.data import Links, check_fit
 from gaigs.loss import Loss
 from gaigs.model import Model
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
@@ -70,12 +70,21 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
         >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape
         torch.Size([2, 90, 360])
     """
-    if links.split is None:
-        raise ValueError("links must have a split to be trained on; gaigs.links(..., split='random') gives one")
+    if not isinstance(model, str | Model) or not isinstance(links, Links):
+        raise TypeError(f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}")
     own = None if isinstance(model, str) else model
+    check_fit(links, own and own.scene)
     name = model if own is None else configuration_of(own)["name"]
-    config = composed([*preset(name, links.task.name), *overrides], options)
+    words = preset(name, links.task.name)
+    config = composed([*words, *overrides], options)
+    if overrides or options:
+        usual = composed(words, {})
+        if config["data"] != usual["data"] or config["split"] != usual["split"]:
+            raise ValueError("data and split are the links' own; give their options to gaigs.links")
+        if own is not None and config["model"] != usual["model"]:
+            raise ValueError("the model is made already; give the options of its parts where it is made")
     config |= {"data": {"name": "arrays"}, "split": {"name": links.split.name}, **links.origin}
+    parts = {key: value for key, value in options.items() if hasattr(value, "configuration")}
     if own is not None:
         config["model"] = configuration_of(own)
     with contextlib.ExitStack() as stack:
@@ -86,7 +95,9 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
         stack.enter_context(only_run(place))
         claim(place, config)
         lightning.seed_everything(config["seed"], verbose=False)
-        loss = registry("loss").build(config["loss"], task=links.task)
+        loss = registry("loss").build(parts.pop("loss", config["loss"]), task=links.task)
+        if parts:
+            own = registry("model").build(config["model"] | parts, scene=links.scene)
         return fit(own, loss, links, config, place).models[config["model"]["name"]].eval()
 
 
@@ -182,6 +193,7 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
     # Before weights come from a checkpoint: Lightning converts behind that, which would round them.
     module = trainer.precision_plugin.convert_module(module)
     handlers = {number: signal.getsignal(number) for number in STOPPING}
+    module.train()  # a model that has been trained or loaded is in evaluation mode
     try:
         with warnings.catch_warnings():
             # Of Lightning's own dealings with torch, of a split without validation links, and of few steps.
