@@ -138,8 +138,8 @@ def only_run(folder: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ValueError(
-                f"{folder} must be free, and another run is at work there; wait for it, or choose another folder with "
-                "hydra.run.dir=DIR"
+                f"{folder} must be free, and another run is at work there; wait for it, or choose another folder "
+                "(hydra.run.dir=DIR)"
             ) from None
         yield
     finally:

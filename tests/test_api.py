@@ -258,6 +258,7 @@ def test_an_object_is_trained_itself_and_no_copy_of_it():
         (["data=synthetic_csi"], {}, "data and split are the links' own"),
         ([], {"split.seed": 4}, "data and split are the links' own"),
         ([], {"tokenizer": "ga"}, "the model is made already"),
+        (["+experiment=mirrored"], {}, r"\+experiment=mirrored must be left out"),
     ],
 )
 def test_options_of_what_is_made_already_are_refused(words, options, message):

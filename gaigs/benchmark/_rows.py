@@ -84,7 +84,7 @@ def read(file: Path, columns: Sequence[str]) -> list[Row]:
     Raises:
         ValueError: It has other columns, or a damaged line before the last.
     """
-    told = "; move it elsewhere, or choose another folder with hydra.run.dir=DIR"
+    told = "; move it elsewhere, or choose another folder (hydra.run.dir=DIR)"
     try:
         text = file.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:

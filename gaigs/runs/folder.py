@@ -35,7 +35,7 @@ def claim(folder: Path, config: dict) -> None:
     if there and not is_configuration(file):
         raise ValueError(
             f"{folder} must be free or hold a run, and it holds {', '.join(there)} of something else; choose another "
-            "folder with hydra.run.dir=DIR"
+            "folder (hydra.run.dir=DIR)"
         )
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         store(config, folder)
@@ -46,15 +46,15 @@ def claim(folder: Path, config: dict) -> None:
     except Exception as error:  # whatever a file meets that is YAML, but no configuration
         raise ValueError(
             f"{file} must be what a run wrote, and is damaged ({' '.join(str(error).split())}); take another copy of "
-            "it, or choose another folder with hydra.run.dir=DIR"
+            "it, or choose another folder (hydra.run.dir=DIR)"
         ) from error
     differing = differences(there, config)
     if differing:
         told = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
         listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in told)
         raise ValueError(
-            f"{folder} must be free or hold a run of the same configuration, but {listed}; choose another folder with "
-            "hydra.run.dir=DIR"
+            f"{folder} must be free or hold a run of the same configuration, but {listed}; choose another folder "
+            "(hydra.run.dir=DIR)"
         )
 
 
@@ -95,13 +95,13 @@ def check_software(folder: Path, config: dict) -> None:
     if series(began) != series(here["gaigs"]):
         raise ValueError(
             f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}, whose runs are others; choose another "
-            "folder with hydra.run.dir=DIR"
+            "folder (hydra.run.dir=DIR)"
         )
     changed = sorted(key for key in here.keys() | there.keys() if key != "gaigs" and here.get(key) != there.get(key))
     if changed:
         raise ValueError(
             f"{folder} must be of the same plug-ins, and the source of {', '.join(changed)} has changed since it was "
-            "begun; choose another folder with hydra.run.dir=DIR"
+            "begun; choose another folder (hydra.run.dir=DIR)"
         )
 
 
@@ -126,7 +126,7 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
     if not same or there["links"] != here["links"]:
         raise ValueError(
             f"{path} must be of these very data to go on, but they have another split, or other transmitters, "
-            "receivers, frequencies or labels now; choose another folder with hydra.run.dir=DIR"
+            "receivers, frequencies or labels now; choose another folder (hydra.run.dir=DIR)"
         )
 
 

@@ -75,6 +75,10 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
     own = None if isinstance(model, str) else model
     check_fit(links, own and own.scene)
     name = model if own is None else configuration_of(own)["name"]
+    if experiments := [word for word in overrides if word.startswith("+experiment=")]:
+        raise ValueError(
+            f"{experiments[0]} must be left out: train takes that of the model and the links' task by itself"
+        )
     words = preset(name, links.task.name)
     config = composed([*words, *overrides], options)
     if overrides or options:
@@ -235,7 +239,7 @@ def resumable(last: Path, best: Path) -> dict:
     except ValueError as error:
         raise ValueError(
             f"the training cannot go on: {error}; move {last} elsewhere to train anew in this folder, which overwrites "
-            "best.ckpt, or choose another folder with hydra.run.dir=DIR"
+            "best.ckpt, or choose another folder (hydra.run.dir=DIR)"
         ) from error
     return content
 
