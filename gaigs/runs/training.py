@@ -76,9 +76,7 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
     check_fit(links, own and own.scene)
     name = model if own is None else configuration_of(own)["name"]
     if experiments := [word for word in overrides if word.startswith("+experiment=")]:
-        raise ValueError(
-            f"{experiments[0]} must be left out: train takes that of the model and the links' task by itself"
-        )
+        raise ValueError(f"{experiments[0]} must be left out: train takes that of the model and the task by itself")
     words = preset(name, links.task.name)
     config = composed([*words, *overrides], options)
     if overrides or options:
