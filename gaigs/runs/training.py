@@ -77,16 +77,15 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
     name = model if own is None else configuration_of(own)["name"]
     if experiments := [word for word in overrides if word.startswith("+experiment=")]:
         raise ValueError(f"{experiments[0]} must be left out: train takes that of the model and the task by itself")
-    words = preset(name, links.task.name)
+    words, parts = preset(name, links.task.name), {k: v for k, v in options.items() if hasattr(v, "configuration")}
     config = composed([*words, *overrides], options)
     if overrides or options:
         usual = composed(words, {})
         if config["data"] != usual["data"] or config["split"] != usual["split"]:
             raise ValueError("data and split are the links' own; give their options to gaigs.links")
-        if own is not None and config["model"] != usual["model"]:
+        if own is not None and (config["model"] != usual["model"] or parts.keys() - {"loss"}):
             raise ValueError("the model is made already; give the options of its parts where it is made")
     config |= {"data": {"name": "arrays"}, "split": {"name": links.split.name}, **links.origin}
-    parts = {key: value for key, value in options.items() if hasattr(value, "configuration")}
     if own is not None:
         config["model"] = configuration_of(own)
     with contextlib.ExitStack() as stack:
