@@ -423,7 +423,7 @@ def launcher(name: str) -> str:
     return name
 
 
-# At import, for whoever composes: a launcher's workers need them too.
+# At import: a launcher's workers need them too.
 OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
 OmegaConf.register_new_resolver("installed", installed, replace=True, use_cache=True)
 OmegaConf.register_new_resolver("known", known, replace=True)

@@ -112,7 +112,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | No
         baselines: Names or configurations of models without a training; None is the task's own.
 
     Raises:
-        TypeError: The model or the links are none.
+        TypeError: The model is no ``gaigs.Model``, or the links are no ``gaigs.Links``.
         ValueError: The links have no test links, other receivers or another task, or a baseline has to be trained.
 
     Example:

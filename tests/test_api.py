@@ -384,6 +384,7 @@ def test_rays_are_pixels_of_the_grid():
         ({"opacities": torch.ones(5)}, "opacities must be real numbers of means' torch.float64, got torch.float32"),
         ({"signal": torch.ones(2, 5, 1).double(), "means": torch.ones(3, 5, 3).double()}, "one number of transmitters"),
         ({"grid": COARSE.flatten()}, "pixel must be given for rays"),
+        ({"grid": gaigs.Grid(torch.arange(1.0, 90.0), torch.arange(360.0))}, "Grid.degrees takes degrees"),
         ({"rasterizer": "aperture"}, "rasterizer 'aperture' draws no map; take fastest, opencl or torch"),
         ({"rasterizer": "torhc"}, r"unknown rasterizer 'torhc' \(did you mean 'torch'\?\)"),
         (

@@ -1,5 +1,6 @@
 """Projections lay Gaussians on the receiver's perception plane."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -167,6 +168,8 @@ def project(
         raise ValueError("pixel must be given for rays and for a single pixel, in rad: e.g. gaigs.Grid.degrees().pitch")
     if not len(grid.elevations) or not len(grid.azimuths):
         raise ValueError("the grid must have directions, got none")
+    if (most := grid.elevations.abs().max().item()) > math.pi / 2 + 1e-4:
+        raise ValueError(f"elevations must lie within 1.5708 rad, got {most:g}; gaigs.Grid.degrees takes degrees")
     chosen = registry("projection").build(projection, pixel=pixel)
     grid = grid.to(means)
     if not chosen.sees_below and grid.elevations.min() < 0:
