@@ -38,7 +38,7 @@ def as_numbers(what: str, values: object, expected: str) -> Tensor:
     """Real numbers of any kind as a float tensor.
 
     Raises:
-        ValueError: They are none.
+        ValueError: They are not real numbers.
     """
     try:
         tensor = torch.as_tensor(values)
@@ -53,7 +53,7 @@ def as_positions(what: str, values: object) -> Float[Tensor, "*points 3"]:
     """Positions of any kind as a float32 tensor (..., 3) [m].
 
     Raises:
-        ValueError: They are none, or one is not finite or too far away.
+        ValueError: They are not (..., 3) real numbers, or one is not finite or too far away.
     """
     positions = as_numbers(what, values, "(..., 3) positions [m]")
     if not positions.ndim or positions.shape[-1] != 3:

@@ -1,7 +1,9 @@
 """What the configuration files choose together, and what they ask of the place they are used in."""
 
 import logging
+import tomllib
 from importlib import metadata
+from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -10,6 +12,7 @@ from omegaconf import OmegaConf
 from gaigs.configuration import conf_dir, installed, known, launcher
 from gaigs.registry import registry
 
+ROOT = Path(__file__).parents[1]
 DATA = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
 MIRRORED = {"spectrum": "mirrored", "rssi": "mirrored_rssi", "csi": "mirrored_csi"}
 POOLINGS = {"spectrum": "array_response", "rssi": "mean_power", "csi": "element_sum"}
@@ -137,3 +140,12 @@ def test_two_jobs_at_a_time_where_that_is_installed(configure, monkeypatch):
     monkeypatch.setattr(metadata, "version", lacks)
     assert launcher("two") == "basic"
     assert settings()["_target_"].endswith("BasicLauncher")
+
+
+def test_the_packages_of_published_systems_are_those_of_the_plugins():
+    known = OmegaConf.load(conf_dir() / "published.yaml").packages
+    projects = [
+        tomllib.loads(file.read_text())["project"] for file in Path(__file__).parents[1].glob("plugins/*/*.toml")
+    ]
+    held = {name: p["name"] for p in projects for name in p["entry-points"].get("gaigs.model", {})}
+    assert known == held

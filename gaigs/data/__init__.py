@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gaigs.data._files import number_places
 from gaigs.geometry import Pose
 from gaigs.query import Batch, Query, as_numbers, as_positions, check_carrier
 from gaigs.registry import registry
@@ -259,16 +260,10 @@ def from_arrays(
         receivers=tuple(receivers),
         labels=labels[heard],
         task=task,
-        rows=_places(places)[rows][heard],
+        rows=number_places(places.tolist())[1][rows][heard],
         remarks=f"{int((~heard).sum())} links were not heard and are left out" if not heard.all() else "",
     )
     return replace(made, split=registry("split").build(config, links=made))
-
-
-def _places(transmitters: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """Which of the different places each one is, in the order in which they appear."""
-    numbers: dict[tuple, int] = {}
-    return torch.tensor([numbers.setdefault(tuple(place), len(numbers)) for place in transmitters.tolist()])
 
 
 def check_fit(links: Links, scene: Scene | None = None) -> None:
@@ -283,7 +278,7 @@ def check_fit(links: Links, scene: Scene | None = None) -> None:
         return
     there, here = scene.task, links.task
     axes = lambda task: {key: value for key, value in task.state().items() if key != "normalisation"}
-    if there.name != here.name or tuple(there.shape) != tuple(here.shape) or not _are_alike(axes(there), axes(here)):
+    if there.name != here.name or tuple(there.shape) != tuple(here.shape) or not are_alike(axes(there), axes(here)):
         raise ValueError(
             f"links must have the model's labels, {there.name!r} {tuple(there.shape)} with the same axes, got "
             f"{here.name!r} {tuple(here.shape)}"
@@ -292,14 +287,14 @@ def check_fit(links: Links, scene: Scene | None = None) -> None:
         [(each.pose.position, each.pose.rotation, each.array.elements, each.array.pattern) for each in receivers]
         for receivers in (scene.receivers, links.receivers)
     ]
-    if not _are_alike(*places):
+    if not are_alike(*places):
         names = [", ".join(each.name for each in receivers) for receivers in (scene.receivers, links.receivers)]
         raise ValueError(
             f"links must have the model's receivers in the same order, at the same places: {names[0]}; got {names[1]}"
         )
 
 
-def _are_alike(a: object, b: object) -> bool:
+def are_alike(a: object, b: object) -> bool:
     """Whether nested values are the same, tensors to 1e-5."""
     if isinstance(a, Tensor):
         return (
@@ -308,7 +303,7 @@ def _are_alike(a: object, b: object) -> bool:
             and torch.allclose(a.double(), b.double(), rtol=1e-6, atol=1e-5)
         )
     if isinstance(a, dict):
-        return a.keys() == b.keys() and all(_are_alike(a[key], b[key]) for key in a)
+        return a.keys() == b.keys() and all(are_alike(a[key], b[key]) for key in a)
     if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(_are_alike, a, b))
+        return len(a) == len(b) and all(map(are_alike, a, b))
     return a == b

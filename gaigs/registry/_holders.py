@@ -25,7 +25,7 @@ GIVEN = {
     "model": ("scene",),
     "training": ("model", "loss", "identity", "seed"),
 }
-"""Arguments of a kind's components that whoever builds them knows; all others are options."""
+"""Arguments that gaigs itself hands to the components of a kind; all others are options."""
 
 MISSING = "???"
 """What stands for an option that must be given."""

@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from gaigs.configuration import differences
-from gaigs.data import Links
+from gaigs.data import Links, are_alike
 from gaigs.files import whole, write_text
 from gaigs.registry import digests
 from gaigs.version import __version__
@@ -122,21 +122,12 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
     """
     parts = ("train", "validation", "test")
     same = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
-    same = same and _is_same(there.get("scene"), here.get("scene"))
+    same = same and are_alike(there.get("scene"), here.get("scene"))
     if not same or there["links"] != here["links"]:
         raise ValueError(
             f"{path} must be of these very data to go on, but they have another split, or other transmitters, "
             "receivers, frequencies or labels now; choose another folder (hydra.run.dir=DIR)"
         )
-
-
-def _is_same(a: object, b: object) -> bool:
-    """Whether two nested states hold the same values."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(_is_same(a[key], b[key]) for key in a)
-    if isinstance(a, list) and isinstance(b, list):
-        return len(a) == len(b) and all(map(_is_same, a, b))
-    return torch.equal(a, b) if isinstance(a, Tensor) and isinstance(b, Tensor) else a == b
 
 
 def fingerprint(links: Links) -> str:
