@@ -40,7 +40,6 @@ from rich.table import Table
 
 from gaigs import checkpoint, runs  # noqa: F401, what a run imports
 from gaigs.evaluation import device_name
-from gaigs.files import whole
 from gaigs.report import curves, room, spectra, style  # noqa: F401, likewise
 
 RUN = (

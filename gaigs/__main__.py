@@ -17,7 +17,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gaigs import commands, configuration, files, processes
+from gaigs import commands, configuration, processes
+from gaigs.io import files
 from gaigs.processes import Stopped, forward_to_children, lacks_memory, limited_threads, stopping
 from gaigs.report import at_end
 
@@ -34,7 +35,7 @@ def run(config: DictConfig) -> float | None:
     """One job: ``gaigs.run`` in Hydra's run folder.
 
     Returns:
-        Of a training the mean of the task's watched score over the validation links, for sweepers; None where nothing
+        Of a training the mean of the task's monitored score over the validation links, for sweepers; None where nothing
         validates.
 
     Raises:

@@ -81,20 +81,20 @@ class Agreement:
         row = np.searchsorted(self.distances, distance, side="right")
         return row * (len(self.separations) + 1) + np.searchsorted(self.separations, separation)
 
-    def cells(self, watched: str) -> list[Cell]:
+    def cells(self, monitor: str) -> list[Cell]:
         """Cells with pairs, by rows, as tables and figures show them."""
         lows, highs = [0.0, *self.distances], [0.0, *self.distances[1:]]
         firsts, lasts = [0, *(self.separations + 1)], [*self.separations, math.inf]
         found = []
         for number in sorted(self.scores):
             row, column = divmod(number, len(lasts))
-            low, median, high = np.quantile(self.scores[number][watched].numpy(), (0.1, 0.5, 0.9))
+            low, median, high = np.quantile(self.scores[number][monitor].numpy(), (0.1, 0.5, 0.9))
             found.append(
                 Cell(
                     (0.0 if row == 1 else float(lows[row]), float(highs[row])),
                     (int(firsts[column]), lasts[column] if column == len(lasts) - 1 else int(lasts[column])),
                     int(self.pairs[row, column]),
-                    len(self.scores[number][watched]),
+                    len(self.scores[number][monitor]),
                     (float(low), float(median), float(high)),
                 )
             )

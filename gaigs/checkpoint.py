@@ -14,7 +14,7 @@ from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 
-from gaigs.files import whole
+from gaigs.io.files import atomic_write
 from gaigs.processes import lacks_memory
 from gaigs.registry import check_type, configuration_of, name_of, registry
 from gaigs.scene import Scene
@@ -52,7 +52,7 @@ def write(content: dict, path: Path) -> None:
     Raises:
         OSError: It cannot be written, e.g. as the disk is full; what was there before stands.
     """
-    with whole(path) as part:
+    with atomic_write(path) as part:
         file = io.BytesIO()  # given a real one, torch would hide that its disk is full
         torch.save(content, file)
         part.write_bytes(file.getvalue())

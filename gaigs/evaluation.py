@@ -17,8 +17,8 @@ from torch import Tensor
 
 from gaigs.configuration import composed, has_file
 from gaigs.data import Links, Split, check_fit
-from gaigs.files import whole
 from gaigs.gaussians import SH_DC, Gaussians
+from gaigs.io.files import atomic_write
 from gaigs.model import Model
 from gaigs.registry import name_of, registry
 from gaigs.report.shapes import LearntRoom
@@ -175,7 +175,7 @@ def score(
         content.setdefault("prediction", task.packed(values))
         content |= {f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()}
     if folder is not None:
-        with whole(folder / "predictions.npz") as part:
+        with atomic_write(folder / "predictions.npz") as part:
             np.savez_compressed(part, **content)
     return scores
 
@@ -288,7 +288,7 @@ def write_figures(
     (folder / "figures").mkdir(exist_ok=True)
     files = {folder / "figures" / f"{name}.png": figure for name, figure in figures.items()}
     for file, figure in files.items():
-        with whole(file) as part:
+        with atomic_write(file) as part:
             figure.savefig(part, dpi=DPI)
     return list(files)
 

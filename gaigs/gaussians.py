@@ -10,8 +10,8 @@ from jaxtyping import Float
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor, nn
 
-from gaigs.files import whole
 from gaigs.geometry import FAR, from_spherical, semi_axes, unit_quaternions
+from gaigs.io.files import atomic_write
 from gaigs.scene import Scene
 
 LARGEST = 1e6
@@ -206,7 +206,7 @@ def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> N
             filled[:] = _to_columns(own) if name == "signal" else own.reshape(n, -1)
         columns |= zip(properties, filled.numpy().T, strict=True)
     vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
-    with whole(path) as part:
+    with atomic_write(path) as part:
         PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(part))
 
 

@@ -11,6 +11,8 @@ from torch.nn.functional import normalize
 FAR = 1e5
 """No coordinate reaches it [m]: float32 tells places apart by 8 mm there, and by half a metre at UTM's northings."""
 
+WITHIN = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
+
 FAINTEST = torch.finfo(torch.float32).tiny
 """Amplitudes and powers below this are silence: what is divided by such a number of float32 overflows."""
 

@@ -10,12 +10,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.directions import Directions
-from gaigs.geometry import FAR
+from gaigs.geometry import FAR, WITHIN
 
 CARRIERS = 1e4, 3e11
 """All carriers lie from the first to the second [Hz]; another number is in another unit."""
 
-NEAR = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
 
 UNITS = {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}
 
@@ -59,7 +58,7 @@ def as_positions(what: str, values: object) -> Float[Tensor, "*points 3"]:
     if not positions.ndim or positions.shape[-1] != 3:
         raise ValueError(f"{what} must be (..., 3) positions [m], got shape {tuple(positions.shape)}")
     points = positions.reshape(-1, 3)
-    for holds, expected in ((points.isfinite(), "finite"), (points.abs() < FAR, NEAR)):
+    for holds, expected in ((points.isfinite(), "finite"), (points.abs() < FAR, WITHIN)):
         if not holds.all():
             row = int((~holds).any(1).nonzero()[0])
             raise ValueError(f"{what} must be {expected}, got {points[row].tolist()} in row {row}")

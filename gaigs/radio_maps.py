@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from gaigs.files import whole
 from gaigs.geometry import ExtrapolationWarning
+from gaigs.io.files import atomic_write
 from gaigs.registry import check_type
 
 PITCH = 0.1
@@ -71,7 +71,10 @@ class RadioMap:
         arrays |= {"receivers": self.receivers, "quantity": self.quantity, "unit": self.unit}
         if self.frequency is not None:
             arrays["frequency"] = self.frequency
-        with whole(path) as part, open(part, "wb") as file:  # given a name, numpy would append .npz where it is missing
+        with (
+            atomic_write(path) as part,
+            open(part, "wb") as file,
+        ):  # given a name, numpy would append .npz where it is missing
             np.savez_compressed(file, **arrays)
 
     @classmethod

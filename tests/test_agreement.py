@@ -47,8 +47,8 @@ def two_passes():
     return of_readings(torch.stack((x, 0 * x, 0 * x), 1), SLOPE * x + JUMP * (torch.arange(2 * LENGTH) >= LENGTH))
 
 
-def by_bounds(found, watched="mae_db"):
-    return {(cell.distance, cell.separation): cell for cell in found.cells(watched)}
+def by_bounds(found, monitor="mae_db"):
+    return {(cell.distance, cell.separation): cell for cell in found.cells(monitor)}
 
 
 def composed(*overrides):
@@ -93,7 +93,7 @@ def test_repeated_places_without_noise_agree_fully(task):
     twice = torch.arange(24).repeat(2)
     links = replace(links, query=links.query[twice], labels=links.labels[twice], rows=None)
     found = measure(links, seeded())
-    (same,) = [cell for cell in found.cells(links.task.watched) if cell.distance == (0.0, 0.0)]
+    (same,) = [cell for cell in found.cells(links.task.monitor) if cell.distance == (0.0, 0.0)]
     assert same.pairs == 24
     assert same.quantiles == pytest.approx((PERFECT[task],) * 3, abs=1e-6)
 

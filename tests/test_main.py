@@ -66,7 +66,7 @@ def signal_at(process, folder, step, number):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def atomic_write(tmp_path_factory):
     """A run that nothing interrupts, in the folder that it chooses, and what it says."""
     cwd = tmp_path_factory.mktemp("anywhere")
     process = start(None, "+experiment=spectrum", cwd=cwd)

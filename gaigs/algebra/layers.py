@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gaigs.algebra import Algebra
-from gaigs.algebra._mix import Mix
+from gaigs.algebra.mix import Mix
 
 NORM_FLOOR = 0.01
 """Added to the squared size in the norm: components with e0 have no size, and light-like ones cancel, so tokens may be

@@ -14,7 +14,7 @@ import torch
 from gaigs import configuration
 from gaigs.benchmark._rows import MEASURED, NOT_MEASURED, UNAVAILABLE, Row, Rows, text_of
 from gaigs.evaluation import device_name
-from gaigs.files import whole, write_text
+from gaigs.io.files import atomic_write, write_text
 from gaigs.registry import suggest
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ class Measured(Benchmark):
         finally:
             rows.write()
         for name, figure in self.figures(rows.all()).items():
-            with whole(folder / f"{name}.png") as part:
+            with atomic_write(folder / f"{name}.png") as part:
                 figure.savefig(part, dpi=DPI)
         write_text(folder / f"{self.name}.md", self.tables(rows.all()))
 

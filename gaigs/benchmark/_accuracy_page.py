@@ -81,11 +81,11 @@ def seconds_to(row: Row, level: float, scale: Scale) -> float | None:
 
 def all_levels(rows: Sequence[Row], fixed: Mapping[str, Sequence[float]], scale: Scale) -> dict[str, float]:
     """Scores whose time is told, by the column's head, the easiest first."""
-    found = {f"{level:g}": float(level) for level in fixed.get(scale.watched, ())}
+    found = {f"{level:g}": float(level) for level in fixed.get(scale.monitor, ())}
     for row in rows:
         if row["axis"] == LOOK_UPS and row["validation"]:
             found[f"`{row['value']}` {number(row['validation'])}"] = float(row["validation"])
-    return dict(sorted(found.items(), key=lambda item: item[1], reverse=not scale.larger_is_better))
+    return dict(sorted(found.items(), key=lambda item: item[1], reverse=not scale.higher_is_better))
 
 
 def tables(rows: Sequence[Row], fixed: Mapping[str, Sequence[float]]) -> str:

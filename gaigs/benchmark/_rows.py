@@ -4,7 +4,7 @@ import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from gaigs.files import whole
+from gaigs.io.files import atomic_write
 
 MEASURED, NOT_MEASURED = "measured", "not measured"
 """What ``status`` says of a row."""
@@ -69,7 +69,7 @@ class Rows:
 
     def write(self) -> None:
         """Writes the file anew, each row once."""
-        with whole(self.file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
+        with atomic_write(self.file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
             writer = csv.DictWriter(opened, self.columns)
             writer.writeheader()
             writer.writerows(self.all())

@@ -20,7 +20,7 @@ from gaigs.processes import lacks_memory
 from gaigs.registry import check_type
 from gaigs.report.curves import read_validations
 from gaigs.report.runs import read_metrics, train_seconds
-from gaigs.report.table import metrics_of, watched_names
+from gaigs.report.table import metrics_of, monitor_names
 from gaigs.training.budget import seconds
 
 log = logging.getLogger(__name__)
@@ -185,11 +185,11 @@ def overrides(row: Row) -> list[str]:
 def facts(metrics: Mapping, folder: Path) -> dict:
     """What a row has of a run."""
     task, own = metrics["task"], next(iter(metrics["models"]))
-    watched, mean = watched_names(task)
+    monitor, mean = monitor_names(task)
     first = next(iter(metrics_of(metrics)))
     mean = mean or first
     validation = (metrics["validation"] or {}).get(own, {}).get(mean)
-    points = read_validations(folder, watched)
+    points = read_validations(folder, monitor)
     curve = [(point.seconds, point.score) for point in points if math.isfinite(point.seconds)]
     if metrics.get("kriging") and curve and validation is not None:
         curve.append((train_seconds(metrics), validation))  # which follows the training

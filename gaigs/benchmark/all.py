@@ -9,7 +9,7 @@ import torch
 
 from gaigs.benchmark import Benchmark, Context, Glance
 from gaigs.benchmark._page import table
-from gaigs.files import write_text
+from gaigs.io.files import write_text
 from gaigs.registry import register, registry
 
 log = logging.getLogger(__name__)

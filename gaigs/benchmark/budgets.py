@@ -137,7 +137,7 @@ def _line(name: str, rows: Sequence[Row], tolerance: float, scale: Scale) -> lis
 
 def smallest_within(rows: Sequence[Row], tolerance: float, scale: Scale) -> Row:
     """The row of the smallest value whose validation score is no further than the tolerance from the best."""
-    sign = -1 if scale.larger_is_better else 1
+    sign = -1 if scale.higher_is_better else 1
     losses = [sign * float(row["validation"]) for row in rows]
     # Scores are told with six digits: one at the bound counts.
     within = [row for row, loss in zip(rows, losses, strict=True) if loss <= min(losses) + tolerance * (1 + 1e-9)]

@@ -17,7 +17,7 @@ from gaigs.benchmark._page import number, remarks, table
 from gaigs.benchmark._passes import CAUSES, Passes, compositor, start
 from gaigs.benchmark._scenes import SCENES, Scene, cast
 from gaigs.benchmark._truth import Truth, errors_of, errors_of_gradients, sum_densely
-from gaigs.files import write_text
+from gaigs.io.files import write_text
 from gaigs.registry import register
 
 log = logging.getLogger(__name__)

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gaigs.data._files import number_places
 from gaigs.geometry import Pose
+from gaigs.io.tables import number_places
 from gaigs.query import Batch, Query, as_numbers, as_positions, check_carrier
 from gaigs.registry import registry
 from gaigs.scene import Receiver, Scene

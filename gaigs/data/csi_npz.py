@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from gaigs.data import Links
-from gaigs.data._files import NEAR, find_file, number_places, refuse
-from gaigs.geometry import FAR, Pose
+from gaigs.geometry import FAR, WITHIN, Pose
+from gaigs.io.tables import find_file, number_places, refuse
 from gaigs.query import CARRIERS, Query, unit_hint
 from gaigs.registry import register
 from gaigs.scene import Array, Receiver
@@ -176,7 +176,7 @@ def _check_values(arrays: dict[str, np.ndarray], defects: list[str]) -> None:
                 low, high = CARRIERS
                 holds, expected = (low <= array) & (array <= high), f"a frequency from {low:g} to {high:g} Hz"
             case _:
-                holds, expected = np.abs(array) < FAR, NEAR
+                holds, expected = np.abs(array) < FAR, WITHIN
         wrong = np.flatnonzero(~holds.reshape(len(array), -1).all(1))
         if len(wrong):
             first, entries = wrong[0], f"{len(wrong)} of {len(array)} such rows"

@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gaigs.data import Links, Parts
-from gaigs.data._files import (
+from gaigs.geometry import Pose
+from gaigs.io.tables import (
     find_folder,
     has_file,
     read_lines,
@@ -23,8 +24,7 @@ from gaigs.data._files import (
     to_number,
     to_numbers,
 )
-from gaigs.data._yaml import read_mapping, to_position
-from gaigs.geometry import Pose
+from gaigs.io.yaml import read_mapping, to_position
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Receiver

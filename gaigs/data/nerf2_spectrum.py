@@ -18,7 +18,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gaigs.data import Links, Parts
-from gaigs.data._files import (
+from gaigs.directions import Grid
+from gaigs.geometry import Pose
+from gaigs.io.files import atomic_write, write_text
+from gaigs.io.tables import (
     find_folder,
     has_file,
     number_places,
@@ -28,10 +31,7 @@ from gaigs.data._files import (
     to_index,
     to_number,
 )
-from gaigs.data._yaml import read_mapping, to_entries, to_position, to_vector
-from gaigs.directions import Grid
-from gaigs.files import whole, write_text
-from gaigs.geometry import Pose
+from gaigs.io.yaml import read_mapping, to_entries, to_position, to_vector
 from gaigs.query import CARRIERS, Query, check_carrier, unit_hint
 from gaigs.registry import register
 from gaigs.scene import Array, Receiver
@@ -162,7 +162,7 @@ def write(folder: str | Path, links: Links) -> None:
     (folder / "spectrum").mkdir(parents=True)
     for k in range(len(links)):
         pixels = (links.labels[torch.tensor([k])][0] * 255).round().byte()
-        with whole(folder / "spectrum" / f"{k + 1:05d}.png") as part:
+        with atomic_write(folder / "spectrum" / f"{k + 1:05d}.png") as part:
             Image.fromarray(pixels.numpy()).save(part)
     # Nine digits bring the same float32 back.
     rows = ["x,y,z", *(",".join(f"{value:.9g}" for value in row) for row in links.query.transmitters.tolist())]

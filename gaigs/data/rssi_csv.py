@@ -6,8 +6,8 @@ from pathlib import Path
 import torch
 
 from gaigs.data import Links
-from gaigs.data._files import find_file, number_places, read_lines, refuse, to_cells, to_columns, to_coordinates
 from gaigs.data.nerf2_rssi import LOUDEST, gateway, read_walls, to_dbm
+from gaigs.io.tables import find_file, number_places, read_lines, refuse, to_cells, to_columns, to_coordinates
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.task.rssi import Rssi

@@ -3,7 +3,7 @@
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from gaigs.loss._errors import MeanError
+from gaigs.loss.errors import MeanError
 from gaigs.registry import register
 from gaigs.task import Task
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.directions import Directions, Grid
-from gaigs.loss._windows import window_means
+from gaigs.loss.windows import window_means
 from gaigs.query import Batch
 from gaigs.registry import register
 from gaigs.task import Task

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from gaigs.loss._errors import MeanError
+from gaigs.loss.errors import MeanError
 from gaigs.registry import register
 
 

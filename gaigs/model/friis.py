@@ -5,8 +5,8 @@ from jaxtyping import Complex
 from torch import Tensor
 
 from gaigs.data import Links
+from gaigs.kriging.links import known_links
 from gaigs.model import Model, Prediction
-from gaigs.model._known import known_links
 from gaigs.propagation import TELLING, check_elements, direct_gains, direct_waves, fit_gain, phase_sign
 from gaigs.query import Batch, Query
 from gaigs.registry import register

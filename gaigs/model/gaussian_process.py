@@ -8,9 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
+from gaigs.kriging.fit import LIMIT, PART, Hyperparameters, damping, likeliest, norms, numbers_of, weigh
+from gaigs.kriging.links import at_directions, coordinates, distances, known_links
 from gaigs.model import Model, Prediction, build_trend
-from gaigs.model._known import at_directions, coordinates, distances, known_links
-from gaigs.model._process import LIMIT, PART, Hyperparameters, damping, likeliest, norms, numbers_of, weigh
 from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.scene import Scene

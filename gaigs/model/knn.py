@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
+from gaigs.kriging.links import at_directions, coordinates, distances, evenly, known_links, scale_bounds
 from gaigs.model import Model, Prediction
-from gaigs.model._known import at_directions, coordinates, distances, evenly, known_links, scale_bounds
 from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.scene import Scene

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from gaigs.data import Links, Split
 from gaigs.gaussians import Gaussians
+from gaigs.kriging.fit import LIMIT, PART, Hyperparameters, damping, likeliest, norms, numbers_of
+from gaigs.kriging.links import at_directions, coordinates, distances, evenly, known_links
 from gaigs.model import Model, Prediction
-from gaigs.model._known import at_directions, coordinates, distances, evenly, known_links
-from gaigs.model._process import LIMIT, PART, Hyperparameters, damping, likeliest, norms, numbers_of
 from gaigs.query import Batch
 from gaigs.registry import register, registry
 from gaigs.report.shapes import LearntRoom
@@ -185,8 +185,8 @@ class Kriging(Model):
         if not len(index):
             return
         labels, trend, kriged = links.labels[index], values[len(links.split.train) :], predicted(blind, links, index)
-        score = lambda weight: task.scores(labels, trend + weight * (kriged - trend))[task.watched].mean().item()
-        sign = 1 if task.larger_is_better else -1
+        score = lambda weight: task.scores(labels, trend + weight * (kriged - trend))[task.monitor].mean().item()
+        sign = 1 if task.higher_is_better else -1
         best = max(WEIGHTS, key=lambda weight: sign * score(weight))
         self.weight.fill_(best)
         blind.weight.fill_(best)

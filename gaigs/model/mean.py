@@ -3,8 +3,8 @@
 import torch
 
 from gaigs.data import Links
+from gaigs.kriging.links import at_directions, known_links
 from gaigs.model import Model, Prediction
-from gaigs.model._known import at_directions, known_links
 from gaigs.query import Batch
 from gaigs.registry import register
 from gaigs.scene import Scene

@@ -11,10 +11,11 @@ from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.deformation import Deformation
-from gaigs.model import Model, _learnt_room
-from gaigs.model._plane_search import fewer, find_planes
+from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.placement import Placement
+from gaigs.placement.mirrored import export
+from gaigs.placement.mirrored.search import fewer, find_planes
 from gaigs.pooling import Pooling
 from gaigs.pooling.element_sum import ElementSum
 from gaigs.projection import Projection
@@ -92,7 +93,7 @@ class Mirrored(GaussianSplatting):
         has it. Where phases say nothing, they start ``QUIET``.
         """
         super().fit(links)
-        self.places = _learnt_room.some(links.query[links.split.train])
+        self.places = export.some(links.query[links.split.train])
         if not isinstance(self.pooling, ElementSum) or self.trend is not None:
             return
         train, sign, frequencies = links.split.train, int(self.pooling.sign), self.scene.task.frequencies
@@ -156,7 +157,7 @@ class Mirrored(GaussianSplatting):
             "paths_kept": int(placement.kept.sum()),
             "paths_most": int(placement.most),
         }
-        return facts if self.places is None else facts | _learnt_room.facts(placement, self.places)
+        return facts if self.places is None else facts | export.facts(placement, self.places)
 
     def export(self, folder: Path) -> None:
         """``planes.obj`` and ``obstacles.ply`` beside the free Gaussians.
@@ -165,12 +166,12 @@ class Mirrored(GaussianSplatting):
         training transmitters' box.
         """
         super().export(folder)
-        places = _learnt_room.all_over(self.scene) if self.places is None else self.places
-        _learnt_room.export(self.placement, places, folder)
+        places = export.all_over(self.scene) if self.places is None else self.places
+        export.export(self.placement, places, folder)
 
     def learnt_room(self, links: Links) -> LearntRoom:
         """Planes, obstacles and paths for figures."""
-        return _learnt_room.learnt_room(self.placement, links)
+        return export.learnt_room(self.placement, links)
 
     # --- which planes ---
 

@@ -5,8 +5,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
+from gaigs.kriging.links import known_links
 from gaigs.model import Model, Prediction
-from gaigs.model._known import known_links
 from gaigs.query import Batch
 from gaigs.registry import register
 from gaigs.scene import Scene

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from gaigs.projection._cylindrical import Cylindrical
+from gaigs.projection.cylindrical import Cylindrical
 from gaigs.registry import register
 
 

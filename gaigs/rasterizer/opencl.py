@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gaigs.projection import Plane, Splats
 from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
-from gaigs.rasterizer._devices import cause_of, default_device, devices, find_fault, name_of, open_queue
+from gaigs.rasterizer.devices import cause_of, default_device, devices, find_fault, name_of, open_queue
 from gaigs.registry import register
 
 __all__ = ["OpenCLRasterizer", "default_device", "devices"]

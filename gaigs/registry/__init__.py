@@ -18,8 +18,8 @@ from types import MappingProxyType, NoneType, UnionType
 
 from omegaconf import OmegaConf
 
-from gaigs.registry._holders import GIVEN, MISSING, Holder, find_holders, is_plain, sources
-from gaigs.registry._holders import digests as digests
+from gaigs.registry.holders import GIVEN, MISSING, Holder, find_holders, is_plain, sources
+from gaigs.registry.holders import digests as digests
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",

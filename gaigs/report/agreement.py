@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
-from gaigs.files import whole, write_text
+from gaigs.io.files import atomic_write, write_text
 from gaigs.report.style import COLUMN, DPI, LINES, STYLE
 from gaigs.report.table import markdown
 
@@ -83,7 +83,7 @@ def write(
     parts.append("\n".join(f"- {remark}" for remark in remarks))
     write_text(folder / "agreement.md", "\n\n".join(parts) + "\n")
     _write_csv(folder / "agreement.csv", cells)
-    with whole(folder / "agreement.png") as part:
+    with atomic_write(folder / "agreement.png") as part:
         figure(score, cells).savefig(part, dpi=DPI)
 
     table = Table(title=escape(about), title_justify="left", box=SIMPLE_HEAD, leading=1)
@@ -141,7 +141,7 @@ def figure(score: str, cells: Sequence[Cell]):
 def _write_csv(path: Path, cells: Sequence[Cell]) -> None:
     """A line for each cell; what has no end is left out."""
     names = "distance_from_m", "distance_below_m", "separation_from", "separation_to", "pairs", "compared"
-    with whole(path) as part, open(part, "w", newline="", encoding="utf-8") as file:
+    with atomic_write(path) as part, open(part, "w", newline="", encoding="utf-8") as file:
         lines = csv.writer(file)
         lines.writerow((*names, "p10", "median", "p90"))
         for cell in cells:

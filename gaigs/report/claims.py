@@ -14,7 +14,7 @@ from rich.table import Table
 from scipy.stats import t
 
 from gaigs.configuration import HARMLESS, conf_dir
-from gaigs.files import whole, write_text
+from gaigs.io.files import atomic_write, write_text
 from gaigs.registry import check_type
 from gaigs.report.runs import Run
 from gaigs.report.table import latex, markdown, metrics_of, tex, written
@@ -134,7 +134,7 @@ def compare(runs: Sequence[Run], claims: Sequence[Claim]) -> list[Finding]:
 def _finding(claim: Claim, setting: str, pairs: Sequence[tuple[Mapping, Mapping]]) -> Finding:
     name, metric = next(iter(metrics_of(pairs[0][0]).items()))
     better, than = ([next(iter(one["models"].values()))[name] for one in side] for side in zip(*pairs, strict=True))
-    sign = 1 if metric.larger_is_better else -1
+    sign = 1 if metric.higher_is_better else -1
     gains = [sign * (a - b) for a, b in zip(better, than, strict=True)]
     means = statistics.mean(better), statistics.mean(than)
     return Finding(claim, setting, pairs[0][0]["task"], metric.title, *means, gains, interval(gains))
@@ -203,7 +203,7 @@ def _sources(found: Sequence[Finding]) -> list[str]:
 
 
 def _csv(file: Path, found: Sequence[Finding]) -> None:
-    with whole(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
+    with atomic_write(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
         writer = csv.writer(opened)
         writer.writerow(
             [

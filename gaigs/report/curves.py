@@ -183,7 +183,7 @@ def learning_curves(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     score_label: str,
     baselines: Mapping[str, float],
-    larger_is_better: bool,
+    higher_is_better: bool,
 ) -> Figure:
     """Validation scores over the time of training, one line a system.
 
@@ -191,7 +191,7 @@ def learning_curves(
         curves: Times [s] and scores by name.
         score_label: What the score is.
         baselines: Scores of the baselines, drawn as lines over all times.
-        larger_is_better: Whether the score is a similarity. Errors have a logarithmic axis, so that a system that
+        higher_is_better: Whether the score is a similarity. Errors have a logarithmic axis, so that a system that
             starts far off leaves room for the good ones.
     """
     with rc_context(STYLE):
@@ -203,7 +203,7 @@ def learning_curves(
         for (name, score), shade in zip(baselines.items(), cycle(("0.2", "0.45", "0.65", "0.8")), strict=False):
             ax.axhline(score, color=shade, linewidth=0.9, zorder=0, label=name)
         ax.set(xlabel="training [s]", ylabel=score_label)
-        if not larger_is_better and all(score > 0 for line in ax.lines for score in line.get_ydata()):
+        if not higher_is_better and all(score > 0 for line in ax.lines for score in line.get_ydata()):
             ax.set_yscale("log")
             ticks = LogLocator(subs=(1, 2, 3, 4, 5, 6, 8))
             ax.yaxis.set(major_locator=ticks, major_formatter="{x:g}", minor_locator=NullLocator())

@@ -12,7 +12,7 @@ from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
-from gaigs.files import whole, write_text
+from gaigs.io.files import atomic_write, write_text
 from gaigs.registry import check_type
 from gaigs.report.claims import write_claims
 from gaigs.report.curves import speed_against_error
@@ -149,7 +149,7 @@ def report(folder: str | Path) -> Group:
     caption = ", ".join(f"{key}={value}" for key, value in shared.items())
 
     written_rows = rows + [_flat(row) for row in groups]
-    with whole(folder / "ablation.csv") as part, open(part, "w", newline="", encoding="utf-8") as file:
+    with atomic_write(folder / "ablation.csv") as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, _columns(written_rows))
         writer.writeheader()
         writer.writerows(written_rows)
@@ -159,7 +159,7 @@ def report(folder: str | Path) -> Group:
         page += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
     write_text(folder / "ablation.md", page)
     if any(run.metrics is not None for run in runs):
-        with whole(folder / "speed_against_error.png") as part:
+        with atomic_write(folder / "speed_against_error.png") as part:
             _speed(runs, rows, shared, titles).savefig(part, dpi=DPI)
 
     hidden = {name for name, metric in known.items() if not metric.is_brief} | {WRITTEN_ONLY}

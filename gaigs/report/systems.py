@@ -14,12 +14,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from gaigs.configuration import conf_dir, plugin_conf_dirs
-from gaigs.files import whole, write_text
+from gaigs.io.files import atomic_write, write_text
 from gaigs.registry import registry
 from gaigs.report.curves import learning_curves, read_validations
 from gaigs.report.runs import Run, Spread, as_baseline, train_seconds
 from gaigs.report.style import DPI
-from gaigs.report.table import latex, markdown, stacked, tex, watched_names, written
+from gaigs.report.table import latex, markdown, monitor_names, stacked, tex, written
 
 COSTS = {
     "train_seconds": "training [s]",
@@ -69,11 +69,11 @@ class System(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column of numbers, one a row, None where there is none; ``larger_is_better`` is None where none is best."""
+    """A column of numbers, one a row, None where there is none; ``higher_is_better`` is None where none is best."""
 
     title: str
     values: list[float | int | Spread | None]
-    larger_is_better: bool | None = None
+    higher_is_better: bool | None = None
 
 
 def read_published() -> Published:
@@ -183,8 +183,8 @@ def _texts(column: Column) -> list[tuple[str, bool]]:
     means = [value.mean if isinstance(value, Spread) else value for value in column.values]
     known = [mean for mean in means if mean is not None]
     best = None
-    if column.larger_is_better is not None and len(known) > 1:
-        best = (max if column.larger_is_better else min)(known)
+    if column.higher_is_better is not None and len(known) > 1:
+        best = (max if column.higher_is_better else min)(known)
     texts = []
     for value, mean in zip(column.values, means, strict=True):
         spread = f" ± {written(value.deviation)}" if isinstance(value, Spread) else ""
@@ -208,7 +208,7 @@ def _tex(rows: Sequence[System], columns: Sequence[Column]) -> str:
 
 
 def _csv(file: Path, rows: Sequence[System], columns: Sequence[Column]) -> None:
-    with whole(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
+    with atomic_write(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
         writer = csv.writer(opened)
         spread = [any(isinstance(value, Spread) for value in column.values) for column in columns]
         head = ([c.title, f"{c.title}, sd"] if wide else [c.title] for c, wide in zip(columns, spread, strict=True))
@@ -245,7 +245,7 @@ def write_systems(
     task = done[0].runs[0].metrics["task"]
     failed = [f"{row.name}: {failure}" for row in rows for failure in row.failures]
     rows = [row for row in rows if row.values]
-    better = {name: metric.larger_is_better for name, metric in known.items()}
+    better = {name: metric.higher_is_better for name, metric in known.items()}
     scores = _columns(rows, {name: metric.title for name, metric in known.items()}, better)
     costs = _columns(rows, COSTS, {})
     told, taken = (_published(rows, part.get(task, ())) for part in (published.scores, published.costs))
@@ -264,7 +264,7 @@ def write_systems(
     for name, parts in texts.items():
         write_text(folder / name, "\n".join(parts))
     for name, figure in _figures(done, task, known).items():
-        with whole(folder / f"systems_{name}.png") as part:
+        with atomic_write(folder / f"systems_{name}.png") as part:
             figure.savefig(part, dpi=DPI)
 
     brief = [column for column in scores if any(column.title == m.title for m in known.values() if m.is_brief)]
@@ -313,10 +313,10 @@ def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict:
     files = {name: file for name, file in files.items() if file.is_file()}
     if len(splits) == 1 and _are_of_the_same_links(files.values()):
         figures |= kind.compared(files, *splits)
-    watched, mean = watched_names(task)
+    monitor, mean = monitor_names(task)
     curves = {}
     for name, run in firsts.items():
-        if points := [(p.seconds, p.score) for p in read_validations(run.folder, watched) if math.isfinite(p.seconds)]:
+        if points := [(p.seconds, p.score) for p in read_validations(run.folder, monitor) if math.isfinite(p.seconds)]:
             curves[name] = tuple(zip(*points, strict=True))
     if curves and mean is not None and len(splits) == 1:
         own = {next(iter(firsts[name].metrics["models"])) for name in curves}
@@ -324,5 +324,5 @@ def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict:
         validation = next((run.metrics["validation"] for run in firsts.values() if run.metrics.get("validation")), {})
         lines = {name: scores[mean] for name, scores in validation.items() if name not in own}
         score = known[mean]
-        figures["curves"] = learning_curves(curves, f"{score.title}, validation", lines, score.larger_is_better)
+        figures["curves"] = learning_curves(curves, f"{score.title}, validation", lines, score.higher_is_better)
     return figures

@@ -35,12 +35,12 @@ def metrics_of(metrics: Mapping) -> dict:
     return registry("task").get(metrics["task"]).metrics()
 
 
-def watched_names(task: str) -> tuple[str, str | None]:
+def monitor_names(task: str) -> tuple[str, str | None]:
     """The score by which a task's best checkpoints are chosen, and which of its metrics is the mean of that, if any."""
     kind = registry("task").get(task)
     known = kind.metrics()
-    watched = kind.watched if isinstance(kind.watched, str) else next(iter(known))  # a property of the instance
-    return watched, next((name for name in (f"{watched}_mean", watched) if name in known), None)
+    monitor = kind.monitor if isinstance(kind.monitor, str) else next(iter(known))  # a property of the instance
+    return monitor, next((name for name in (f"{monitor}_mean", monitor) if name in known), None)
 
 
 def written(value: float | int | str | None) -> str:
@@ -96,11 +96,11 @@ def metrics_table(metrics: Mapping) -> Group:
     columns = []
     for name in names:
         table.add_column(stacked(known[name].title), justify="right")
-        columns.append(_cells(models, name, known[name].larger_is_better))
+        columns.append(_cells(models, name, known[name].higher_is_better))
     if validation:
         first, metric = next(iter(known.items()))
         table.add_column(stacked(f"{metric.title}, validation"), justify="right")
-        columns.append(_cells(validation, first, metric.larger_is_better))
+        columns.append(_cells(validation, first, metric.higher_is_better))
     for model in models:
         table.add_row(escape(model), *(cells.get(model, "") for cells in columns))
     return Group(table, *([_receivers_table(metrics["receivers"], known)] if metrics.get("receivers") else []))
@@ -113,13 +113,13 @@ def _receivers_table(receivers: Mapping, known: dict) -> Table:
     for model in next(iter(receivers.values())):
         table.add_column(escape(model), justify="right")
     for receiver, models in receivers.items():
-        table.add_row(escape(receiver), *_cells(models, name, metric.larger_is_better).values())
+        table.add_row(escape(receiver), *_cells(models, name, metric.higher_is_better).values())
     return table
 
 
-def _cells(models: Mapping, name: str, larger_is_better: bool) -> dict[str, str]:
+def _cells(models: Mapping, name: str, higher_is_better: bool) -> dict[str, str]:
     """One metric of each model as text, the best in bold."""
-    best = (max if larger_is_better else min)(scores[name] for scores in models.values())
+    best = (max if higher_is_better else min)(scores[name] for scores in models.values())
     texts = {model: written(scores[name]) for model, scores in models.items()}
     return {model: f"[bold]{text}[/bold]" if models[model][name] == best else text for model, text in texts.items()}
 
@@ -141,5 +141,5 @@ def verdict(metrics: Mapping) -> str:
         side = {"+": "above", "-": "below"}[gap[0]]
         stands.append(f"level with {other}" if float(gap) == 0 else f"{gap[1:]}{unit} {side} {other}")
     stand = " and ".join(filter(None, (", ".join(stands[:-1]), *stands[-1:]))) or f"at {own[name]:.{digits}f}{unit}"
-    hint = "" if metric.larger_is_better else " (lower is better)"
+    hint = "" if metric.higher_is_better else " (lower is better)"
     return f"{model} is {stand} in {quantity}{hint} on split {metrics['split']}."

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from gaigs import evaluation
 from gaigs.data import load
-from gaigs.files import write_text
+from gaigs.io.files import write_text
 from gaigs.processes import is_first, limited_threads, only_run
 from gaigs.registry import registry
 from gaigs.report.runs import read_metrics
@@ -111,7 +111,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "checkpoint_bytes": (folder / "best.ckpt").stat().st_size if is_trained else None,
         "models": {name: task.summarise(values) for name, values in scores.items()},
         "validation": {name: task.summarise(values) for name, values in validation.items()},
-        "validation_score": validation[name][task.watched].mean().item() if validation else None,
+        "validation_score": validation[name][task.monitor].mean().item() if validation else None,
         "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
     } | model.facts()
     if config["kriging"]:

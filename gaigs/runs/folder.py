@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gaigs.configuration import differences
 from gaigs.data import Links, are_alike
-from gaigs.files import whole, write_text
+from gaigs.io.files import atomic_write, write_text
 from gaigs.registry import digests
 from gaigs.version import __version__
 
@@ -60,7 +60,7 @@ def claim(folder: Path, config: dict) -> None:
 
 def store(config: dict, folder: Path) -> None:
     """Writes the configuration of a run into its folder, and what computes it."""
-    with whole(folder / "config.yaml") as part:
+    with atomic_write(folder / "config.yaml") as part:
         OmegaConf.save(OmegaConf.create(config), part)
     write_text(folder / SOFTWARE, json.dumps(software(config), indent=2) + "\n")
 

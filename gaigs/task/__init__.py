@@ -21,16 +21,16 @@ class Metric(NamedTuple):
 
     Attributes:
         title: What a reader calls it, with its unit in brackets.
-        larger_is_better: Whether it is a similarity; else it is an error.
+        higher_is_better: Whether it is a similarity; else it is an error.
         is_brief: Whether a terminal's table shows it too, which has little room.
 
     Example:
         >>> gaigs.registries["task"].get("rssi").metrics()["mae_db"]
-        Metric(title='MAE [dB]', larger_is_better=False, is_brief=True)
+        Metric(title='MAE [dB]', higher_is_better=False, is_brief=True)
     """
 
     title: str
-    larger_is_better: bool
+    higher_is_better: bool
     is_brief: bool = True
 
 
@@ -41,8 +41,8 @@ class Task(ABC):
         name: The registered name.
         quantity: What a label is, in a word or two.
         unit: Of a label; empty for a ratio.
-        watched: The score by whose mean over the validation links the best checkpoint is chosen.
-        larger_is_better: Whether that is a similarity; else it is an error.
+        monitor: The score by whose mean over the validation links the best checkpoint is chosen.
+        higher_is_better: Whether that is a similarity; else it is an error.
         dtype: Of labels and predictions.
         is_noisy: Whether labels scatter however near to each other they were taken, so that fine detail is not learnt.
         directions: Those of a label's pixels; None where a label has none.
@@ -51,8 +51,8 @@ class Task(ABC):
     name: str
     quantity: str
     unit: str = ""
-    watched: str
-    larger_is_better: bool
+    monitor: str
+    higher_is_better: bool
     dtype: torch.dtype = torch.float32
     is_noisy: bool = False
     directions: Grid | None = None
@@ -74,12 +74,12 @@ class Task(ABC):
 
     @property
     def compared_by(self) -> str:
-        """The score of two labels of one data set; by default ``watched``."""
-        return self.watched
+        """The score of two labels of one data set; by default ``monitor``."""
+        return self.monitor
 
     @abstractmethod
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
-        """Scores of every sample (k,) by name, float64 on the CPU; ``watched`` among them.
+        """Scores of every sample (k,) by name, float64 on the CPU; ``monitor`` among them.
 
         Raises:
             ValueError: Labels or values are not (k, *shape), or not finite.

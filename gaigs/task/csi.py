@@ -29,7 +29,7 @@ class Csi(Task):
       the label best, as where receiver and transmitter share no clock.
     - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²): near the SNR where that is high, 3 dB for a prediction of 0, and at
       least 0. Links in deep shadow may have an SNR of -50 dB, of which a few decide a mean; so the mean SINAD is
-      watched.
+      monitor.
 
     And of all links together NMSE [dB], 10 log10(sum |e|² / sum |h|²): the error of a link budget, in which loud links
     count most.
@@ -45,7 +45,7 @@ class Csi(Task):
     """
 
     name, quantity = "csi", "channel"
-    watched, compared_by, larger_is_better = "sinad_db", "snr_db", True
+    monitor, compared_by, higher_is_better = "sinad_db", "snr_db", True
     pair_score = "SNR [dB]"
     dtype = torch.complex64
     normalisation = "linear amplitude, in the data's own unit"

@@ -21,7 +21,7 @@ class Scalar(Task):
     """
 
     error_unit: str
-    larger_is_better = False
+    higher_is_better = False
     is_noisy = True
 
     @property
@@ -29,7 +29,7 @@ class Scalar(Task):
         return ()
 
     @property
-    def watched(self) -> str:
+    def monitor(self) -> str:
         return f"mae_{self.error_unit.lower()}"
 
     @classmethod
@@ -44,7 +44,7 @@ class Scalar(Task):
     def scores(self, labels: Float[Tensor, "k"], values: Float[Tensor, "k"]) -> dict[str, Tensor]:
         """The absolute error of each prediction."""
         check_values(labels, values, (), "readings")
-        return {self.watched: (values.detach().cpu().double() - labels.detach().cpu().double()).abs()}
+        return {self.monitor: (values.detach().cpu().double() - labels.detach().cpu().double()).abs()}
 
     @property
     def pair_score(self) -> str:
@@ -56,7 +56,7 @@ class Scalar(Task):
 
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
         """Mean, median and root of the mean square of the absolute error."""
-        errors = scores[self.watched]
+        errors = scores[self.monitor]
         need_samples(errors)
         numbers = errors.mean(), torch.quantile(errors, 0.5), errors.square().mean().sqrt()
         return dict(zip(self.metrics(), (number.item() for number in numbers), strict=True))

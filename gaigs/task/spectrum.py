@@ -35,7 +35,7 @@ class Spectrum(Task):
     """
 
     name, quantity = "spectrum", "amplitude"
-    watched, larger_is_better = "ssim", True
+    monitor, higher_is_better = "ssim", True
     pair_score = "SSIM"
     normalisation = ""
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from gaigs.projection import Splats
 from gaigs.propagation import NEAREST
 from gaigs.scene import Array
-from gaigs.testing._checks import PRECISION, fixed_sum, require, require_close, require_tensor
+from gaigs.testing.checks import PRECISION, fixed_sum, require, require_close, require_tensor
 
 
 def check_aperture(rasterizer, device: torch.device | str) -> None:

@@ -17,7 +17,7 @@ from gaigs.scene import Array, Receiver, Scene
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
-from gaigs.testing._checks import flat, require, require_close, require_tensor
+from gaigs.testing.checks import flat, require, require_close, require_tensor
 
 POSES = (
     Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)),
@@ -182,5 +182,5 @@ def _check_labels(links: Links) -> None:
         require(bool(labels.ge(0).all() and labels.le(1).all()), "spectra must lie in [0, 1]")
         require(bool(task.directions.elevations.abs().max() <= math.pi / 2 + 1e-6), "elevations must be in radians")
         require(bool(task.directions.azimuths.abs().max() <= 2 * math.pi + 1e-6), "azimuths must be in radians")
-    best = task.scores(labels, labels)[task.watched]
+    best = task.scores(labels, labels)[task.monitor]
     require(bool(best.isfinite().all()), "each label must have a score")

@@ -9,7 +9,7 @@ from gaigs.deformation import Residuals
 from gaigs.placement import Placed
 from gaigs.query import Query
 from gaigs.scene import Scene
-from gaigs.testing._checks import (
+from gaigs.testing.checks import (
     PRECISION,
     random_frequencies,
     random_places,

@@ -8,7 +8,7 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.loss import Loss
 from gaigs.query import Batch
-from gaigs.testing._checks import PRECISION, require, require_close, require_gradients, require_tensor
+from gaigs.testing.checks import PRECISION, require, require_close, require_gradients, require_tensor
 
 
 def check_loss(loss: Loss, links: Links, device: torch.device | str = "cpu") -> None:

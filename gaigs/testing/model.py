@@ -15,7 +15,7 @@ from gaigs.model import Model, Prediction
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.scene import Scene
-from gaigs.testing._checks import require, require_close, require_gradients, require_raises, require_tensor
+from gaigs.testing.checks import require, require_close, require_gradients, require_raises, require_tensor
 
 
 def check_model(build: Callable[[Scene], Model], links: Links, device: torch.device | str = "cpu") -> None:

@@ -10,7 +10,7 @@ from gaigs.gaussians import Gaussians
 from gaigs.placement import Placed
 from gaigs.query import Query
 from gaigs.scene import Scene
-from gaigs.testing._checks import (
+from gaigs.testing.checks import (
     PRECISION,
     random_frequencies,
     random_places,

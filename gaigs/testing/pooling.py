@@ -14,7 +14,7 @@ from gaigs.directions import Directions, Grid
 from gaigs.pooling import Pooling
 from gaigs.query import Query
 from gaigs.scene import Array, Scene
-from gaigs.testing._checks import PRECISION, require, require_close, require_gradients, require_tensor
+from gaigs.testing.checks import PRECISION, require, require_close, require_gradients, require_tensor
 
 
 def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch.device | str = "cpu") -> None:

@@ -6,7 +6,7 @@ from torch import Tensor
 from gaigs.directions import Directions, Grid, Rays
 from gaigs.geometry import Pose, from_spherical, quaternions_to_rotations
 from gaigs.projection import NEAR, Projection
-from gaigs.testing._checks import require, require_close, require_gradients, require_tensor
+from gaigs.testing.checks import require, require_close, require_gradients, require_tensor
 
 
 def check_projection(projection: Projection, device: torch.device | str = "cpu") -> None:

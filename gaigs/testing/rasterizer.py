@@ -11,7 +11,7 @@ from torch import Tensor
 from gaigs.projection import Plane, Splats
 from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, Rasterizer
 from gaigs.testing._aperture import check_aperture
-from gaigs.testing._checks import PRECISION, fixed_sum, require, require_close, require_tensor
+from gaigs.testing.checks import PRECISION, fixed_sum, require, require_close, require_tensor
 
 
 def check_rasterizer(rasterizer: Rasterizer, device: torch.device | str = "cpu") -> None:

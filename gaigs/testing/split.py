@@ -6,7 +6,7 @@ import torch
 
 from gaigs.data import Links, Split
 from gaigs.split import rows_of
-from gaigs.testing._checks import require
+from gaigs.testing.checks import require
 from gaigs.testing.data import check_parts
 
 

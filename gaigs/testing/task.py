@@ -11,7 +11,7 @@ from gaigs.directions import Grid
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.task import Metric, Task
-from gaigs.testing._checks import flat, random_labels, require, require_close, require_raises
+from gaigs.testing.checks import flat, random_labels, require, require_close, require_raises
 
 SAMPLES = 5
 
@@ -38,9 +38,9 @@ def check_task(task: Task, *thinnings: Mapping) -> None:
 
 def _check_facts(task: Task) -> None:
     require(task.name in registry("task").names(), f"a task must bear its registered name, got {task.name!r}")
-    for name in ("quantity", "unit", "normalisation", "watched", "pair_score"):
+    for name in ("quantity", "unit", "normalisation", "monitor", "pair_score"):
         require(isinstance(getattr(task, name), str), f"{name} must be a string, got {getattr(task, name)!r}")
-    for name in ("larger_is_better", "is_noisy"):
+    for name in ("higher_is_better", "is_noisy"):
         require(isinstance(getattr(task, name), bool), f"{name} must be true or false, got {getattr(task, name)!r}")
     require(isinstance(task.shape, tuple), f"shape must be a tuple, got {task.shape!r}")
     if task.directions is not None:
@@ -60,20 +60,20 @@ def _check_state(task: Task) -> None:
     again = registry("task").build(state)
     require(type(again) is type(task), "the task must come back from its state as one of its kind")
     require(flat(again.state()) == flat(task.state()), "the task must come back from its state as it was")
-    facts = lambda task: (task.shape, task.dtype, task.unit, task.normalisation, task.watched, task.larger_is_better)
+    facts = lambda task: (task.shape, task.dtype, task.unit, task.normalisation, task.monitor, task.higher_is_better)
     require(facts(again) == facts(task), "the task must come back from its state as it was")
 
 
 def _check_scores(task: Task, labels: Tensor, noise: Tensor) -> None:
     values = labels + noise
     perfect, worse = (task.scores(labels, guess) for guess in (labels, values))
-    require(task.watched in perfect, f"scores must have the one watched, {task.watched!r}, got {', '.join(perfect)}")
+    require(task.monitor in perfect, f"scores must have the monitored one, {task.monitor!r}, got {', '.join(perfect)}")
     for name, score in (*perfect.items(), *worse.items()):
         right = tuple(score.shape) == (SAMPLES,) and score.dtype == torch.float64 and score.device.type == "cpu"
         require(right, f"the score {name} must be ({SAMPLES},) float64 on the CPU, got {score.shape}, {score.dtype}")
         require(bool(score.isfinite().all()), f"the score {name} must be finite")
-    gain = perfect[task.watched] - worse[task.watched]
-    require(bool((gain > 0).all() if task.larger_is_better else (gain < 0).all()), "what is right must score best")
+    gain = perfect[task.monitor] - worse[task.monitor]
+    require(bool((gain > 0).all() if task.higher_is_better else (gain < 0).all()), "what is right must score best")
     for name, score in task.scores(labels[-1:], values[-1:]).items():
         require_close(score, worse[name][-1:], 1e-9, f"the score {name} must not depend on the other samples")
     graded = task.scores(labels, values.clone().requires_grad_())
@@ -84,12 +84,12 @@ def _check_scores(task: Task, labels: Tensor, noise: Tensor) -> None:
     require([*best] == [*metrics], f"summarise must give {', '.join(metrics)}, got {', '.join(best)}")
     require(all(type(number) is float for number in best.values()), "summarise must give plain numbers")
     for name, metric in metrics.items():
-        better = best[name] > second[name] if metric.larger_is_better else best[name] < second[name]
+        better = best[name] > second[name] if metric.higher_is_better else best[name] < second[name]
         require(better, f"what is right must have the best {name}, got {best[name]} and else {second[name]}")
     if (averaged := task.averaged(worse)) is not None:
         require([*averaged] == [*worse], f"averaged must give {', '.join(worse)}, got {', '.join(averaged)}")
-        gain = averaged[task.watched] - worse[task.watched]
-        require(bool((gain >= 0).all() if task.larger_is_better else (gain <= 0).all()), "averaged must be no worse")
+        gain = averaged[task.monitor] - worse[task.monitor]
+        require(bool((gain >= 0).all() if task.higher_is_better else (gain <= 0).all()), "averaged must be no worse")
     stored = task.stored(labels, values, worse)
     require(all(isinstance(array, np.ndarray) for array in stored.values()), "stored must give arrays of numpy")
     require(all(len(array) == SAMPLES for array in stored.values()), "stored must give a row for each sample")

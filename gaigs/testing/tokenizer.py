@@ -8,7 +8,7 @@ from torch import nn
 from gaigs.placement import Placed
 from gaigs.query import Query
 from gaigs.scene import Scene
-from gaigs.testing._checks import (
+from gaigs.testing.checks import (
     PRECISION,
     random_frequencies,
     random_places,

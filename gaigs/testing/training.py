@@ -17,7 +17,7 @@ from gaigs.model import Model
 from gaigs.processes import stopping
 from gaigs.query import Batch
 from gaigs.scene import Scene
-from gaigs.testing._checks import flat, require, require_close, require_raises
+from gaigs.testing.checks import flat, require, require_close, require_raises
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.callbacks import KeepLast, save
 

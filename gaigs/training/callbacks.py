@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from rich.progress import BarColumn, Progress, TimeRemainingColumn
 
 from gaigs import checkpoint, density
-from gaigs.files import whole
+from gaigs.io.files import atomic_write
 from gaigs.processes import STOPPING
 from gaigs.training import MeanScores, seeded
 from gaigs.training.budget import share_done
@@ -124,7 +124,7 @@ class DensityControl(Callback):
 
 
 class KeepBest(Checkpoint):
-    """Writes the checkpoint of the best validation score (``Task.watched``), or of the last step where nothing was
+    """Writes the checkpoint of the best validation score (``Task.monitor``), or of the last step where nothing was
     validated.
 
     Args:
@@ -157,7 +157,7 @@ class KeepBest(Checkpoint):
     def on_validation_end(self, trainer, module) -> None:
         if trainer.sanity_checking:
             return
-        score = trainer.callback_metrics[f"validation/{module.task.watched}"].item()
+        score = trainer.callback_metrics[f"validation/{module.task.monitor}"].item()
         self.waited = 0 if self._keep(trainer, module, score) else self.waited + 1
         self._stop_in_time(trainer)
 
@@ -175,14 +175,14 @@ class KeepBest(Checkpoint):
             with trainer.precision_plugin.val_step_context():
                 scores.add(batch, module.model.evaluate(batch))
         module.train()
-        self._keep(trainer, module, scores.over_processes(trainer.strategy)[module.task.watched])
+        self._keep(trainer, module, scores.over_processes(trainer.strategy)[module.task.monitor])
 
     def on_fit_end(self, trainer, module) -> None:
         if self.best == -math.inf:
             save(trainer, self.path)
 
     def _keep(self, trainer, module, score: float) -> bool:
-        score = score if module.task.larger_is_better else -score
+        score = score if module.task.higher_is_better else -score
         better = score > self.best
         if better:
             self.best = score
@@ -275,7 +275,7 @@ def save(trainer: lightning.Trainer, path: Path) -> None:
     """Writes a checkpoint, whole or not at all, behind the log of the steps before it; every process has to call it."""
     for logger in trainer.loggers:
         logger.save()
-    with whole(path) if trainer.is_global_zero else contextlib.nullcontext(path.with_suffix(".part")) as part:
+    with atomic_write(path) if trainer.is_global_zero else contextlib.nullcontext(path.with_suffix(".part")) as part:
         trainer.save_checkpoint(part, weights_only=False)  # which only the first process writes
         if trainer.is_global_zero:
             checkpoint.seal(part)
@@ -300,7 +300,7 @@ class ProgressLine(ProgressBar):
     def on_train_batch_end(self, trainer, module, *_) -> None:
         step, values = trainer.global_step, trainer.progress_bar_metrics
         rate = (step - self.first) / (time.monotonic() - self.start)
-        words = {"train/loss": "loss", f"validation/{module.task.watched}": module.task.watched}
+        words = {"train/loss": "loss", f"validation/{module.task.monitor}": module.task.monitor}
         scores = " ".join(f"{word} {values[name]:.3f}" for name, word in words.items() if name in values)
         self.line.update(self.task, **self._done(trainer), rate=rate, scores=scores)
 

@@ -151,7 +151,7 @@ class Descent(lightning.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         for name, mean in self.scores.over_processes(self.trainer.strategy).items():
-            self.log(f"validation/{name}", mean, prog_bar=name == self.task.watched, sync_dist=True)
+            self.log(f"validation/{name}", mean, prog_bar=name == self.task.monitor, sync_dist=True)
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, _: int) -> Batch:
         return batch.to(device)

@@ -338,7 +338,7 @@ def test_errors_are_above_zero_and_fall_as_scores_get_better(task, score, title,
     assert scale.error(score) == pytest.approx(error)
     assert scale.error_title == title
     assert scale.reaches(score, score)
-    assert not scale.reaches(score, score + (0.1 if scale.larger_is_better else -0.1))
+    assert not scale.reaches(score, score + (0.1 if scale.higher_is_better else -0.1))
 
 
 def test_curves_fall_on_logarithmic_axes_and_their_names_keep_apart():

@@ -7,8 +7,8 @@ import torch
 from precision import build, composed, require_same, widen
 from torch.nn import functional
 
-from gaigs.placement._words import all_words, fold, images
 from gaigs.placement.mirrored import BOX, TILT, UNIT
+from gaigs.placement.mirrored.reflections import all_words, fold, images
 from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.testing import example_links

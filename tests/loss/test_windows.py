@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from gaigs.loss._windows import window_means
+from gaigs.loss.windows import window_means
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from strategies import coordinates, normals, points, tensors
 
 from gaigs.algebra import PROJECTIVE, SPACETIME
 from gaigs.algebra.embedding import embed_point, embed_reflection, extract_point
-from gaigs.placement._words import all_words, fold, images, reflect
+from gaigs.placement.mirrored.reflections import all_words, fold, images, reflect
 
 algebras = st.sampled_from([PROJECTIVE, SPACETIME])
 multivectors = tensors(st.floats(-2, 2, width=32), 16)

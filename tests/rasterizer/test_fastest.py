@@ -10,7 +10,7 @@ from gaigs.rasterizer.fastest import FastestRasterizer
 from gaigs.rasterizer.torch import TorchRasterizer
 
 opencl = pytest.importorskip("gaigs.rasterizer.opencl", exc_type=ImportError)
-_devices = pytest.importorskip("gaigs.rasterizer._devices", exc_type=ImportError)
+_devices = pytest.importorskip("gaigs.rasterizer.devices", exc_type=ImportError)
 
 
 def scene(n=12, dtype=torch.float32, channels=2, attenuations=None):

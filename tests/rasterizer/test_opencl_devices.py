@@ -9,7 +9,7 @@ import pytest
 from gaigs.rasterizer.fastest import FastestRasterizer
 
 opencl = pytest.importorskip("gaigs.rasterizer.opencl", exc_type=ImportError)
-found_devices = pytest.importorskip("gaigs.rasterizer._devices", exc_type=ImportError)
+found_devices = pytest.importorskip("gaigs.rasterizer.devices", exc_type=ImportError)
 
 LOG = """clBuildProgram failed: BUILD_PROGRAM_FAILURE - clBuildProgram failed: BUILD_PROGRAM_FAILURE
 

@@ -187,11 +187,11 @@ def test_figures_show_the_first_seed_of_each_system(sweep, monkeypatch):
         "yagi": "model=yagi,seed=0",
     }
     assert asked["split"] == "official"
-    curves, label, baselines, larger_is_better = asked["curves"]
+    curves, label, baselines, higher_is_better = asked["curves"]
     assert curves == {"NeRF²": ((15.0, 30.5), (0.3, 0.8)), "GAI-GS": ((15.0, 30.5), (0.3, 0.9))}
     assert label == "mean SSIM, validation"
     assert baselines == {"mean": 0.49, "knn": 0.49}
-    assert larger_is_better
+    assert higher_is_better
     assert {path.name for path in sweep.glob("systems_*")} == {
         "systems_cdf.png",
         "systems_spectra.png",
@@ -315,10 +315,10 @@ def test_a_spectrum_and_what_systems_predict():
     assert [ax.get_xlabel() != "" for ax in panels] == [False] * 3 + [True] * 4
 
 
-@pytest.mark.parametrize(("larger_is_better", "scale"), [(True, "linear"), (False, "log")])
-def test_learning_curves(larger_is_better, scale):
+@pytest.mark.parametrize(("higher_is_better", "scale"), [(True, "linear"), (False, "log")])
+def test_learning_curves(higher_is_better, scale):
     curves = {"GAI-GS": ((1, 2, 3), (0.1, 0.5, 0.6)), "NeRF²": ((2, 4), (0.2, 0.3))}
-    figure = learning_curves(curves, "mean SSIM, validation", {"mean": 0.4}, larger_is_better)
+    figure = learning_curves(curves, "mean SSIM, validation", {"mean": 0.4}, higher_is_better)
     (ax,) = figure.axes
     for line, (name, points) in zip(ax.lines, curves.items(), strict=False):
         assert line.get_label() == name
@@ -330,7 +330,7 @@ def test_learning_curves(larger_is_better, scale):
 
 
 def test_errors_of_zero_have_no_logarithm():
-    figure = learning_curves({"GAI-GS": ((1, 2), (0.1, 0.0))}, "error", {}, larger_is_better=False)
+    figure = learning_curves({"GAI-GS": ((1, 2), (0.1, 0.0))}, "error", {}, higher_is_better=False)
     assert figure.axes[0].get_yscale() == "linear"
 
 

@@ -37,7 +37,7 @@ def test_another_quantity_has_names_of_its_own_unit():
     task = Delay()
     assert [metric.title for metric in Delay.metrics().values()] == ["MAE [ns]", "median AE [ns]", "RMSE [ns]"]
     scores = task.scores(torch.zeros(3), torch.ones(3))
-    assert [*scores] == [task.watched] == ["mae_ns"]
+    assert [*scores] == [task.monitor] == ["mae_ns"]
     assert task.summarise(scores) == {"mae_ns": 1, "median_ae_ns": 1, "rmse_ns": 1}
 
 

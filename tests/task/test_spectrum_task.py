@@ -55,7 +55,7 @@ def test_summary_is_that_of_numpy():
     }
     assert list(summary) == list(expected) == list(Spectrum.metrics())
     assert summary == pytest.approx(expected, rel=1e-12)
-    assert [metric.larger_is_better for metric in Spectrum.metrics().values()] == [True] * 4 + [False]
+    assert [metric.higher_is_better for metric in Spectrum.metrics().values()] == [True] * 4 + [False]
 
 
 @pytest.mark.parametrize(

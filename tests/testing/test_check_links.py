@@ -193,7 +193,7 @@ class Biased(Rssi):
 
 
 class Upside(Rssi):
-    larger_is_better = True
+    higher_is_better = True
 
 
 class Pooled(Rssi):
@@ -204,7 +204,7 @@ class Pooled(Rssi):
 
 class Trusting(Rssi):
     def scores(self, labels, values):
-        return {self.watched: (values - labels).detach().double().abs()}
+        return {self.monitor: (values - labels).detach().double().abs()}
 
 
 class Blind(Csi):
@@ -216,7 +216,7 @@ class Blind(Csi):
 
 class Cheerful(Rssi):
     def summarise(self, scores):
-        return super().summarise(scores) if len(scores[self.watched]) else dict.fromkeys(self.metrics(), 0.0)
+        return super().summarise(scores) if len(scores[self.monitor]) else dict.fromkeys(self.metrics(), 0.0)
 
 
 class Renamed(Rssi):

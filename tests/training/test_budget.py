@@ -265,7 +265,7 @@ def test_the_progress_line_tells_the_share_of_the_time(capsys, monkeypatch):
     _, budget = make_budget({"max_steps": -1, "max_time": "00:00:03:00"}, Timer())
     trainer = SimpleNamespace(global_step=40, max_steps=-1, progress_bar_metrics={}, is_global_zero=True)
     trainer.callbacks = [budget]
-    line, module = ProgressLine(), SimpleNamespace(task=SimpleNamespace(watched="ssim"))
+    line, module = ProgressLine(), SimpleNamespace(task=SimpleNamespace(monitor="ssim"))
     line.on_train_start(trainer, None)
     trainer.global_step, budget.share = 1499, 0.25
     line.on_train_batch_end(trainer, module)

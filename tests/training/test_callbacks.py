@@ -162,7 +162,7 @@ class Trainer(SimpleNamespace):
 
     def validate(self, callback, score, task=SPECTRA):
         self.global_step += 1
-        self.callback_metrics = {f"validation/{task.watched}": torch.tensor(score)}
+        self.callback_metrics = {f"validation/{task.monitor}": torch.tensor(score)}
         callback.on_validation_end(self, SimpleNamespace(task=task))
 
 

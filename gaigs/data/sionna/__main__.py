@@ -8,7 +8,7 @@ import numpy as np
 from gaigs.data import Links, load, nerf2_spectrum
 from gaigs.data.sionna import find_room
 from gaigs.data.sionna.meshes import wavefront_obj
-from gaigs.files import whole, write_text
+from gaigs.io.files import atomic_write, write_text
 
 
 def write_rssi(folder: Path, links: Links) -> None:
@@ -24,7 +24,7 @@ def write_rssi(folder: Path, links: Links) -> None:
 def write_channels(folder: Path, links: Links) -> None:
     """Channels as the file of arrays that ``csi_npz`` reads."""
     (receiver,) = links.receivers
-    with whole(folder / "room.npz") as part:
+    with atomic_write(folder / "room.npz") as part:
         np.savez(
             part,
             tx=links.query.transmitters.numpy(),

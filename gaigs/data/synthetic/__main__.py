@@ -6,7 +6,7 @@ from pathlib import Path
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.data.synthetic import ROOM, wavefront_obj
-from gaigs.files import write_text
+from gaigs.io.files import write_text
 
 
 def main() -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from gaigs.data import synthetic
-from gaigs.data._meshes import NO_NAME, check_mesh, parse_obj, read_ply
-from gaigs.data._meshes import read_obj as read_mesh
 from gaigs.data.sionna import ROOMS, tracing
 from gaigs.data.sionna.meshes import THICKNESS, Mesh
+from gaigs.io.meshes import NO_NAME, check_mesh, parse_obj, read_ply
+from gaigs.io.meshes import read_obj as read_mesh
 
 BUILT_IN = ("built_in", "synthetic", "synthetic_rssi", "synthetic_csi")
 """Names of the built-in room: its own, and those of the data that come from it."""

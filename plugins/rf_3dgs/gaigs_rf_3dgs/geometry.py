@@ -11,8 +11,8 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gaigs.data._files import read_points, refuse
-from gaigs.data._meshes import read_obj, read_ply
+from gaigs.io.meshes import read_obj, read_ply
+from gaigs.io.tables import read_points, refuse
 
 NEIGHBOURS = 3
 """A Gaussian at a bare point is as wide as these are away, in root mean square, as 3-D Gaussian splatting starts."""

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gaigs.data.synthetic.image_source import cells, mirror
-from gaigs.placement._words import all_words, fold, images, reflect
+from gaigs.placement.mirrored.reflections import all_words, fold, images, reflect
 
 SIZE = torch.tensor([7.0, 5.0, 3.0], dtype=torch.float64)
 BOX = torch.cat((torch.eye(3), -torch.eye(3))).double(), torch.cat((SIZE, torch.zeros(3, dtype=torch.float64)))

@@ -10,10 +10,10 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from gaigs.data import Links
-from gaigs.files import write_text
 from gaigs.gaussians import write_ply
-from gaigs.placement._words import fold, images
+from gaigs.io.files import write_text
 from gaigs.placement.mirrored import Mirrored
+from gaigs.placement.mirrored.reflections import fold, images
 from gaigs.propagation import fresnel
 from gaigs.query import Query
 from gaigs.report import shapes

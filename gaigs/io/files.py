@@ -11,7 +11,7 @@ UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 @contextlib.contextmanager
-def whole(path: str | Path) -> Iterator[Path]:
+def atomic_write(path: str | Path) -> Iterator[Path]:
     """Where to write a file that takes its place once it is whole; the name ends as the file's own does.
 
     Where the writing fails or is stopped, nothing of it is left, and what was there before stands. It is on the disk
@@ -43,12 +43,12 @@ def whole(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Writes a text file in UTF-8, whole or not at all, as ``whole`` has it.
+    """Writes a text file in UTF-8, whole or not at all, as ``atomic_write`` has it.
 
     Raises:
         OSError: It cannot be written.
     """
-    with whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text(text, encoding="utf-8")
 
 

@@ -7,8 +7,8 @@ import torch
 
 from gaigs.data.synthetic import ROOM, wavefront_obj
 from gaigs.data.synthetic.image_source import Room
-from gaigs.placement._walls import read_planes
 from gaigs.placement.mirrored import Mirrored
+from gaigs.placement.mirrored.walls import read_planes
 from gaigs.testing import example_links
 
 LOWER, UPPER = torch.tensor([0.5, 0.5, 0.4]), torch.tensor([3.5, 2.5, 2.2])

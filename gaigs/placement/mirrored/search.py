@@ -10,8 +10,8 @@ from torch.nn import functional
 
 from gaigs.directions import Grid
 from gaigs.gaussians import fibonacci_lattice
-from gaigs.placement._words import reflect
 from gaigs.placement.mirrored import CONDUCTIVITY, PERMITTIVITY
+from gaigs.placement.mirrored.reflections import reflect
 from gaigs.projection import Splats
 from gaigs.propagation import NEAREST, fresnel
 from gaigs.query import Batch

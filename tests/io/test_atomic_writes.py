@@ -13,8 +13,8 @@ import torch
 
 import gaigs
 from gaigs import checkpoint
-from gaigs.files import sentence, whole
 from gaigs.gaussians import write_ply
+from gaigs.io.files import atomic_write, sentence
 from gaigs.radio_maps import RadioMap
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -23,7 +23,7 @@ FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 def test_a_file_takes_its_place_once_it_is_whole(tmp_path):
     path = tmp_path / "scores.npz"
     path.write_text("old")
-    with whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text("new")
         assert path.read_text() == "old"
         assert part.suffix == ".npz", "many writers choose the format by it"
@@ -38,7 +38,7 @@ def test_where_writing_fails_all_is_as_before(error, begun, tmp_path):
     path.write_text("old")
 
     def write():
-        with whole(path) as part:
+        with atomic_write(path) as part:
             if begun:
                 part.write_text("ne")
             raise error
@@ -55,7 +55,7 @@ def test_where_writing_fails_all_is_as_before(error, begun, tmp_path):
 )
 def test_the_error_names_file_cause_and_remedy(error, number, cause, tmp_path):
     def write():
-        with whole(tmp_path / "scores.npz"):
+        with atomic_write(tmp_path / "scores.npz"):
             raise error
 
     with pytest.raises(
@@ -75,7 +75,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 
 def test_a_folder_that_was_removed_is_not_made_anew(tmp_path):
     def write():
-        with whole(tmp_path / "removed" / "last.ckpt") as part:
+        with atomic_write(tmp_path / "removed" / "last.ckpt") as part:
             part.parent.mkdir()  # as Lightning does
             part.write_text("new")
 
@@ -93,7 +93,7 @@ def test_a_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     def write():
-        with whole(path) as part:
+        with atomic_write(path) as part:
             part.write_text("new")
 
     monkeypatch.setattr(os, "fsync", fail)
@@ -124,7 +124,7 @@ def test_an_error_of_the_system_becomes_a_sentence_and_others_stay(error, begins
 
 
 def test_nothing_is_written_otherwise():
-    """``part`` is what ``whole`` gives; ``file`` and ``stream`` are opened at such a place."""
+    """``part`` is what ``atomic_write`` gives; ``file`` and ``stream`` are opened at such a place."""
     written = re.compile(r"(\S+)\.write_text\(|np\.savez\w*\(\s*([^,]+),|\.savefig\(([^,)]+)")
     root = Path(gaigs.__file__).parent
     places = {

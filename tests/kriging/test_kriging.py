@@ -9,8 +9,9 @@ from scipy.spatial.distance import cdist
 from torch import nn
 
 from gaigs.data import Split
-from gaigs.model import Model, Prediction, _process, kriging
-from gaigs.model._known import at_directions
+from gaigs.kriging import fit
+from gaigs.kriging.links import at_directions
+from gaigs.model import Model, Prediction, kriging
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging, known, predicted, principal, thinned
 from gaigs.query import Batch, Query
@@ -38,7 +39,7 @@ class Trained(Model):
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setitem(registry("model")._registered, "trained", Trained)
-    monkeypatch.setattr(_process, "AROUND", 16)
+    monkeypatch.setattr(fit, "AROUND", 16)
 
 
 def make(task="rssi", count=None, carriers=(), smooth=0.0, trained=0.0, noise=0.0):

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from gaigs.data import csi_npz, nerf2_rssi, nerf2_spectrum, rssi_csv
-from gaigs.data._files import LONGEST, refuse
+from gaigs.io.tables import LONGEST, refuse
 
 READERS = {"rssi": nerf2_rssi.read, "spectrum": nerf2_spectrum.read}
 

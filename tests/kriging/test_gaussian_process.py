@@ -9,8 +9,9 @@ from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
 from gaigs.data import Split
-from gaigs.model import _process, gaussian_process
-from gaigs.model._process import FEWEST, NOISE, hold_out, misfit
+from gaigs.kriging import fit
+from gaigs.kriging.fit import FEWEST, NOISE, hold_out, misfit
+from gaigs.model import gaussian_process
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.query import Query
 from gaigs.registry import registry
@@ -196,7 +197,7 @@ def test_predictions_do_not_depend_on_the_order_of_the_links():
 @pytest.mark.parametrize("validation", [True, False])
 @pytest.mark.parametrize(("length", "noise"), [(0.5, 0.01), (2.0, 0.1), (1.0, 1.0)])
 def test_length_and_noise_are_those_of_the_process(length, noise, validation, monkeypatch):
-    monkeypatch.setattr(_process, "AROUND", 24)
+    monkeypatch.setattr(fit, "AROUND", 24)
     links = drawn(length, noise)
     if not validation:
         split = links.split
@@ -265,7 +266,7 @@ def test_validation_links_are_held_out_from_the_training_links():
 
 def test_without_a_validation_copies_of_a_link_do_not_predict_it(monkeypatch):
     """Else noise would pass for signal: every copy has the same noise."""
-    monkeypatch.setattr(_process, "AROUND", 24)
+    monkeypatch.setattr(fit, "AROUND", 24)
     links = drawn(1.0, 1.0)
     twice = torch.arange(400) % 200
     split = Split("twice", torch.arange(400), torch.arange(0), torch.arange(400, 450))
@@ -321,7 +322,7 @@ def test_the_distance_is_over_place_and_log_frequency():
 
 
 def test_the_scale_of_frequencies_is_that_of_the_process(monkeypatch):
-    monkeypatch.setattr(_process, "AROUND", 24)
+    monkeypatch.setattr(fit, "AROUND", 24)
     scale, length, noise, count = 3.0, 2.0, 0.05, 250
     links = make("spectrum", count, carriers=(1e9, 1.7e9, 2.9e9, 5e9))
     query = replace(links.query, receivers=torch.zeros(count, dtype=torch.long))

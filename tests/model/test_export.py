@@ -13,8 +13,8 @@ from plyfile import PlyData
 from gaigs.data import Links, Split
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Pose
-from gaigs.model import _learnt_room as learnt_room
 from gaigs.placement.mirrored import Mirrored
+from gaigs.placement.mirrored import export as learnt_room
 from gaigs.query import Query
 from gaigs.scene import Receiver
 from gaigs.task.rssi import Rssi

@@ -17,9 +17,9 @@ from gaigs.algebra.embedding import embed_reflection, embed_scalar
 from gaigs.data import Links
 from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.placement import Placed, Placement
-from gaigs.placement._obstacles import Obstacles
-from gaigs.placement._walls import read_planes
-from gaigs.placement._words import Folded, all_words, fold, images
+from gaigs.placement.mirrored.obstacles import Obstacles
+from gaigs.placement.mirrored.reflections import Folded, all_words, fold, images
+from gaigs.placement.mirrored.walls import read_planes
 from gaigs.propagation import NEAREST, carriers, fresnel
 from gaigs.query import Query
 from gaigs.registry import register

@@ -11,8 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gaigs.geometry import FAR
-from gaigs.query import NEAR
+from gaigs.geometry import FAR, WITHIN
 
 SHOWN = 10
 """Defects that an error lists one by one."""
@@ -140,7 +139,7 @@ def to_numbers(
 def to_coordinates(place: str, names: Sequence[str], cells: Sequence[str], defects: list[str]) -> list[float]:
     """Cells of a line as coordinates [m], finite and near enough for float32."""
     if all(math.isfinite(to_number(cell)) for cell in cells):
-        return to_numbers(place, names, cells, lambda value: abs(value) < FAR, NEAR, defects)
+        return to_numbers(place, names, cells, lambda value: abs(value) < FAR, WITHIN, defects)
     return to_numbers(place, names, cells, math.isfinite, "a finite number", defects)
 
 

@@ -12,8 +12,8 @@ from gaigs.algebra.embedding import embed_point, extract_point
 from gaigs.data.synthetic import POSE, REGION
 from gaigs.data.synthetic.image_source import Room, permittivity, trace
 from gaigs.gaussians import SH_DC
-from gaigs.placement._words import images
 from gaigs.placement.mirrored import Mirrored
+from gaigs.placement.mirrored.reflections import images
 from gaigs.query import Query
 from gaigs.scene import Array, Receiver, Scene
 from gaigs.task.csi import Csi

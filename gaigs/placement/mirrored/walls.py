@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.data._files import refuse
-from gaigs.data._meshes import read_obj
 from gaigs.data.nerf2_rssi import read_walls
+from gaigs.io.meshes import read_obj
+from gaigs.io.tables import refuse
 
 SAME_TURN, SAME_PLACE = 0.02, 0.02
 """Planes are one where their normals differ by less [rad], and their offsets by less [m]."""

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.model._known import coordinates, distances, evenly, scale_bounds
+from gaigs.kriging.links import coordinates, distances, evenly, scale_bounds
 from gaigs.query import Query
 from gaigs.scene import Scene
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.placement._obstacles import Obstacles
+from gaigs.placement.mirrored.obstacles import Obstacles
 
 LOWER, UPPER = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([6.0, 4.0, 3.0])
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from test_mirrored_model import MIRRORED, build, room_spectra, told
 
-from gaigs.model._plane_search import fewer, find_planes
+from gaigs.placement.mirrored.search import fewer, find_planes
 from gaigs.scene import Array
 
 WALLS = {0: [1.0, 0, 0, 0], 2: [0, 1.0, 0, 0], 3: [0, 1.0, 0, 5.0]}

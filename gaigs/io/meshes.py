@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from plyfile import PlyData
 
-from gaigs.data._files import NEAR, NUMBER, read_lines, refuse
-from gaigs.geometry import FAR
+from gaigs.geometry import FAR, WITHIN
+from gaigs.io.tables import NUMBER, read_lines, refuse
 
 Face = tuple[int, ...]
 """Numbers of a polygon's vertices, from 0."""
@@ -70,7 +70,7 @@ def _vertex(words: list[str]) -> list[float]:
         raise ValueError("numbers x y z")
     point = [float(word) for word in words]
     if not all(abs(value) < FAR for value in point):
-        raise ValueError(NEAR)
+        raise ValueError(WITHIN)
     return point
 
 
@@ -120,7 +120,7 @@ def check_mesh(points: Float[np.ndarray, "v 3"], faces: Sequence[Face], source: 
     """
     if not (np.abs(points) < FAR).all():
         row = int((~(np.abs(points) < FAR)).any(1).argmax())
-        raise ValueError(f"{source} must hold {NEAR}, got {points[row].tolist()} at vertex {row + 1}")
+        raise ValueError(f"{source} must hold {WITHIN}, got {points[row].tolist()} at vertex {row + 1}")
     for number, face in enumerate(faces, 1):
         if len(face) < 3 or not all(0 <= corner < len(points) for corner in face):
             raise ValueError(

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import yaml
 
-from gaigs.data._files import NEAR, read_lines, to_number
-from gaigs.geometry import FAR
+from gaigs.geometry import FAR, WITHIN
+from gaigs.io.tables import read_lines, to_number
 
 CORE = "tag:yaml.org,2002:"
 """What the tags of YAML's own types begin with; others may stand for anything, as a unit."""
@@ -82,7 +82,7 @@ def to_position(place: str, entry: Entry | None, defects: list[str]) -> list[flo
     """A list of coordinates [m], finite and near enough for float32."""
     before, values = len(defects), to_vector(f"{place}: position", entry, "xyz", defects)
     if len(defects) == before and max(map(abs, values)) >= FAR:
-        defects.append(f"{place}: expected {NEAR}, got {_written(entry.node)!r}")
+        defects.append(f"{place}: expected {WITHIN}, got {_written(entry.node)!r}")
     return values
 
 

@@ -1,0 +1,1 @@
+"""Reading and writing files: tables, meshes, YAML, and files written at once."""
