@@ -3,7 +3,9 @@
 import ast
 import functools
 import hashlib
+import os
 import re
+import sys
 import tomllib
 from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass
@@ -94,13 +96,24 @@ def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list
     """
     cwd = Path.cwd()
     built_in, unreadable = _scan(kind, PACKAGE / kind, f"gaigs.{kind}")
-    points = metadata.entry_points(group=f"gaigs.{kind}")
+    points = _installed(_path()).select(group=f"gaigs.{kind}")
     installed = [Holder(p.name, f"distribution {p.dist.name} {p.dist.version}", p.value) for p in points]
     dropped, causes = _scan(kind, cwd / "plugins", "plugins", root=cwd)
     targets = {(holder.name, holder.target) for holder in installed}
     # A package in ./plugins that is installed as well is no rival of itself.
     holders = built_in + installed + [holder for holder in dropped if (holder.name, holder.target) not in targets]
     return [holder for holder in holders if name in (None, holder.name)], unreadable + causes
+
+
+def _path() -> tuple:
+    """The folders of ``sys.path`` with their times of change, which an installation changes."""
+    return tuple((folder, os.stat(folder or ".").st_mtime_ns) for folder in sys.path if os.path.isdir(folder or "."))
+
+
+@functools.lru_cache(maxsize=1)
+def _installed(_: tuple) -> metadata.EntryPoints:
+    """Entry points of the packages on ``sys.path``, which are read from files of each package."""
+    return metadata.entry_points()
 
 
 def digests(names: Container[str]) -> dict[str, str]:

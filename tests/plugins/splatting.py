@@ -22,6 +22,7 @@ RUN = (
     "rasterizer=torch",
     "training.batch_size=7",
     "trainer.accelerator=cpu",
+    "data.transmitters=40",
     "trainer.max_steps=4",
     "trainer.val_check_interval=2",
     "trainer.log_every_n_steps=1",
