@@ -96,7 +96,7 @@ def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list
     """
     cwd = Path.cwd()
     built_in, unreadable = _scan(kind, PACKAGE / kind, f"gaigs.{kind}")
-    points = _installed(_path()).select(group=f"gaigs.{kind}")
+    points = _installed(f"gaigs.{kind}", _path())
     installed = [Holder(p.name, f"distribution {p.dist.name} {p.dist.version}", p.value) for p in points]
     dropped, causes = _scan(kind, cwd / "plugins", "plugins", root=cwd)
     targets = {(holder.name, holder.target) for holder in installed}
@@ -110,10 +110,10 @@ def _path() -> tuple:
     return tuple((folder, os.stat(folder or ".").st_mtime_ns) for folder in sys.path if os.path.isdir(folder or "."))
 
 
-@functools.lru_cache(maxsize=1)
-def _installed(_: tuple) -> metadata.EntryPoints:
-    """Entry points of the packages on ``sys.path``, which are read from files of each package."""
-    return metadata.entry_points()
+@functools.lru_cache
+def _installed(group: str, _: tuple) -> metadata.EntryPoints:
+    """Entry points of a group. They stand in a file of each package on ``sys.path``, and reading these is slow."""
+    return metadata.entry_points(group=group)
 
 
 def digests(names: Container[str]) -> dict[str, str]:
