@@ -1,4 +1,4 @@
-"""What fits of one gain over free space are worth for channels, and what a few links change in them.
+"""Scores of fits of one gain over free space to channels, and the influence of a few links on them.
 
     python benchmarks/channel_gains.py                                   the built-in room
     python benchmarks/channel_gains.py l_shape slanted furnished         rooms of the ray tracer; needs gaigs[sionna]
@@ -15,8 +15,9 @@ from jaxtyping import Complex
 from torch import Tensor
 
 from gaigs.data import Links, load
-from gaigs.propagation import direct_gains, direct_waves, fit_gain
+from gaigs.propagation import fit_gain
 from gaigs.report.table import markdown
+from gaigs.scene import direct_gains, direct_waves
 
 Channels = Complex[Tensor, "k m"]
 

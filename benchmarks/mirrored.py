@@ -1,13 +1,13 @@
 """Times predictions of mirrored Gaussians, without a map and by way of one, interleaved in one process.
 
     python benchmarks/mirrored.py
-    python benchmarks/mirrored.py data=synthetic_rssi pooling=mean_power --links 256
+    python benchmarks/mirrored.py data=synthetic_rssi --links 256
     python benchmarks/mirrored.py --checkpoint runs/a-run/best.ckpt
 
-Overrides are those of ``python -m gaigs +experiment=mirrored``. Every rasterizer gets the same Gaussians: those of a
-checkpoint, without its kriging, or untrained ones, of which none has been pruned. Phases count. Rendering is the
-rasterizer alone, of aperture with the projection; a prediction is everything from position to label. Times are
-medians for one link; judge them by their ratios within one run, as other work on the machine slows all of them.
+Overrides are those of ``python -m gaigs +experiment=mirrored``. Every way gets the same Gaussians: those of a
+checkpoint, without its kriging, or untrained ones, none of them pruned. Phases count. Rendering is the
+rasterizer alone, or the sum over paths; a prediction is everything from position to label. Times are medians for one
+link; judge them by their ratios within one run, as other work on the machine slows all of them.
 """
 
 import argparse
@@ -25,18 +25,17 @@ from scipy.constants import speed_of_light
 
 import gaigs
 from gaigs.data import Links, load
-from gaigs.evaluation import device_name
 from gaigs.model import Model
-from gaigs.propagation import carriers
 from gaigs.query import Batch
 from gaigs.registry import registry
+from gaigs.runs.evaluation import device_name
+from gaigs.scene import carriers
 
-WAYS = {"aperture": [], "torch": ["rasterizer=torch", "projection=mercator"]}
-WAYS["opencl"] = ["rasterizer=opencl", "projection=mercator"]
-"""Overrides by rasterizer."""
+POOLINGS = {"spectrum": "array_response", "rssi": "mean_power", "csi": "element_sum"}
+"""Pooling of maps by task."""
 
 MAPS = 8
-"""Links of which a map rasterizer draws maps at a time: it takes one after the other anyway."""
+"""Links of which maps are drawn at a time: a rasterizer takes one after the other anyway."""
 
 
 def build(overrides: list[str], checkpoint: Path | None) -> tuple[Model, Links]:
@@ -47,7 +46,7 @@ def build(overrides: list[str], checkpoint: Path | None) -> tuple[Model, Links]:
     model = registry("model").build(config["model"], scene=links.scene)
     model.fit(links)
     if checkpoint is None:
-        model.placement.sharpen(speed_of_light / carriers(links.scene, links.query).mean().item())
+        model.placement.enable_phases(speed_of_light / carriers(links.scene, links.query).mean().item())
     else:
         trained = gaigs.load(checkpoint)
         model.placement.load_state_dict(getattr(trained, "trend", trained).placement.state_dict())
@@ -76,10 +75,13 @@ def main() -> None:
     if min(options.links, options.repeats) < 1:
         parser.error(f"--links and --repeats must be at least 1, got {options.links} and {options.repeats}")
     renderings, predictions, refusals = {}, {}, []
-    for name, overrides in WAYS.items():
+    task = gaigs.compose("+experiment=mirrored", *options.overrides)["task"]["name"]
+    for name in ("paths", "torch", "opencl"):
+        maps = [f"rasterizer={name}", "projection=mercator", f"pooling={POOLINGS.get(task)}"]
+        overrides = [] if name == "paths" else maps
         try:
             model, links = build([*options.overrides, *overrides], options.checkpoint)
-            count = options.links if name == "aperture" else MAPS
+            count = options.links if name == "paths" else MAPS
             query = links.query[torch.arange(count) % len(links)]
             batch = Batch(query, links.task.directions)
             rendering = model.rendering(batch)
@@ -98,8 +100,8 @@ def main() -> None:
     table = Table("", *map(str, rendering), title=title, box=SIMPLE_HEAD)
     for what, times in ("rendering", rendering), ("prediction", prediction):
         table.add_row(f"{what} [ms]", *(f"{value:.3f}" for value in times.values()))
-        ratios = (value / times["aperture"] for value in times.values()) if "aperture" in times else ()
-        table.add_row("over aperture's", *(f"{ratio:.1f}" for ratio in ratios))
+        ratios = (value / times["paths"] for value in times.values()) if "paths" in times else ()
+        table.add_row("over the paths'", *(f"{ratio:.1f}" for ratio in ratios))
     console = Console()
     console.print(table)
     for refusal in refusals:

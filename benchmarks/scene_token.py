@@ -1,4 +1,4 @@
-"""What the scene token of GAI-GS knows, and what it is worth.
+"""Probes of the scene token of GAI-GS, and trainings of several ways to use it.
 
     python benchmarks/scene_token.py probe RUN
     python benchmarks/scene_token.py train multiview scene_alone own_tokens trainer.max_steps=300 gaussians.count=100
@@ -38,13 +38,12 @@ from torch import Tensor, nn
 
 import gaigs
 from gaigs.data import Links, load
-from gaigs.evaluation import validate
+from gaigs.gaussians import Placed, Tokens
 from gaigs.model import Model
-from gaigs.placement import Placed
 from gaigs.query import Query
 from gaigs.registry import register, registry
+from gaigs.runs.evaluation import validate
 from gaigs.runs.training import descend
-from gaigs.tokenizer import Tokens
 from gaigs.tokenizer.ga import GATokenizer
 from gaigs.tokenizer.multiview import MultiviewTokenizer
 
@@ -64,7 +63,7 @@ class SceneAlone(MultiviewTokenizer):
         self.transmitter_width = 0
         self.euclidean.network = nn.Identity()
 
-    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
+    def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
         tokens = super().forward(placed, opacities, query)
         return tokens._replace(transmitters=tokens.transmitters[:, :0])
 
@@ -77,7 +76,7 @@ class OwnTokens(GATokenizer):
         super().__init__(scene, **{key: value for key, value in ga.items() if key != "name"})
         self.gaussian_width = self.scene_width
 
-    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
+    def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
         means, b = placed.means.detach(), len(query)
         n = means.shape[1]
         tx, own = ((positions - self.middle) / self.scale for positions in (query.transmitters, means))
@@ -95,7 +94,7 @@ class OwnTokens(GATokenizer):
 class FixedAnchors(GATokenizer):
     """Anchors evenly among the Gaussians in the order of their start, whatever their opacities."""
 
-    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
+    def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
         ranks = torch.zeros_like(opacities)
         ranks[torch.linspace(0, len(ranks) - 1, min(self.anchors, len(ranks))).long()] = 1
         return super().forward(placed, ranks, query)
@@ -105,7 +104,7 @@ class FixedAnchors(GATokenizer):
 class Loud(GATokenizer):
     """CLS times ``GAIN``."""
 
-    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
+    def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
         tokens = super().forward(placed, opacities, query)
         return tokens._replace(scene=GAIN * tokens.scene)
 
@@ -189,7 +188,7 @@ def mean_ssim(model: Model, links: Links) -> float:
 
 
 def probe(run: Path) -> Table:
-    """What the tokens of a trained model tell of places and labels, and what the network makes of them."""
+    """Information of the tokens of a trained model on places and labels, and their influence on the network."""
     config = yaml.safe_load((run / "config.yaml").read_text())
     links = load(config["data"], config["split"])
     torch.manual_seed(config["seed"])
@@ -210,17 +209,17 @@ def probe(run: Path) -> Table:
         table.add_column(name, justify="right")
         here, there = values[known], values[asked]
         labels = look_up(here, links.labels[known].flatten(1), there).unflatten(1, links.task.shape)
-        told = [str(values.shape[1]), f"{dimensions(here):.1f}"]
+        texts = [str(values.shape[1]), f"{dimensions(here):.1f}"]
         for predicted in (linear_prediction(here, places[known], there), look_up(here, places[known], there)):
-            told.append(f"{r_squared(predicted, places[asked], places[known]):.3f}")
-        told.append(f"{r_squared(linear_prediction(places[known], here, places[asked]), there, here):.3f}")
-        told.append(f"{ssim(links, labels):.3f}")
+            texts.append(f"{r_squared(predicted, places[asked], places[known]):.3f}")
+        texts.append(f"{r_squared(linear_prediction(places[known], here, places[asked]), there, here):.3f}")
+        texts.append(f"{ssim(links, labels):.3f}")
         if field is not None:
-            told += [f"{moves_then[field]:.4f}", f"{moves[field]:.4f}", f"{gradients[field]:.1e}"]
-            told.append(f"{without(model, links, field):.3f}")
+            texts += [f"{moves_then[field]:.4f}", f"{moves[field]:.4f}", f"{gradients[field]:.1e}"]
+            texts.append(f"{without(model, links, field):.3f}")
         if field == "scene":
-            told.append(f"{of_an_anchor(model, links.query[known]):.2f}")
-        for row, text in zip(rows.values(), told + [""] * (len(rows) - len(told)), strict=True):
+            texts.append(f"{of_an_anchor(model, links.query[known]):.2f}")
+        for row, text in zip(rows.values(), texts + [""] * (len(rows) - len(texts)), strict=True):
             row.append(text)
     for key, row in rows.items():
         table.add_row(key, *row)
@@ -241,7 +240,7 @@ ROWS = (
     "mean SSIM of the model without it",
     "what another anchor moves it by, over its spread over transmitters",
 )
-"""What ``probe`` tells of features."""
+"""Rows of ``probe``."""
 
 
 def ssim(links: Links, labels: Tensor) -> float:
@@ -256,7 +255,7 @@ def tokenize(model: Model, query: Query) -> Tokens:
 
 
 def of_an_anchor(model: Model, query: Query) -> float:
-    """What the token moves by where the last anchor gives way to the next Gaussian, over its RMS spread."""
+    """Change of the token if the next Gaussian replaces the last anchor, over its RMS spread."""
     ga = getattr(model.tokenizer, "ga", model.tokenizer)
     opacities = model.gaussians.opacities.detach()
     fewer = opacities.clone()
@@ -294,7 +293,7 @@ def dimensions(features: Tensor) -> float:
 
 
 def first_layer(model: Model, tokens: Tokens) -> dict[str, float]:
-    """What each token changes in the attenuation branch's first layer from transmitter to transmitter (RMS)."""
+    """RMS change by each token in the attenuation branch's first layer, from transmitter to transmitter."""
     names = ("scene", "transmitters")
     values = [getattr(tokens, name) for name in names]
     parts = model.deformation.attenuation_first.links.weight.split([value.shape[1] for value in values], 1)

@@ -33,14 +33,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from forked import Process
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
 
-from gaigs import checkpoint, runs  # noqa: F401, what a run imports
-from gaigs.evaluation import device_name
-from gaigs.report import curves, room, spectra, style  # noqa: F401, likewise
+from gaigs import __main__ as command_line
+from gaigs import checkpoint, runs  # noqa: F401, imported before the forks
+from gaigs.io.files import write_text
+from gaigs.report import curves, run_figures, style  # noqa: F401, imported before the forks
+from gaigs.report.table import markdown
+from gaigs.runs.evaluation import device_name
 
 RUN = (
     "+experiment=spectrum",
@@ -69,7 +68,7 @@ PHASES = {
     "last.ckpt": "training, kriging",
     "log": "before the first save",
 }
-"""What a run is at, by the first of these that is in its folder; before there is any, it is at its start."""
+"""Phase of a run by the first of these files in its folder; without any it is at the start."""
 
 NAMES = {"kill": "", "disk": "disk full", "files": "files limited in size", "folder": "run folder removed"}
 NAMES |= {"memory": "memory limited", "multirun": "two jobs of `joblib`, "}
@@ -88,7 +87,7 @@ went on in the same folder, once there was room, folder or memory again. It lost
 
 - it ended with the scores, predictions, weights and loss curves of an undisturbed run, to the bit;
 - checkpoints in between were whole, and no half-written file was left;
-- what ended it was told in one sentence.
+- its message was one sentence.
 
 Undisturbed it took {work:.1f} s of one core, and {seconds:.0f} s on a machine shared by others: {device}.
 
@@ -98,6 +97,79 @@ Undisturbed it took {work:.1f} s of one core, and {seconds:.0f} s on a machine s
 - Training lost: seconds from the last save to the fault. `save_every` was 0.5 s; a save waits for the end of a step.
 - SIGKILL and SIGTERM came one after the other in the same folder, in turn.
 {wrong}"""
+
+
+class Process:
+    """The command line in a forked process.
+
+    Args:
+        arguments: Of the command line.
+        says: File for what it says on stderr; the rest goes beside it.
+        before: Called first in the new process.
+    """
+
+    def __init__(self, arguments: Sequence[str], says: Path, before: Callable = lambda: None):
+        self.says, self.code = says.with_name(f"{says.name}.err"), None
+        sys.stdout.flush()
+        self.id = os.fork()
+        if self.id == 0:
+            self._work(arguments, before)
+
+    def _work(self, arguments: Sequence[str], before: Callable) -> None:
+        os.setsid()
+        for number, file in (1, self.says.with_suffix(".out")), (2, self.says):
+            os.dup2(os.open(file, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
+        code = 0
+        try:
+            before()
+            sys.argv = ["gaigs", *arguments]
+            command_line.main()
+        except SystemExit as end:
+            code = end.code or 0
+        except BaseException:
+            sys.excepthook(*sys.exc_info())
+            code = 1
+        finally:
+            with contextlib.suppress(OSError):
+                sys.stdout.flush()
+                sys.stderr.flush()
+            os._exit(code)
+
+    @property
+    def seconds(self) -> float:
+        """Of the processor, so far."""
+        ticks = Path(f"/proc/{self.id}/stat").read_text().rpartition(")")[2].split()[11:13]
+        return sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
+
+    def wait(self, until: Callable[[], bool] = lambda: False) -> bool:
+        """True if it ended before ``until`` was true; a run that takes half an hour hangs."""
+        start = time.monotonic()
+        while self.code is None and not until():
+            done, status = os.waitpid(self.id, os.WNOHANG)
+            self.code = os.waitstatus_to_exitcode(status) if done else None
+            if time.monotonic() > start + 1800:
+                os.killpg(self.id, signal.SIGKILL)
+                raise TimeoutError(f"a run must end within {1800} s, and one did not; see {self.says}")
+            time.sleep(0.002)
+        return self.code is not None
+
+    @property
+    def messages(self) -> list[str]:
+        """Messages on stderr, without the lines that Hydra puts around each."""
+        lines = self.says.read_text().splitlines()
+        return [line for line in lines if line and not line.startswith(("Error executing job", "Set the environment"))]
+
+    @property
+    def end(self) -> str:
+        """How it ended, in words."""
+        if self.code < 0:
+            return signal.Signals(-self.code).name
+        causes = {"enough memory": "not enough memory", "not be written": "could not be written"}
+        causes |= {"was removed": "folder was removed", "stopped": "stopped", "not started": "stopped"}
+        said = next(
+            (name for words, name in causes.items() if any(words in line for line in self.messages)), "no message"
+        )
+        return f"{said}, exit code {self.code}" if self.code else "ended well"
 
 
 @dataclass
@@ -131,7 +203,7 @@ class Soak:
         self.seconds = time.monotonic() - start
         self.work = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
         if process.code:
-            raise SystemExit(f"the undisturbed run must end well, and says {' '.join(process.told)}")
+            raise SystemExit(f"the undisturbed run must end well, and says {' '.join(process.messages)}")
         self.sizes = sorted(path.stat().st_size for path in self.reference.rglob("*") if path.is_file())
 
     def start(self, folder: Path, before: Callable = lambda: None) -> Process:
@@ -157,9 +229,10 @@ class Soak:
     def judge(self, process: Process, phase: str, lost: float | None = None, codes: tuple = (0, 1)) -> Trial:
         """Looks at how a disturbed run has ended."""
         trial = Trial(self.fault, phase, process.end, lost)
-        is_clear = all(line.startswith("gaigs: ") for line in process.told) and len(process.told) == (process.code > 0)
+        messages = process.messages
+        is_clear = all(line.startswith("gaigs: ") for line in messages) and len(messages) == (process.code > 0)
         if process.code not in codes or not is_clear or "no message" in process.end:
-            trial.wrong.append(f"exit code {process.code}, {' '.join(process.told)}")
+            trial.wrong.append(f"exit code {process.code}, {' '.join(process.messages)}")
         self.trials.append(trial)
         return trial
 
@@ -175,7 +248,7 @@ class Soak:
         process = self.start(folder)
         process.wait()
         if process.code:
-            trial.wrong.append(f"going on: exit code {process.code}, {' '.join(process.told)}")
+            trial.wrong.append(f"going on: exit code {process.code}, {' '.join(process.messages)}")
         else:
             trial.wrong += self.differences(folder)
         print(trial, flush=True)
@@ -220,7 +293,7 @@ class Soak:
         folder, numbers, self.moment = self.new_folder(), [signal.SIGKILL, signal.SIGTERM], 0.0
         for number in numbers if self.count % 2 else reversed(numbers):
             process, phase, lost = self.disturbed(folder, lambda p, n=number: os.kill(p.id, n), self.moment)
-            saved = any("after step" in line for line in process.told)
+            saved = any("after step" in line for line in process.messages)
             self.fault = number.name
             trial = self.judge(process, phase, 0.0 if saved else lost, (0, 143, -number))
         self.go_on(folder, trial)
@@ -309,7 +382,7 @@ FAULTS = {
     "memory": (Soak.limit_memory, 6),
     "multirun": (Soak.kill_multirun, 1),
 }
-"""What is tried, in turns, and how often; ``kill`` and ``multirun`` with each of two signals."""
+"""Faults and how often each is tried, in turns; ``kill`` and ``multirun`` with each of two signals."""
 
 
 def untimed(metrics: dict) -> dict:
@@ -334,16 +407,15 @@ def rows(trials: Sequence[Trial]) -> list[list[str]]:
 
 
 def wrong(trials: Sequence[Trial]) -> list[str]:
-    """What went wrong, a line each."""
+    """Defects, a line each."""
     return [f"- {trial.fault}, {trial.phase}: {text}" for trial in trials for text in trial.wrong]
 
 
 def page(soak: Soak, seed: int) -> str:
     """The page of documentation."""
-    head, *body = rows(soak.trials)
     good, device = sum(not trial.wrong for trial in soak.trials), device_name(torch.device("cpu"))
     return PAGE.format(
-        table="\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body)),
+        table=markdown(rows(soak.trials)).rstrip(),
         verdict=f"{good} of {len(soak.trials)} lost nothing",
         wrong="".join(f"{line}\n" for line in wrong(soak.trials)).replace(str(soak.top), "DIR"),
         command=shlex.join(["python", *sys.argv]),
@@ -373,13 +445,8 @@ def main() -> None:
             soak.fault = NAMES[name]
             FAULTS[name][0](soak)
             if options.markdown:
-                with whole(options.markdown) as part:
-                    part.write_text(page(soak, options.seed))
-    head, *body = rows(soak.trials)
-    table = Table(*head, box=SIMPLE_HEAD)
-    for row in body:
-        table.add_row(*row)
-    Console().print(table)
+                write_text(options.markdown, page(soak, options.seed))
+    print(markdown(rows(soak.trials)))
     raise SystemExit("\n".join(wrong(soak.trials)) or 0)
 
 

@@ -12,35 +12,40 @@
 """
 
 import importlib
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gaigs.version import __version__
 
 if TYPE_CHECKING:
+    from gaigs.antenna import Array, Receiver
     from gaigs.checkpoint import load
-    from gaigs.commands import run
     from gaigs.configuration import compose
-    from gaigs.data import Links, links
-    from gaigs.directions import Grid, Rays
-    from gaigs.evaluation import evaluate
-    from gaigs.geometry import Pose
+    from gaigs.data import Links
+    from gaigs.data.links import links
+    from gaigs.geometry import Grid, Pose, Rays
     from gaigs.model import Model
     from gaigs.query import Query
     from gaigs.radio_maps import radio_map
     from gaigs.rasterizer import rasterize
     from gaigs.registry import register, registries
+    from gaigs.runs.evaluation import evaluate
     from gaigs.runs.training import train
-    from gaigs.scene import Array, Receiver, Scene
+    from gaigs.scene import Scene
     from gaigs.task import Metric
 
+log = logging.getLogger(__name__)
+
 PLACES = {
-    "links": "data", "train": "runs.training", "evaluate": "evaluation", "load": "checkpoint",
-    "compose": "configuration", "run": "commands", "rasterize": "rasterizer", "radio_map": "radio_maps",
-    "register": "registry", "registries": "registry", "Model": "model", "Links": "data", "Query": "query",
-    "Grid": "directions", "Rays": "directions", "Receiver": "scene", "Array": "scene", "Pose": "geometry",
-    "Scene": "scene", "Metric": "task",
+    "links": "data.links", "train": "runs.training", "evaluate": "runs.evaluation", "load": "checkpoint",
+    "compose": "configuration", "rasterize": "rasterizer", "radio_map": "radio_maps", "register": "registry",
+    "registries": "registry", "Model": "model", "Links": "data", "Query": "query", "Grid": "geometry",
+    "Rays": "geometry", "Receiver": "antenna", "Array": "antenna", "Pose": "geometry", "Scene": "scene",
+    "Metric": "task",
 }  # fmt: skip
-"""The module of each public name, which is imported when the name is first asked for: torch is slow to import."""
+"""The module of each public name, which is imported when the name is first used: torch is slow to import."""
 
 __all__ = [
     "Array", "Grid", "Links", "Metric", "Model", "Pose", "Query", "Rays", "Receiver", "Scene", "__version__", "compose",
@@ -57,3 +62,73 @@ def __getattr__(name: str):
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *PLACES})
+
+
+def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = ()) -> dict | None:
+    """Executes the command of a configuration, as ``python -m gaigs`` does; resumes a run that was stopped.
+
+    Args:
+        configuration: The result of ``gaigs.compose``.
+        folder: Gets the results; with ``command=train`` the run folder of docs/start.md.
+        overrides: With ``command=benchmark``: further command-line words of each of its trainings.
+
+    Returns:
+        With ``command=train`` the contents of ``metrics.json``, or None in all but the first of several processes.
+        None with the other commands.
+
+    Raises:
+        TypeError: A value of the configuration has the wrong type.
+        ValueError: The configuration does not fit the data, the folder holds another run, or a file in it is damaged.
+        FileNotFoundError: The data do not exist.
+        ImportError: A component needs a package that is not installed.
+        OSError: A file cannot be written, e.g. because the disk is full; no partial file is left.
+        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it and SIGTERM within a training.
+
+    Example:
+        >>> configuration = gaigs.compose("model=knn", "data.transmitters=40", "data.order=0", baselines=["mean"])
+        >>> metrics = gaigs.run(configuration, "runs/room")
+        Test scores
+        ...
+        results: runs/room
+        >>> list(metrics["models"])
+        ['knn', 'mean']
+    """
+    from gaigs import configuration as configurations
+    from gaigs import processes
+
+    if not isinstance(configuration, Mapping):
+        raise TypeError(f"configuration must be the result of gaigs.compose, got {configuration!r:.80}")
+    config, folder = dict(configuration), Path(folder)
+    if config.get("command") == "devices":  # works with any other keys
+        from gaigs.rasterizer.devices import default_device, devices
+
+        names, default = devices(), default_device()
+        for number, name in enumerate(names):
+            print(f"{name}  <- rasterizer=opencl takes this one" if number == names.index(default) else name)
+        return None
+    configurations.check(config)
+    match config["command"]:
+        case "train":
+            processes.check_ranks()  # before Lightning is imported, which reads them
+            from gaigs import runs
+
+            return runs.run(config, folder)
+        case "benchmark":
+            from gaigs.registry import registry
+
+            limits = {key: config["benchmark"].get(key) for key in ("minutes", "device")}
+            options = {key: value for key, value in config["benchmark"].items() if key not in limits}
+            with processes.limited_threads(config["threads"]):
+                benchmark = registry("benchmark").build(options)
+                folder.mkdir(parents=True, exist_ok=True)
+                with processes.only_run(folder):
+                    benchmark.run(folder, overrides, **limits)
+            log.info("results: %s", folder)
+        case "agreement":
+            from gaigs import agreement
+
+            with processes.limited_threads(config["threads"]):
+                agreement.run(config, folder)
+        case unknown:
+            raise ValueError(f"command must be train, benchmark, agreement or devices, got {unknown!r}")
+    return None

@@ -1,6 +1,5 @@
-"""Checkpoints that are complete: configuration, scene, split and weights in one file, loaded without the data."""
+"""Complete checkpoints: configuration, scene, split and weights in one file, loaded without the data."""
 
-import contextlib
 import hashlib
 import io
 import os
@@ -11,8 +10,6 @@ from zipfile import ZipFile
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map_only
 
 from gaigs.io.files import atomic_write
 from gaigs.processes import lacks_memory
@@ -20,95 +17,79 @@ from gaigs.registry import check_type, configuration_of, name_of, registry
 from gaigs.scene import Scene
 
 KEY = "gaigs"
-"""Where our part stands in a Lightning checkpoint."""
+"""Key of gaigs's entries in a Lightning checkpoint."""
 
 VERSION = 2
-"""Of our part. Version 1 had no seal. Version 0, which had no number, is read too: see ``_from_version_0``."""
+"""The only format that is read."""
 
 SEAL = b"gaigs sha256 "
-"""What stands before a file's last bytes: the digest of all that is before it. Both are the comment of the zip archive
-that ``torch.save`` writes, so the file stays one."""
+"""Precedes the file's last bytes, the digest of all before it. Both are the comment of the zip archive that
+``torch.save`` writes, so the file stays an archive."""
 
 DIGEST = 2 * hashlib.sha256().digest_size
-"""Bytes of the digest, in hexadecimal digits."""
-
-ROOM, TIMES = 2**30, 16
-"""What may be allocated to make a model: so many bytes, and so many times the size of its file."""
-
-LEAST = 2**16
-"""What a tensor counts at least towards that [bytes], so that a file cannot ask for layers without end either."""
+"""Length of the digest in hexadecimal digits."""
 
 
 def seal(path: Path) -> None:
-    """Ends a file of ``torch.save`` in its seal, by which ``read`` finds any bit that changes later."""
+    """Appends the seal to a file of ``torch.save``, by which ``read`` detects any changed bit."""
     content = path.read_bytes()
     sealed = content[:-2] + (len(SEAL) + DIGEST).to_bytes(2, "little") + SEAL  # the length of the archive's comment
     path.write_bytes(sealed + hashlib.sha256(sealed).hexdigest().encode())
 
 
 def write(content: dict, path: Path) -> None:
-    """Writes a checkpoint, sealed, whole or not at all.
+    """Writes a sealed checkpoint by ``atomic_write``.
 
     Raises:
-        OSError: It cannot be written, e.g. as the disk is full; what was there before stands.
+        OSError: It cannot be written, e.g. because the disk is full; the old file stays.
     """
     with atomic_write(path) as part:
-        file = io.BytesIO()  # given a real one, torch would hide that its disk is full
+        file = io.BytesIO()  # with a real file torch hides that the disk is full
         torch.save(content, file)
         part.write_bytes(file.getvalue())
         seal(part)
 
 
 def read(path: str | Path) -> dict:
-    """A checkpoint's content; nothing but tensors and plain Python can come out of it.
-
-    A file in which a single bit has changed is refused by its seal. Files of versions 0 and 1 have none: of them the
-    check sums are looked at that torch writes, and does not look at.
+    """The content of a checkpoint: tensors and plain Python only.
 
     Raises:
-        TypeError: The path is none.
-        FileNotFoundError: There is no such file.
-        ValueError: It is no checkpoint of gaigs, not a whole one, or of a later version.
+        TypeError: The path is not a path.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is not a checkpoint of gaigs, is damaged, or has another format.
     """
     if not isinstance(path, os.PathLike):
         check_type("the path of a checkpoint", path, Path)
     path = Path(path)
     if not os.path.isfile(path):  # Path.is_file raises where a name is too long
-        raise FileNotFoundError(f"no checkpoint at {path}; a run leaves best.ckpt and last.ckpt in its folder")
+        raise FileNotFoundError(f"no checkpoint at {path}; a run writes best.ckpt and last.ckpt into its folder")
     data = path.read_bytes()
     try:
-        is_sealed = _is_sealed(data)
+        _check_seal(data)
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever archive readers and unpicklers meet; torch's own words advise to run its code
-        if lacks_memory(error):  # which says nothing of the file
+    except Exception as error:  # any error of zip readers and unpicklers; torch's own message advises to run code
+        if lacks_memory(error):
             raise
         raise ValueError(
-            f"{path} must be a checkpoint of gaigs, and is damaged or another file; take another copy of it, or do the "
-            "run anew"
+            f"{path} is damaged, or no checkpoint of this version of gaigs\ntake another copy, or train again"
         ) from None
     part = content.get(KEY) if isinstance(content, dict) else None
     if not isinstance(part, dict):
-        raise ValueError(f"{path} must be a checkpoint of gaigs, and lacks the entry {KEY!r}")
-    version = part.get("version", 0)
-    if not isinstance(version, int) or version < 0:
-        raise ValueError(f"{path} must be of a version from 0 to {VERSION}, got {version!r}; take another copy of it")
-    if version > VERSION:
-        raise ValueError(f"{path} must be of version {VERSION} or earlier, got {version}; update gaigs")
-    if version > 1 and not is_sealed:
+        raise ValueError(f"{path} is no checkpoint of gaigs: it lacks the entry {KEY!r}")
+    if part.get("version") != VERSION:
         raise ValueError(
-            f"{path} must end in its seal, and has none: it is damaged, or another program has written it; take the "
-            "file as the run left it, or write it by gaigs.checkpoint.write"
+            f"{path} has checkpoint format {part.get('version')!r}, and this gaigs reads format {VERSION} only\n"
+            "load it with the gaigs that wrote it, or train again"
         )
     needed = {"state_dict": content, "model": part, "scene": part}
     lacking = [name for name, there in needed.items() if not isinstance(there.get(name), dict)]
     if lacking:
-        raise ValueError(f"{path} must be a whole checkpoint of gaigs, and lacks {', '.join(lacking)}; do the run anew")
+        raise ValueError(f"{path} is no complete checkpoint: it lacks {', '.join(lacking)}\ntrain again")
     for name, value in [*_tensors(content["state_dict"], "weights"), *_tensors(part["scene"], "scene")]:
         is_plain = value.layout == torch.strided and value.device.type == "cpu"
         if not is_plain or value.nbytes > value.untyped_storage().nbytes():
-            raise ValueError(f"{path} must hold its tensors whole, and of {name} it holds less than its shape says")
-    with _blaming(path):
-        return content if version else _from_version_0(content)
+            raise ValueError(f"{path} is damaged: {name} holds fewer numbers than its shape says")
+    return content
 
 
 def save(model: nn.Module, path: str | Path) -> None:
@@ -127,15 +108,15 @@ def load(path: str | Path) -> nn.Module:
     """The model of a checkpoint, ready to predict; needs neither data nor Hydra.
 
     Args:
-        path: A file ``best.ckpt`` or ``last.ckpt`` of a run, or what ``Model.save`` wrote.
+        path: ``best.ckpt`` or ``last.ckpt`` of a run, or a file of ``Model.save``.
 
     Returns:
         The model in evaluation mode, on the CPU: ``load(path).predict(transmitters)``.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is no checkpoint of gaigs, or damaged; its components are not installed here; its weights are not
-            theirs, or not finite; or the model would be far larger than the file.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is damaged or of another format, a component is not installed, or the weights do not fit
+            the configuration or are not finite.
         ImportError: A component cannot be imported.
 
     Example:
@@ -146,79 +127,58 @@ def load(path: str | Path) -> nn.Module:
     """
     content = read(path)
     weights, scene = content["state_dict"], content[KEY]["scene"]
-    with _blaming(path), _Bounded(ROOM + TIMES * Path(path).stat().st_size):
+    try:
         consume_prefix_in_state_dict_if_present(weights, "model.")
         _check_finite("scene", scene)
         model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(scene))
         unset = {name for name, value in model.state_dict().items() if not value.isfinite().all()}
-        try:
-            model.load_state_dict(weights)
-        except RuntimeError as error:  # one line a tensor
-            raise ValueError(f"its weights are not those of its configuration: {error}") from error
+        model.load_state_dict(weights)
         _check_finite("weights", {name: value for name, value in weights.items() if name not in unset})
+    except Exception as error:  # any error of a constructor with damaged options
+        if lacks_memory(error):
+            raise
+        cause = str(error) if isinstance(error, ValueError | ImportError) else f"{type(error).__name__}: {error}"
+        message = f"cannot make the model of {path}: {' '.join(cause.split())}"
+        raise (ImportError if isinstance(error, ImportError) else ValueError)(message) from error
     return model.eval()
 
 
 def trained_weights(content: dict) -> dict:
-    """The weights of the training module in a checkpoint, without what was kriged on top of it."""
+    """The weights of the training module in a checkpoint, before and after ``exchange_model``."""
     weights = content["state_dict"]
-    if content[KEY]["model"]["name"] != "kriging":
+    if "trained" not in content[KEY]:
         return weights
-    trend = "model.trend."
-    return {f"model.{key.removeprefix(trend)}": value for key, value in weights.items() if key.startswith(trend)}
+    part = f"model.{content[KEY]['trained']}."
+    return {f"model.{key.removeprefix(part)}": value for key, value in weights.items() if key.startswith(part)}
 
 
-def exchange_model(path: Path, model: nn.Module) -> None:
-    """Puts another model into a checkpoint, whole or not at all.
+def exchange_model(path: Path, model: nn.Module, trained: str) -> None:
+    """Replaces the model of a checkpoint, whole or not at all.
 
     Args:
         path: The file, which is rewritten.
-        model: In its place, of the same scene.
+        model: The new model, of the same scene.
+        trained: Name of the part of it that is the model of the training.
     """
     content = read(path)
-    content[KEY] |= {"version": VERSION, "model": configuration_of(model)}
+    content[KEY] |= {"version": VERSION, "model": configuration_of(model), "trained": trained}
     content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
     write(content, path)
 
 
-def _from_version_0(content: dict) -> dict:
-    """The splatting pipeline's parts had other names: mapping, the map's grid in the model, reference."""
-    part = content[KEY]
-    model = dict(part["model"])
-    if "mapping" in model:
-        model["deformation"] = {"name": "two_branch", **model.pop("mapping")}
-        model["placement"] = {"name": "free"}
-        model["trend"] = model.pop("reference")
-        grid = model.pop("grid")
-        if grid is not None:
-            model["pooling"] = {**model["pooling"], "grid": grid}
-    names = {"model.mapping.": "model.deformation.", "model.reference.": "model.trend."}
-    weights = {}
-    for key, value in content["state_dict"].items():
-        for old, new in names.items():
-            key = new + key.removeprefix(old) if key.startswith(old) else key
-        weights[key] = value
-    return content | {KEY: part | {"model": model}, "state_dict": weights}
-
-
-def _is_sealed(data: bytes) -> bool:
-    """Whether a file has a seal, which a version 2 must have.
+def _check_seal(data: bytes) -> None:
+    """Checks the digest of a file, and that its archive does not unpack to more than the file.
 
     Raises:
-        ValueError: It is damaged, or would unpack to more than it is.
-        zipfile.BadZipFile: It is damaged, or no file of ``torch.save``.
+        ValueError: The file is damaged, or has no seal.
+        zipfile.BadZipFile: The file is no archive.
     """
     sealed, digest = data[:-DIGEST], data[-DIGEST:]
-    is_sealed = sealed.endswith(SEAL)
-    if is_sealed and hashlib.sha256(sealed).hexdigest().encode() != digest:
+    if not sealed.endswith(SEAL) or hashlib.sha256(sealed).hexdigest().encode() != digest:
         raise ValueError("another digest")
     with ZipFile(io.BytesIO(data)) as archive:
-        parts = archive.infolist()
-        if sum(part.file_size for part in parts) > len(data):
-            raise ValueError("more than it is")
-        for part in [] if is_sealed else parts:
-            archive.read(part)  # which looks at its check sum
-    return is_sealed
+        if sum(part.file_size for part in archive.infolist()) > len(data):
+            raise ValueError("a compressed archive")
 
 
 def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
@@ -233,52 +193,4 @@ def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
 def _check_finite(name: str, value: object) -> None:
     for place, tensor in _tensors(value, name):
         if not tensor.isfinite().all():
-            raise ValueError(f"{place} must be finite, and is not; take another copy of the file, or do the run anew")
-
-
-@contextlib.contextmanager
-def _blaming(path: str | Path) -> Iterator[None]:
-    """Turns whatever a file's content leads to into one sentence that names the file."""
-    try:
-        yield
-    except Exception as error:  # whatever constructors make of what they were not written for
-        if lacks_memory(error):
-            raise
-        cause = str(error) if isinstance(error, ValueError | ImportError) else f"{type(error).__name__}: {error}"
-        told = f"{path} must hold a model that can be made here, and does not: {' '.join(cause.split())}"
-        raise (ImportError if isinstance(error, ImportError) else ValueError)(told) from error
-
-
-class _Bounded(TorchDispatchMode):
-    """Refuses, before memory is taken, tensors beyond what the file of a model explains.
-
-    Args:
-        limit: Of all tensors that are made [bytes].
-    """
-
-    def __init__(self, limit: int):
-        super().__init__()
-        self.limit, self.made = limit, 0
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        self.made += self._size(function, args, kwargs or {})
-        if self.made > self.limit:
-            raise ValueError(
-                f"its configuration asks for more than {self.limit:.3g} bytes, which its weights do not fill"
-            )
-        return function(*args, **(kwargs or {}))
-
-    @staticmethod
-    def _size(function, args: tuple, kwargs: dict) -> int:
-        """Bytes that an operation takes, from its shapes alone; 0 for a view and where shapes alone do not say it."""
-        schema = function._schema
-        if any(result.alias_info for result in schema.returns):
-            return 0
-        args, kwargs = tree_map_only(Tensor, lambda value: value.to("meta"), (args, kwargs))
-        if any(argument.name == "device" for argument in schema.arguments):
-            kwargs |= {"device": "meta"}
-        try:
-            made = function(*args, **kwargs)
-        except Exception:  # values count
-            return 0
-        return sum(max(LEAST, value.nbytes) for value in tree_leaves(made) if isinstance(value, Tensor))
+            raise ValueError(f"{place} is not finite")

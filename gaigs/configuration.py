@@ -1,7 +1,8 @@
-"""Where Hydra finds gaigs's configuration files and those of plug-ins, and how two configurations differ."""
+"""Configurations: the files that Hydra joins, the check of the result, and the message of an error in it."""
 
 import hashlib
 import logging
+import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
@@ -10,6 +11,7 @@ from pathlib import Path
 import hydra
 from hydra import initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
@@ -31,43 +33,37 @@ log = logging.getLogger(__name__)
 HARMLESS = (
     "command", "save_every", "tensorboard", "threads", "trainer.enable_progress_bar", "trainer.enable_model_summary"
 )  # fmt: skip
-"""Keys that change nothing of what a run finds: one that goes on may have others."""
+"""Keys that change no result: a run may be resumed with other values."""
 
-MAY_BE_NULL = ("gaussians", "density", "benchmark")
-"""Choices that a configuration may be without."""
+MAY_BE_NULL = ("gaussians", "density", "benchmark", "projection", "rasterizer")
+"""Optional parts."""
 
 KEYS = {
     **dict.fromkeys((*KINDS, "trainer"), dict), **dict.fromkeys(MAY_BE_NULL, dict | None),
-    "kriging": bool, "kriging_folds": int, "baselines": list[dict], "command": str, "seed": int, "save_every": float,
-    "tensorboard": bool, "threads": int | None,
+    "kriging": bool, "kriging_fallback": dict | None, "baselines": list[dict], "command": str, "seed": int,
+    "save_every": float, "tensorboard": bool, "threads": int | None,
 }  # fmt: skip
-"""What stands at the top of a configuration, and of which type it is."""
-
-TASK_KEYS = {"name": str, "trend": dict | None, "baselines": list[dict]}
-"""The same under ``task``, of which all but the name may be missing."""
+"""Top-level keys and their types."""
 
 CHOSEN = (*KINDS, "gaussians", "density", "trainer")
-"""Keys of which each is a choice of one file or component."""
+"""Keys that choose one file or component."""
 
 CONSTRUCTED = tuple(kind for kind in KINDS if kind not in ("task", "training", "benchmark"))
-"""Kinds whose components need no configuration file: their constructors say what there is to set."""
-
-LONGEST = 200
-"""Bytes in the name of a job's folder; most file systems end at 255."""
+"""Kinds whose components need no configuration file: the options are read from their constructors."""
 
 
 def conf_dir() -> Path:
-    """The folder of gaigs's own configuration: inside the package where it is installed, beside it in a checkout."""
+    """The folder of gaigs's own configuration: in the installed package, or beside the package in a checkout."""
     here = Path(__file__).parent
     packaged = here / "conf"
     return packaged if packaged.is_dir() else here.parent / "conf"
 
 
 def plugin_conf_dirs() -> list[Path]:
-    """The conf folders of plug-ins, each with ``<kind>/<name>.yaml`` inside.
+    """The conf folders of plug-ins, which hold ``<kind>/<name>.yaml``; no plug-in is imported.
 
-    They are ``plugins/conf``, ``plugins/<folder>/conf``, and ``<package>/conf`` of every package that an entry point of
-    ours points into. No plug-in is imported.
+    They are ``plugins/conf``, ``plugins/<folder>/conf``, and ``<package>/conf`` of each package with an entry point of
+    gaigs.
     """
     folders = [*Path.cwd().glob("plugins/conf"), *sorted(Path.cwd().glob("plugins/[!_.]*/conf"))]
     for holder in (holder for kind in KINDS for holder in find_holders(kind)[0]):
@@ -77,10 +73,7 @@ def plugin_conf_dirs() -> list[Path]:
 
 
 class PluginConfigurations(SearchPathPlugin):
-    """Puts the conf folders of plug-ins behind gaigs's own, so that none of them replaces a file of ours.
-
-    Behind them all comes for each component its constructor: the options with their defaults.
-    """
+    """Hydra's search path: gaigs's own files, then those of plug-ins, then the constructors of components."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in plugin_conf_dirs():
@@ -89,7 +82,7 @@ class PluginConfigurations(SearchPathPlugin):
 
 
 class Constructors(ConfigSource):
-    """What Hydra finds where a component has no file: ``name``, and its constructor's options with their defaults."""
+    """The configuration of a component without a file: ``name``, and its constructor's options with defaults."""
 
     def __init__(self, provider: str, path: str):
         super().__init__(provider, path)
@@ -118,30 +111,25 @@ class Constructors(ConfigSource):
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
         files: list[str] = []
-        known = (
-            CONSTRUCTED
-            if config_path == ""
-            else [key.split("/")[1] for key in self.found if key.startswith(f"{config_path}/")]
-        )
-        for name in known:
-            name = name if config_path == "" else f"{name}.yaml"
+        components = [f"{name}.yaml" for kind, name in self.found.values() if kind == config_path]
+        for name in components if config_path else CONSTRUCTED:
             self._list_add_result(files, f"{config_path}/{name}".strip("/"), name, results_filter)
         return sorted(set(files))
 
 
 def differences(there: dict, here: dict) -> dict[str, tuple]:
-    """What two resolved configurations have at the keys, joined by dots, in which their runs may differ; sorted."""
+    """The values of two configurations at the keys in which they differ, joined by dots and sorted."""
     there, here = _flat(there), _flat(here)
     keys = sorted((there.keys() | here.keys()) - set(HARMLESS))
     return {key: (there.get(key), here.get(key)) for key in keys if there.get(key) != here.get(key)}
 
 
 def check(config: dict) -> None:
-    """Sees to it that a configuration has the keys that there are, and no others, with values that suit them.
+    """Checks the keys of a configuration and their values.
 
     Raises:
-        TypeError: A value is not of its key's type.
-        ValueError: A key is unknown or missing, or its value out of range.
+        TypeError: A value has the wrong type.
+        ValueError: A key is unknown or missing, or a value out of range.
     """
     if unknown := [key for key in config if key not in KEYS]:
         listed = ", ".join(sorted(KEYS))
@@ -156,13 +144,15 @@ def check(config: dict) -> None:
             "add command=benchmark, or leave out the benchmark"
         )
     if config.get("benchmark") is None and config["command"] == "benchmark":
-        raise ValueError("command=benchmark needs a benchmark, and it was left out; add benchmark=all")
+        raise ValueError("command=benchmark needs a benchmark; add benchmark=accuracy, budgets, rasterizer or step")
     for kind in KINDS[: KINDS.index("benchmark")]:
-        check_type(f"{kind}.name", config[kind].get("name"), str)
+        if config.get(kind) is not None:
+            check_type(f"{kind}.name", config[kind].get("name"), str)
+    task_keys = {"name": str, "trend": dict | None, "baselines": list[dict | str]}
     for key, value in config["task"].items():
-        if key not in TASK_KEYS:
-            raise ValueError(f"task has no key {suggest(key, TASK_KEYS)}; it has: {', '.join(TASK_KEYS)}")
-        check_type(f"task.{key}", value, TASK_KEYS[key])
+        if key not in task_keys:
+            raise ValueError(f"task has no key {suggest(key, task_keys)}; it has: {', '.join(task_keys)}")
+        check_type(f"task.{key}", value, task_keys[key])
     if not 0 <= config["seed"] < 2**32:
         raise ValueError(f"seed must be in 0..{2**32 - 1}, got {config['seed']}")
     if config["save_every"] < 0:
@@ -170,20 +160,20 @@ def check(config: dict) -> None:
 
 
 def compose(*overrides: str, **options) -> dict:
-    """The whole configuration of a run, as the command line makes it: presets, then overrides, then options.
+    """The configuration of a run, as the command line makes it: presets, then overrides, then options.
 
     Args:
-        overrides: Words of the command line, e.g. ``"+experiment=mirrored"`` or ``"trainer.max_steps=300"``.
-        options: Values by their keys, ``**{"trainer.max_steps": 300}``, or by an option's name alone where only one
-            part has it, ``max_steps=300``. A part is chosen by its name, ``tokenizer="ga"``, by a mapping with a name
-            and options, or by an object.
+        overrides: Command-line words, e.g. ``"+experiment=mirrored"`` or ``"trainer.max_steps=300"``.
+        options: Values by their keys, ``**{"trainer.max_steps": 300}``, or by an option's name alone if only one part
+            has it, ``max_steps=300``. A part is chosen by its name, ``tokenizer="ga"``, by a mapping with a name and
+            options, or by an object.
 
     Returns:
-        Plain dictionaries, lists, numbers and strings: what ``gaigs.run`` takes.
+        Plain dictionaries, lists, numbers and strings: the argument of ``gaigs.run``.
 
     Raises:
-        TypeError: A value is not of its key's type.
-        ValueError: A word or an option is unknown, a value out of range, or one that must be given is missing.
+        TypeError: A value has the wrong type.
+        ValueError: A word or an option is unknown, a value is out of range, or a mandatory value is missing.
 
     Example:
         >>> configuration = gaigs.compose("+experiment=mirrored", "trainer.max_steps=300", planes=8)
@@ -194,7 +184,7 @@ def compose(*overrides: str, **options) -> dict:
 
 
 def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str] = ()) -> dict:
-    """As ``compose``; with sections, the options are those of these alone."""
+    """Like ``compose``; with sections, options are looked up in these sections only."""
     choices, values = _choices(options)
     running = GlobalHydra.instance()
     before = running.hydra
@@ -202,59 +192,59 @@ def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str]
         str(conf_dir()) in str(element.path) for element in running.config_loader().get_search_path().get_path()
     )
     try:
-        if is_ours:  # Hydra's main, which allows no other
+        if is_ours:  # within a run of the command line, where Hydra allows no second instance
             config = hydra.compose("config", [*overrides, *choices])
         else:
             running.clear()
             with initialize_config_dir(str(conf_dir()), version_base="1.3"):
                 config = hydra.compose("config", [*overrides, *choices])
     except Exception as error:
-        if not isinstance(error, HydraException | OmegaConfBaseException | ValueError) and not is_composing(error):
+        message = explain(error)
+        if message is None:
             raise
-        raise ValueError(explain(error)) from None
+        raise ValueError(message) from None
     finally:
         GlobalHydra.instance().hydra = before
     for key, value in values.items():
-        is_new = key.startswith("+") or key in CHOSEN  # what a part has, its constructor knows
+        is_new = key.startswith("+") or key in CHOSEN  # a part's constructor knows its keys
         path = _path(config, key, sections)
         OmegaConf.update(config, path, value, merge=isinstance(value, Mapping), force_add=is_new)
-    return resolve(config)
+    plain = resolve(config)
+    check(plain)
+    return plain
 
 
 def has_file(kind: str, name: str) -> bool:
-    """Whether there is a configuration file of that kind and name, ours or a plug-in's."""
+    """True if gaigs or a plug-in has a configuration file of that kind and name."""
     return any((folder / kind / f"{name}.yaml").is_file() for folder in (conf_dir(), *plugin_conf_dirs()))
 
 
 def preset(model: str, task: str) -> list[str]:
-    """The command line's words for a model and the task of its links.
-
-    That is the experiment of the model, of the model and the task, or, of GAI-GS, of the task, where there is one.
-    """
+    """The command-line words for a model and a task, with their experiment if there is one."""
     names = (task,) if model == "gaigs" else (f"{model}_{task}", model)
     experiment = [f"+experiment={name}" for name in names if has_file("experiment", name)][:1]
     return [*experiment, f"model={model}", *([f"task={task}"] if has_file("task", task) else [])]
 
 
 def resolve(config: DictConfig) -> dict:
-    """A composed configuration in plain dictionaries, checked.
+    """A composed configuration in plain dictionaries, unchecked; a baseline's name becomes its configuration.
 
     Raises:
-        TypeError: A value is not of its key's type.
-        ValueError: It is not complete, a key is unknown, or a value out of range.
+        ValueError: A mandatory value or the key of a reference is missing.
     """
     try:
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         raise ValueError(f"{error.full_key} must be given, as it has no default; add {error.full_key}=...") from None
     except OmegaConfBaseException as error:
-        raise ValueError(f"the configuration is not complete\n{error}") from error
-    check(plain)
+        raise ValueError(f"the configuration is not complete: {' '.join(str(error).split())}") from error
+    if isinstance(plain.get("baselines"), list):
+        plain["baselines"] = [{"name": base} if isinstance(base, str) else base for base in plain["baselines"]]
     return plain
 
 
 def _choices(options: Mapping) -> tuple[list[str], dict]:
-    """Of options the words that choose a part, and the values to be set then."""
+    """The command-line words that choose parts, and the values of all other options."""
     choices, values = [], {}
     for key, value in options.items():
         value = storable(value, key)
@@ -273,10 +263,10 @@ def _choices(options: Mapping) -> tuple[list[str], dict]:
 
 
 def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
-    """The key that a name stands for: itself if there are dots in it or it stands at the top, else where a part has it.
+    """The full key of an option: the name itself if it has dots or is a top-level key, else the part's key.
 
     Raises:
-        ValueError: There is no such key, or several parts have one.
+        ValueError: No part has such a key, or several have.
     """
     is_new, name = name.startswith("+"), name.removeprefix("+")
     plain = OmegaConf.to_container(config)
@@ -292,19 +282,17 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
     if name in CHOSEN:
         return name
     if "." in name or name in plain:
+        place, _, last = name.rpartition(".")
         parent = plain
-        for part in name.split(".")[:-1]:
+        for part in filter(None, place.split(".")):
             parent = parent.get(part) if isinstance(parent, dict) else None
-        if not is_new and (not isinstance(parent, dict) or name.rpartition(".")[2] not in parent):
-            has = parent if isinstance(parent, dict) else ()
-            raise ValueError(
-                f"{name.rpartition('.')[0]} has no key {suggest(name.rpartition('.')[2], has)}; it has: "
-                f"{', '.join(sorted(has)) or 'none'}"
-            )
+        has = parent if isinstance(parent, dict) else {}
+        is_open = isinstance(parent, dict) and OmegaConf.is_struct(OmegaConf.select(config, place)) is False
+        if not (is_new or last in has or is_open):
+            raise ValueError(f"{place} has no key {suggest(last, has)}; it has: {_listed(sorted(has)) or 'none'}")
         return name
     found = {key for key in _options(plain, "") if key.rpartition(".")[2] == name}
-    # The model is joined from the parts; of its own options none is another's.
-    found = found & {f"model.{name}"} or found
+    found = found & {f"model.{name}"} or found  # a model's own option wins over those of its parts
     if len(found) == 1:
         return found.pop()
     if found:
@@ -317,7 +305,7 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
 
 
 def _options(config: Mapping, prefix: str) -> Iterator[str]:
-    """Keys of all options of parts; what parts are made of others refers to them by ${...}."""
+    """Keys of all options of parts; a reference ${...} to another part is left out."""
     for key, value in config.items():
         is_part = isinstance(value, Mapping) and (not prefix or "name" in value)
         if is_part and key not in ("data", "split", "task"):
@@ -326,56 +314,65 @@ def _options(config: Mapping, prefix: str) -> Iterator[str]:
             yield f"{prefix}{key}"
 
 
-def is_composing(error: Exception) -> bool:
-    """Whether an error came up while Hydra read configuration files and joined them, and not in a job."""
-    return any(frame.name == "load_configuration" for frame in traceback.extract_tb(error.__traceback__))
-
-
-def unreadable() -> str | None:
-    """What is wrong with the first configuration file that cannot be read, in one sentence; None where all can."""
-    for file in (file for folder in (conf_dir(), *plugin_conf_dirs()) for file in sorted(folder.rglob("*.yaml"))):
-        try:
-            OmegaConf.load(file)
-        except Exception as error:  # whatever YAML meets
-            if getattr(error, "errno", None) is not None:  # of the system, and not of what is in the file
-                continue
-            cause = " ".join(str(error).split())
-            return f"{file} must be a YAML file in UTF-8, and is none ({cause}); mend it, or take it away"
-    return None
-
-
-def explain(error: Exception) -> str:
-    """What is wrong with a command line of which Hydra makes no configuration, in one sentence."""
+def explain(error: Exception) -> str | None:
+    """The message of an error of a job or of a command line that Hydra cannot compose; None for any other error."""
+    is_known = isinstance(error, HydraException | OmegaConfBaseException | ValueError)
+    is_composing = any(frame.name == "load_configuration" for frame in traceback.extract_tb(error.__traceback__))
+    of_system = isinstance(error, MemoryError) or getattr(error, "errno", None) is not None
+    if not is_known and (of_system or not is_composing):
+        return None
     cause = error.__cause__
     match error, cause:
         case _, ConfigAttributeError(full_key=str(key)) | ConfigKeyError(full_key=str(key)):
+            place, _, word = key.rpartition(".")
             has = [str(name) for name in cause.parent_node]
-            place = key.rpartition(".")[0] or "the configuration"
-            word = suggest(key.rpartition(".")[2], has)
-            return f"{place} has no key {word}; it has: {', '.join(sorted(has)) or 'none'}"
+            told = f"{place or 'the configuration'} has no key {suggest(word, has)}; it has: {_listed(sorted(has))}"
+            # Hydra composes the defaults of a sweep first, and then each job: all of them must have the key.
+            return f"{told}\nin a sweep over parts that lack it write ++{key}=VALUE" if is_multirun() else told
         case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:
             kind, _, name = file.rpartition("/")
             packages = OmegaConf.load(conf_dir() / "published.yaml").packages if kind == "model" else {}
             if name in packages:
                 package, folder = packages[name], packages[name].removeprefix("gaigs-").replace("-", "_")
                 return (
-                    f"there is no {kind} {name!r} here: it is in the package {package}; pip install {package}, or of a "
-                    f"copy of the repository pip install plugins/{folder}"
+                    f"model {name!r} is in the package {package}, which is not installed\n"
+                    f"pip install {package}, or in a copy of the repository pip install plugins/{folder}"
                 )
-            return f"there is no {kind} {suggest(name, names)}; there are: {', '.join(names) or 'none'}"
-        case HydraException(), _ if str(error).startswith("gaigs: "):  # of a job, which says itself what is wrong
+            return f"there is no {kind} {suggest(name, names)}; there are: {_listed(names)}"
+        case HydraException(), _ if str(error).startswith("gaigs: "):  # the message of a job
             reason = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
             return f"{str(error).removeprefix('gaigs: ')}{reason}"
         case HydraException(), _:
             words = " ".join(f"{error} {cause or ''}".split())
             return f"Hydra cannot read it: {words}"
         case _ if not str(error).startswith("Config group"):
-            words = " ".join(str(error).split())
-            about = "; its files may not choose each other in a circle" if isinstance(error, RecursionError) else ""
-            cannot = f"Hydra cannot join command line and configuration files ({words}){about}; mend what is your own"
-            return unreadable() or cannot
-        case _:  # of null, or a number, for a group
-            return f"a word on the command line that chooses a file must be its name ({error}); ~density chooses none"
+            about = "; its files choose each other in a circle" if isinstance(error, RecursionError) else ""
+            told = f"Hydra cannot join command line and configuration files ({' '.join(str(error).split())}){about}"
+            return _unreadable() or told
+        case _:  # null or a number as a file's name
+            return f"a part is chosen by the name of its file ({error}); ~density leaves it out"
+
+
+def _unreadable() -> str | None:
+    """The message for the first configuration file that cannot be parsed; None if all can."""
+    for file in (file for folder in (conf_dir(), *plugin_conf_dirs()) for file in sorted(folder.rglob("*.yaml"))):
+        try:
+            OmegaConf.load(file)
+        except UnicodeDecodeError:
+            return f"cannot parse {file}: not UTF-8"
+        except Exception as error:  # any error of the YAML parser
+            if getattr(error, "errno", None) is None:
+                return f"cannot parse {file}: {' '.join(str(error).split())}"
+    return None
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+def is_multirun() -> bool:
+    """True if the command line asks for a sweep."""
+    return any(word in ("-m", "--multirun") for word in sys.argv)
 
 
 def _flat(config: dict, prefix: str = "") -> dict:
@@ -387,16 +384,16 @@ def _flat(config: dict, prefix: str = "") -> dict:
 
 
 def run_folder(overrides: str) -> str:
-    """The name of a job's folder from its overrides: one folder, whatever is in them, and no longer than allowed."""
+    """The folder name of a job from its overrides, at most 200 bytes; most file systems allow 255."""
     name = overrides.replace("/", "_") or "defaults"
-    if name == overrides and len(name.encode()) <= LONGEST:
+    if name == overrides and len(name.encode()) <= 200:
         return name
     digest = hashlib.sha256(overrides.encode()).hexdigest()[:12]
-    return name.encode()[: LONGEST - len(digest) - 1].decode(errors="ignore") + "-" + digest
+    return name.encode()[:187].decode(errors="ignore") + "-" + digest
 
 
 def installed(*names: str) -> str:
-    """Those models of a list that are installed, as a sweep takes them; the log tells of the others."""
+    """The installed models of a list, joined by commas for a sweep; the log names the others."""
     holders, _ = find_holders("model")
     known = {holder.name for holder in holders}
     if missing := [name for name in names if name not in known]:
@@ -405,7 +402,7 @@ def installed(*names: str) -> str:
 
 
 def known(kind: str, name: str, otherwise: str) -> str:
-    """A name of a kind where a configuration file or a component has it, and else another: for choices by task."""
+    """The name if a configuration file or a component has it, else the other one: for choices by task."""
     return name if has_file(kind, name) or name in registry(kind).names() else otherwise
 
 
@@ -415,7 +412,7 @@ def by_task(values: Mapping, otherwise: object, *, _root_: DictConfig) -> object
 
 
 def launcher(name: str) -> str:
-    """A launcher that joblib is needed for, where it is installed; else Hydra's own, which runs job by job."""
+    """The launcher if joblib is installed, else Hydra's own, which runs one job at a time."""
     try:
         metadata.version("hydra-joblib-launcher")
     except metadata.PackageNotFoundError:
@@ -429,6 +426,8 @@ OmegaConf.register_new_resolver("installed", installed, replace=True, use_cache=
 OmegaConf.register_new_resolver("known", known, replace=True)
 OmegaConf.register_new_resolver("by_task", by_task, replace=True)
 OmegaConf.register_new_resolver("launcher", launcher, replace=True)
+# Hydra refuses a new key on the command line, but for those of a mapping that says it takes them.
+ConfigStore.instance().store(name="open", node=OmegaConf.create({}, flags={"struct": False}))
 if PluginConfigurations not in Plugins.instance().discover(SearchPathPlugin):
     Plugins.instance().register(Constructors)
     Plugins.instance().register(PluginConfigurations)

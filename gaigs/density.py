@@ -1,6 +1,6 @@
-"""Density control: prune, clone and split Gaussians, keeping the optimizer's memory of those that stay.
+"""Density control: prune, clone and split Gaussians; the optimizer keeps its state of all others.
 
-Functions over (Gaussians, optimizer, what to do with whom); the schedule is a callback's business.
+The functions take the Gaussians, the optimizer and a mask; a callback has the schedule.
 
 Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2.
 """
@@ -16,46 +16,43 @@ from torch.optim import Optimizer
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import quaternions_to_rotations
 
-SHRINK = 1.6
-"""The halves of a split Gaussian have its scales divided by this (Kerbl et al.)."""
 
-
-def prune(gaussians: Gaussians, optimizer: Optimizer, gone: Bool[Tensor, "n"]) -> None:
+def prune(gaussians: Gaussians, optimizer: Optimizer, gone: Bool[Tensor, " n"]) -> None:
     """Removes Gaussians.
 
     Raises:
-        ValueError: None would be left.
+        ValueError: All Gaussians would be removed.
     """
     if gone.all():
-        raise ValueError(f"pruning must leave a Gaussian, and all {len(gone)} would go; lower the opacity bound")
+        raise ValueError(f"pruning would remove all {len(gone)} Gaussians; lower the opacity bound")
     keep = ~gone
     _rearrange(gaussians, optimizer, lambda values: values[keep], lambda state: state[keep])
 
 
-def clone(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, "n"]) -> None:
-    """Doubles Gaussians in place, sharing the opacity so that both together cover what one did.
+def clone(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]) -> None:
+    """Doubles Gaussians in place, each with the opacity a' = 1 - sqrt(1 - a), so that both cover as much as one.
 
-    1 - (1 - a')² = a gives a' = 1 - sqrt(1 - a); the signal is that of the original. Copies start without momentum.
+    Copies have the signal of the original, and start without momentum.
     """
     copies = _append(gaussians, optimizer, chosen)
     with torch.no_grad():
-        # The logit of a' in that of a, which loses no digits where a is near 0 or 1.
+        # The logit of a' from the logit of a, accurate for opacities near 0 and 1.
         logits = gaussians.opacity_logits[copies]
         gaussians.opacity_logits[copies] = nn.functional.softplus(logits).div(2).expm1().log()
 
 
-def split(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, "n"], generator: torch.Generator) -> None:
+def split(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"], generator: torch.Generator) -> None:
     """Replaces each chosen Gaussian by two smaller ones drawn from it."""
     halves = _append(gaussians, optimizer, chosen)
     with torch.no_grad():
         scales, quats = gaussians.scales[halves], gaussians.quats[halves]
         steps = torch.randn(scales.shape, generator=generator).to(scales) * scales
         gaussians.means[halves] += (quaternions_to_rotations(quats) @ steps[..., None]).squeeze(-1)
-        gaussians.log_scales[halves] -= math.log(SHRINK)
+        gaussians.log_scales[halves] -= math.log(1.6)  # as Kerbl et al. shrink them
 
 
-def _append(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, "n"]) -> Bool[Tensor, "m"]:
-    """Puts copies of the chosen behind all others; True for both of each pair."""
+def _append(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]) -> Bool[Tensor, " m"]:
+    """Appends copies of the chosen Gaussians; gives a mask of originals and copies."""
     _rearrange(
         gaussians,
         optimizer,
@@ -71,7 +68,7 @@ def _rearrange(
     pick: Callable[[Tensor], Tensor],
     pick_state: Callable[[Tensor], Tensor],
 ) -> None:
-    """New parameters in place of the old ones, in the module and in the optimizer."""
+    """Replaces the parameters in the module and in the optimizer."""
     for name in gaussians.PARAMETERS:
         old = getattr(gaussians, name)
         new = nn.Parameter(pick(old.detach()), old.requires_grad)
@@ -79,7 +76,7 @@ def _rearrange(
         for group in optimizer.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
         if state := optimizer.state.pop(old, None):
-            # What an optimizer remembers is of the Gaussians, though not of all their axes in Adafactor, or one number.
+            # An entry has a row for each Gaussian (in Adafactor without all axes), or is one number.
             optimizer.state[new] = {
                 key: pick_state(value) if torch.is_tensor(value) and value.shape[:1] == old.shape[:1] else value
                 for key, value in state.items()

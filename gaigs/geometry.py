@@ -1,24 +1,24 @@
-"""Poses, quaternions, spherical and polar coordinates, harmonics; conventions stand in docs/conventions.md."""
+"""Poses, quaternions, coordinates, harmonics, and grids of directions; conventions: docs/conventions.md."""
 
 import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
 FAR = 1e5
-"""No coordinate reaches it [m]: float32 tells places apart by 8 mm there, and by half a metre at UTM's northings."""
+"""Bound of all coordinates [m]: float32 resolves 8 mm there, and half a metre at UTM's northings."""
 
 WITHIN = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
 
 FAINTEST = torch.finfo(torch.float32).tiny
-"""Amplitudes and powers below this are silence: what is divided by such a number of float32 overflows."""
+"""Smaller amplitudes and powers are silence: dividing by such a float32 number overflows."""
 
 
 class ExtrapolationWarning(UserWarning):
-    """Something is asked for far from all that was measured."""
+    """A prediction is far from all measurements."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Pose:
 
     Attributes:
         position: Centre of the array, world frame (3,) [m].
-        rotation: Columns are the array's axes in the world frame (3, 3), so a world point x
-            is seen at ``rotation.T @ (x - position)``.
+        rotation: The array's axes in the world frame as columns (3, 3): ``rotation.T @ (x - position)`` is a world
+            point x in the array's frame.
 
     Example:
         >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])  # scipy's order: looks along the axes
@@ -79,10 +79,9 @@ class Pose:
 
 
 def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z) of any length; of length zero no rotation.
+    """Rotation matrices of quaternions (w, x, y, z) of any length; length zero means no rotation.
 
-    The matrix is that of the normalised quaternion; dividing by the squared length keeps the gradient
-    free of a component along the quaternion.
+    The matrix is that of the normalised quaternion; the gradient has no component along the quaternion.
     """
     quats = _of_moderate_length(quats)
     w, x, y, z = quats.unbind(-1)
@@ -97,21 +96,21 @@ def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, 
 
 
 def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Quaternions of length 1; one of length zero stays as it is."""
+    """Quaternions scaled to length 1; a quaternion of length zero stays zero."""
     return normalize(_of_moderate_length(quats), dim=-1)
 
 
 def _of_moderate_length(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """The same directions with a largest component of 1, so that squares neither overflow nor vanish."""
+    """Quaternions scaled to a largest component of 1, so that squares neither overflow nor vanish."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     return quats / torch.where(largest == 0, 1, largest)
 
 
 def semi_axes(quats: Float[Tensor, "*batch 4"], scales: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """R diag(scales) [m], a column an axis, of Gaussians with quaternions (w, x, y, z) and standard deviations [m].
+    """Semi-axes R diag(scales) of Gaussians as columns [m], from quaternions (w, x, y, z) and standard deviations [m].
 
-    Times its transpose this is the covariance, whose condition number is the square: of a Gaussian 10,000 times as long
-    as wide float32 would keep nothing of the width there.
+    Times its transpose this is the covariance, whose condition number is the square: for a Gaussian 10,000 times as
+    long as wide float32 loses the width there.
     """
     return quaternions_to_rotations(quats) * scales[..., None, :]
 
@@ -119,12 +118,11 @@ def semi_axes(quats: Float[Tensor, "*batch 4"], scales: Float[Tensor, "*batch 3"
 def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
     """Azimuth in [-pi, pi] [rad], elevation in [-pi/2, pi/2] [rad] and distance [m] of points in the array's frame.
 
-    ``atan2`` of the height over the horizontal distance equals asin(z / r) and is accurate at the zenith too. There,
-    where azimuth is undefined, it is 0. Gradients are finite everywhere but at the origin.
+    At the zenith, where azimuth is undefined, it is 0. Gradients are finite everywhere but at the origin.
     """
     x, y, z = points.unbind(-1)
     distances = points.norm(dim=-1)
-    # Nearer to the axis than this no azimuth is resolved: such a point counts as one just beside it, at azimuth 0.
+    # Within rounding of the axis no azimuth is resolved: such a point counts as one just beside it, at azimuth 0.
     least = torch.finfo(points.dtype).eps * distances.detach()
     axial = torch.hypot(x, y) <= least
     x, y = torch.where(axial, least, x), torch.where(axial, 0.0, y)
@@ -138,27 +136,27 @@ def from_spherical(azimuths: Float[Tensor, "*batch"], elevations: Float[Tensor, 
 
 
 def polar(amplitudes: Float[Tensor, "*batch"], phases: Float[Tensor, "*batch"]) -> Complex[Tensor, "*batch"]:
-    """Waves of amplitudes, at least 0, and phases [rad]; 0, as are its gradients, below ``FAINTEST``.
+    """Complex waves of amplitudes (at least 0) and phases [rad]; value and gradient are 0 below ``FAINTEST``.
 
-    The gradient of ``torch.polar`` is finite at an amplitude of 0, and NaN just beside it.
+    The gradient of ``torch.polar`` itself is NaN for amplitudes just above 0.
     """
     return torch.polar(amplitudes.masked_fill(amplitudes < FAINTEST, 0), phases)
 
 
 def magnitudes(waves: Complex[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Of waves; 0, as is its gradient, where both parts are below ``FAINTEST``: as for ``polar``."""
+    """Magnitudes of complex waves; value and gradient are 0 where both parts are below ``FAINTEST``."""
     largest = torch.maximum(waves.real.detach().abs(), waves.imag.detach().abs())
     return waves.masked_fill(largest < FAINTEST, 0).abs()
 
 
 def spherical_harmonics(vectors: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch k"]:
-    """Real spherical harmonics in directions, of all degrees n up to one, which is k = (degree + 1)² of them.
+    """The k = (degree + 1)² real spherical harmonics of degree n up to ``degree`` in given directions.
 
     Number n² + n + m is sqrt(2) N P_n^|m|(z) times cos(m az) for m > 0, sin(|m| az) for m < 0, and N P_n(z) for m = 0.
-    P has the factor (-1)^m, and with N the mean square over the sphere is 1 / 4 pi, as .ply viewers have them.
+    P has the factor (-1)^m, and N makes the mean square over the sphere 1 / 4 pi, as in .ply viewers.
 
-    The recurrence over n runs on N P_n^m / sin^m of the polar angle, a polynomial in z; the sine goes with the
-    azimuth's functions into (x + j y)^m. So values and gradients are finite at the poles too.
+    The recurrence over n runs on N P_n^m / sin^m of the polar angle, a polynomial in z; the sine joins the azimuth's
+    functions in (x + j y)^m. So values and gradients are finite at the poles.
 
     Args:
         vectors: Unit vectors.
@@ -187,3 +185,121 @@ def spherical_harmonics(vectors: Float[Tensor, "*batch 3"], degree: int) -> Floa
             else:
                 harmonics[middle] = legendre
     return torch.stack(harmonics, -1)
+
+
+@dataclass
+class Rays:
+    """Any list of directions, in the array's frame.
+
+    Attributes:
+        elevations: One a ray [rad].
+        azimuths: One a ray [rad].
+
+    Example:
+        >>> gaigs.Rays(elevations=torch.tensor([0.0, 0.5]), azimuths=torch.tensor([0.0, 3.0])).vectors().shape
+        torch.Size([2, 3])
+    """
+
+    elevations: Float[Tensor, " k"]
+    azimuths: Float[Tensor, " k"]
+
+    @property
+    def shape(self) -> tuple[int]:
+        return (len(self.elevations),)
+
+    def flatten(self) -> "Rays":
+        """The same, as a list of rays."""
+        return self
+
+    def vectors(self) -> Float[Tensor, "k 3"]:
+        """Unit vectors in the array's frame."""
+        return from_spherical(self.azimuths, self.elevations)
+
+    def __getitem__(self, index: slice | Int[Tensor, " j"]) -> "Rays":
+        return Rays(self.elevations[index], self.azimuths[index])
+
+    def to(self, where: torch.device | str | torch.dtype | Tensor) -> "Rays":
+        """The same directions on another device or in another dtype."""
+        return Rays(self.elevations.to(where), self.azimuths.to(where))
+
+
+@dataclass
+class Grid:
+    """Directions of a spectrum's pixel centres, in the array's frame.
+
+    Attributes:
+        elevations: One a row [rad].
+        azimuths: One a column [rad].
+
+    Example:
+        >>> gaigs.Grid.degrees().shape, gaigs.Grid.degrees(elevations=range(-30, 31, 10), azimuths=range(8)).shape
+        ((90, 360), (7, 8))
+    """
+
+    elevations: Float[Tensor, " rows"]
+    azimuths: Float[Tensor, " columns"]
+
+    @classmethod
+    def degrees(cls, elevations=range(1, 91), azimuths=range(360)) -> "Grid":
+        """A grid of whole degrees; the default is that of the NeRF² spectra, 90 x 360."""
+        as_radians = lambda values: torch.deg2rad(torch.tensor([float(v) for v in values]))
+        return cls(as_radians(elevations), as_radians(azimuths))
+
+    @classmethod
+    def sphere(cls, rows: int, columns: int) -> "Grid":
+        """The full sphere in pixels of equal solid angle: the sines of the rows' elevations are evenly spaced.
+
+        Raises:
+            ValueError: There are fewer than 2 rows or 3 columns.
+        """
+        if rows < 2 or columns < 3:
+            raise ValueError(f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x {columns}")
+        sines = (2 * torch.arange(rows, dtype=torch.float64) + 1 - rows) / rows
+        azimuths = 2 * math.pi / columns * (torch.arange(columns, dtype=torch.float64) + 0.5)
+        return cls(sines.asin().float(), azimuths.float())
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.elevations), len(self.azimuths)
+
+    @property
+    def pitch(self) -> float:
+        """Distance between neighbouring rows, their mean [rad]."""
+        rows = self.shape[0]
+        return ((self.elevations[-1] - self.elevations[0]) / max(rows - 1, 1)).abs().item()
+
+    @property
+    def solid_angles(self) -> Float[Tensor, "rows columns"]:
+        """Shares of the pixels in the grid's; rows meet where the sine of the elevation is halfway between theirs.
+
+        Raises:
+            ValueError: There are fewer than 2 rows: the extent of a single one is unknown.
+        """
+        if len(self.elevations) < 2:
+            raise ValueError(f"solid angles take at least 2 rows, got {len(self.elevations)}; use a finer grid")
+        sines = self.elevations.double().sin()
+        first, last = (3 * sines[:1] - sines[1:2]) / 2, (3 * sines[-1:] - sines[-2:-1]) / 2
+        bounds = torch.cat((first, (sines[1:] + sines[:-1]) / 2, last)).clamp(-1, 1)
+        shares = bounds.diff().abs()[:, None].expand(self.shape)
+        return (shares / shares.sum()).float()
+
+    def thin(self, rows: slice, columns: slice) -> "Grid":
+        """The grid of some of the rows and columns."""
+        return Grid(self.elevations[rows], self.azimuths[columns])
+
+    def flatten(self) -> Rays:
+        """The pixels row by row, as a list of rays."""
+        elevations, azimuths = torch.meshgrid(self.elevations, self.azimuths, indexing="ij")
+        return Rays(elevations.flatten(), azimuths.flatten())
+
+    def vectors(self) -> Float[Tensor, "rows columns 3"]:
+        """Unit vectors in the array's frame."""
+        return self.flatten().vectors().unflatten(0, self.shape)
+
+    def to(self, where: torch.device | str | torch.dtype | Tensor) -> "Grid":
+        """The same directions on another device or in another dtype."""
+        return Grid(self.elevations.to(where), self.azimuths.to(where))
+
+
+Directions = Grid | Rays
+"""Directions of the values of a label or a map."""

@@ -1,4 +1,4 @@
-"""What a run shares a machine with: threads, memory, the signals that stop it, other runs, its own other processes."""
+"""Resources and signals of a run: threads, memory, Ctrl-C and SIGTERM, other processes, locked folders."""
 
 import contextlib
 import os
@@ -8,20 +8,26 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+from omegaconf.errors import OmegaConfBaseException
+
+from gaigs.io.files import file_message
+
 STOPPING = (signal.SIGINT, signal.SIGTERM)
-"""Signals at which a run stops where it can go on: Ctrl-C, and what schedulers send before they kill."""
+"""Signals at which a run saves and stops: Ctrl-C, and the one that schedulers send before they kill."""
 
 POCL_THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
-"""Environment variables that limit the threads of OpenCL on the processor: PoCL up to version 3, and later ones."""
+"""Environment variables that limit the processor threads of PoCL's OpenCL, up to version 3 and later."""
 
-OUT_OF_MEMORY = ("allocate memory", "unable to allocate", "not enough memory", "out of memory", "bad_alloc")
-OUT_OF_MEMORY += ("bad allocation", "failed to map segment", "can't start new thread", "mem_object_allocation_failure")
-OUT_OF_MEMORY += ("could not create a primitive", "error return without exception set")
-"""Words of torch, C++, the loader of libraries, Python, OpenCL and oneDNN for it, in small letters; the last ones are
-Python's where there was no memory for the error itself."""
+OUT_OF_MEMORY = (
+    "allocate memory", "unable to allocate", "not enough memory", "out of memory", "bad_alloc", "bad allocation",
+    "failed to map segment", "can't start new thread", "mem_object_allocation_failure", "could not create a primitive",
+    "error return without exception set",
+)  # fmt: skip
+"""Messages for a lack of memory of torch, C++, the linker, Python, OpenCL and oneDNN, in lower case; the last one is
+Python's if there is no memory for the error itself."""
 
 AGAIN = 0.05
-"""Until a signal comes once more that was passed over [s]."""
+"""Delay before an ignored signal is sent again [s]."""
 
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "NODE_RANK", "GROUP_RANK")
 """Environment variables that number processes and machines."""
@@ -30,15 +36,15 @@ COUNTS = ("SLURM_NTASKS", "SLURM_NTASKS_PER_NODE", "SLURM_NNODES")
 """Environment variables that count processes and machines."""
 
 received: list[int] = []
-"""Signals at which runs of this process have stopped: a launcher's worker starts no other then."""
+"""Signals that have stopped runs of this process: a launcher's worker starts no further run."""
 
 
 class Stopped(KeyboardInterrupt):
     """A signal has stopped a run.
 
     Args:
-        message: Where it stopped.
-        number: Of the signal.
+        message: The step at which it stopped.
+        number: The signal.
     """
 
     def __init__(self, message: str, number: int):
@@ -48,11 +54,11 @@ class Stopped(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
-    """Has torch and PoCL take so many threads; PoCL keeps those with which it was first used.
+    """Limits the threads of torch and PoCL; PoCL keeps the limit of its first use.
 
     Args:
-        count: Threads; None leaves everything as it is, but shares the processors where several jobs run at a time.
-        jobs: How many jobs run at a time on this machine; -1 is one for each processor.
+        count: Number of threads; None: no limit for one job, an equal share of the processors for several.
+        jobs: Number of jobs that run at a time on this machine; -1: one for each processor.
 
     Raises:
         ValueError: The count is less than 1.
@@ -82,7 +88,7 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
 
 
 def lacks_memory(error: BaseException | None) -> bool:
-    """Whether an error, or what caused it, is that there was no more memory, of the processor or of a GPU."""
+    """True if an error, or its cause, is a lack of memory of the processor or of a GPU."""
     while error is not None:
         if isinstance(error, MemoryError) or any(words in str(error).lower() for words in OUT_OF_MEMORY):
             return True
@@ -90,31 +96,53 @@ def lacks_memory(error: BaseException | None) -> bool:
     return False
 
 
+def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
+    """The message of an error that a user can mend; None for a fault of the program.
+
+    Args:
+        error: Raised by a run.
+        folder: Run folder.
+        goes_on: How to resume the run.
+    """
+    if lacks_memory(error):
+        cause = " ".join(str(error).split()) or type(error).__name__
+        return (
+            f"out of memory ({cause})\nend other programs or give the run more, and {goes_on}; or take a smaller "
+            "training.batch_size in another folder"
+        )
+    if not folder.is_dir():  # the first cause, whatever file was missed
+        return f"{folder} was removed during the run; the same command begins anew"
+    if isinstance(error, OSError):
+        return file_message(error, folder)
+    is_known = isinstance(error, ValueError | TypeError | ImportError | RuntimeError | OmegaConfBaseException)
+    return str(error) if is_known or type(error).__name__ == "MisconfigurationException" else None  # Lightning's
+
+
 def check_ranks() -> None:
-    """Sees to it that what numbers processes are numbers; to be called before Lightning is imported, which reads them.
+    """Checks the environment variables of several processes, before Lightning is imported, which reads them.
 
     Raises:
-        ValueError: One is none, or SLURM's say not how many processes a machine has.
+        ValueError: A variable is not a number, or SLURM gives no number of processes per machine.
     """
     for name in (*RANKS, *COUNTS):
         value = os.environ.get(name, "0")
         if not value.isdecimal():
             raise ValueError(f"{name} must be a whole number in the environment, got {value!r}; unset it")
     count = int(os.environ.get("SLURM_NTASKS", 1))
-    is_shell = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # where one process runs alone
-    asked = not is_shell and "TORCHELASTIC_RUN_ID" not in os.environ  # torchrun's numbers go before SLURM's
-    if count > 1 and asked and "SLURM_NTASKS_PER_NODE" not in os.environ:
+    is_shell = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # one process alone
+    is_slurm = not is_shell and "TORCHELASTIC_RUN_ID" not in os.environ  # torchrun's numbers take precedence
+    if count > 1 and is_slurm and "SLURM_NTASKS_PER_NODE" not in os.environ:
         raise ValueError(
-            f"SLURM_NTASKS_PER_NODE must be in the environment where SLURM_NTASKS is more than 1, got {count}; give "
-            "srun --ntasks-per-node in place of --ntasks, or unset SLURM_NTASKS for one process"
+            f"SLURM_NTASKS={count} needs SLURM_NTASKS_PER_NODE in the environment\n"
+            "use srun --ntasks-per-node instead of --ntasks, or unset SLURM_NTASKS for one process"
         )
 
 
 def is_first() -> bool:
-    """Whether this is the first of the processes that train together, which alone writes files."""
+    """True in the first of the processes that train together; only this one writes files."""
     from lightning.pytorch.utilities import rank_zero_only  # slow to import
 
-    # Lightning's number is that within a machine where neither torchrun nor SLURM gives one over all of them.
+    # Without torchrun and SLURM, Lightning's rank is that within a machine.
     is_global = any(name in os.environ for name in ("RANK", "SLURM_PROCID"))
     machine = 0 if is_global else int(os.environ.get("NODE_RANK", os.environ.get("GROUP_RANK", 0)))
     return rank_zero_only.rank == 0 and machine == 0
@@ -122,14 +150,14 @@ def is_first() -> bool:
 
 @contextlib.contextmanager
 def only_run(folder: Path) -> Iterator[None]:
-    """Holds a run's folder against other runs, as long as this process lives; nothing is written there.
+    """Locks a run folder, at most until this process ends; writes nothing there.
 
     Raises:
-        ValueError: Another run holds it.
+        ValueError: Another run holds the folder.
     """
     try:
         import fcntl
-    except ImportError:  # no such locks on this system
+    except ImportError:  # Windows has no such locks
         yield
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -138,8 +166,7 @@ def only_run(folder: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ValueError(
-                f"{folder} must be free, and another run is at work there; wait for it, or choose another folder "
-                "(hydra.run.dir=DIR)"
+                f"another run is at work in {folder}\nwait for it, or choose another hydra.run.dir"
             ) from None
         yield
     finally:
@@ -148,21 +175,21 @@ def only_run(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stopping(waits: bool = False) -> Iterator[None]:
-    """Has SIGTERM stop a run as Ctrl-C does; what handlers there were come back.
+    """Lets SIGTERM stop a run as Ctrl-C does, and restores the handlers.
 
-    Python passes over what is raised while it destroys an object; such a signal comes once more.
+    Python ignores errors that are raised while it destroys an object; such a signal is sent again.
 
     Args:
-        waits: Whether the process waits for another run then. SIGTERM does not end it while it does, as its launcher
-            would wait for it for ever.
+        waits: True if the process waits for another run afterwards. SIGTERM does not end it then: its launcher would
+            wait for it forever.
     """
-    if threading.current_thread() is not threading.main_thread():  # others may set no handlers
+    if threading.current_thread() is not threading.main_thread():  # other threads may not set handlers
         yield
         return
     handlers = {number: signal.getsignal(number) for number in STOPPING}
 
     def stop(number: int, _) -> None:
-        for timer in timers:  # they are not to interrupt what this one ends
+        for timer in timers:  # no second signal while the run stops
             timer.cancel()
         raise Stopped("stopped", number)
 
@@ -183,7 +210,7 @@ def stopping(waits: bool = False) -> Iterator[None]:
             raise Stopped("stopped", received[0])
         yield
         for timer in timers:
-            if not timer.finished.is_set():  # the end came before it did
+            if not timer.finished.is_set():  # the run ended first
                 raise Stopped("stopped", timer.args[1])
     finally:
         for timer in timers:
@@ -196,7 +223,7 @@ def stopping(waits: bool = False) -> Iterator[None]:
 
 
 def forward_to_children(number: int) -> None:
-    """Sends a signal to the processes that this one has started, as far as the system tells."""
+    """Sends a signal to the child processes, on systems with ``/proc``."""
     for task in Path("/proc/self/task").glob("*/children"):
         for child in task.read_text().split():
             with contextlib.suppress(ProcessLookupError):

@@ -1,4 +1,4 @@
-"""Waves: free space, reflection, and what a beamformer makes of what an array hears."""
+"""Waves: free space, reflection, the beamformer of an array, and gains and phases of measured channels."""
 
 import math
 
@@ -7,18 +7,15 @@ from jaxtyping import Complex, Float, Int
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.directions import Directions
-from gaigs.query import Query, check_carrier
-from gaigs.scene import Array, Scene, differences
+from gaigs.antenna import Array, differences
+from gaigs.geometry import Directions
+from gaigs.query import check_carrier
 
 NEAREST = 1e-2
-"""Smaller distances count as this one [m]: at 0 a spherical wave has no value."""
+"""Smallest distance of a spherical wave [m]; smaller ones count as this."""
 
 TELLING = 5
-"""Fewest links a receiver that can tell a sign: of fewer chance may keep all of the power."""
-
-KEPT = 0.01
-"""Share of the channels' power that must follow the direct distance for a sign to be told, beside what chance keeps."""
+"""Fewest links of a receiver that show a sign: with fewer, chance may keep all of the power."""
 
 
 def free_space(
@@ -28,7 +25,7 @@ def free_space(
 
     Args:
         distances: Between transmitter and receiver [m].
-        frequencies: To be broadcast against the distances [Hz].
+        frequencies: Broadcast against the distances [Hz].
         sign: -1 for the time dependence exp(+j omega t), +1 for exp(-j omega t), 0 for the amplitude alone.
 
     Source: Friis, A note on a simple transmission formula, 1946.
@@ -47,18 +44,18 @@ def bartlett(
     places; of a 4 x 4 array 49 of them instead of 256 pairs make it cheap.
 
     Args:
-        responses: Of the array's elements at each frequency (..., e, f), linear amplitude; phases are those of the time
-            dependence exp(+j omega t).
-        grid: Directions to look into, in the array's frame [rad]: ``gaigs.Grid`` or ``gaigs.Rays``.
-        array: Its elements' places [m].
-        frequency: Of the carrier, which the weights are those of [Hz].
+        responses: Linear amplitudes of the array's elements at each frequency (..., e, f), for the time dependence
+            exp(+j omega t).
+        grid: Directions in the array's frame [rad]: ``gaigs.Grid`` or ``gaigs.Rays``.
+        array: Positions of the elements [m].
+        frequency: Carrier of the weights [Hz].
 
     Returns:
         (..., rows, columns), or (..., k) of rays; differentiable, with a gradient of 0 where the amplitude is 0.
 
     Raises:
-        TypeError: The responses are no complex tensor.
-        ValueError: They are not of the array's elements, or the frequency is no carrier.
+        TypeError: The responses are not a complex tensor.
+        ValueError: Their elements are not the array's, or the frequency is not a carrier.
 
     Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
 
@@ -107,8 +104,8 @@ def fresnel(
     """Fresnel reflection coefficients of a half-space, electric field across (TE) and in (TM) the plane of incidence.
 
     Args:
-        permittivity: Complex, relative, for the time dependence exp(+j omega t).
-        cosines: Of the angle of incidence against the surface's normal.
+        permittivity: Complex relative permittivity, for the time dependence exp(+j omega t).
+        cosines: Cosine of the angle of incidence, from the surface's normal.
 
     Source: Fresnel's formulas in the form of ITU-R P.2040-3.
     """
@@ -118,94 +115,19 @@ def fresnel(
     return te, tm
 
 
-def carriers(scene: Scene, query: Query) -> Float[Tensor, "b"]:
-    """The frequency of each link [Hz]; the data's only one where the query says none, of channels their band's middle.
-
-    Raises:
-        ValueError: Neither says one, or the data have several.
-    """
-    if scene.task.dtype.is_complex:
-        return scene.task.frequencies.mean().to(query.transmitters).expand(len(query))
-    if query.frequencies is not None:
-        return query.frequencies
-    if len(scene.frequencies) != 1:
-        raise ValueError(
-            f"each link must have a frequency [Hz], as the data have {len(scene.frequencies)}; give the query its "
-            "frequencies, or the data theirs"
-        )
-    return scene.frequencies.to(query.transmitters).expand(len(query))
-
-
-def check_elements(what: str, scene: Scene) -> None:
-    """Sees to it that labels are channels, and that each receiver's array has as many elements as they.
-
-    Args:
-        what: Who takes nothing else, as errors call it.
-        scene: Its task and receivers.
-
-    Raises:
-        ValueError: They are not, or one has not.
-    """
-    task = scene.task
-    if not task.dtype.is_complex or len(task.shape) != 2:
-        raise ValueError(f"{what} gives complex channels, and labels of task {task.name!r} are none; take another")
-    for receiver in scene.receivers:
-        if len(receiver.array) != task.shape[0]:
-            raise ValueError(
-                f"the labels have {task.shape[0]} elements, and the array of {receiver.name} {len(receiver.array)}; "
-                "give the data's elements"
-            )
-
-
-def direct_waves(
-    scene: Scene, query: Query, frequencies: Float[Tensor, "s"], sign: int = -1, at_elements: bool = True
-) -> Complex[Tensor, "b e s"]:
-    """Free space from each transmitter to the elements of its receiver, or to its middle alone (e = 1).
-
-    Args:
-        scene: Its receivers' arrays have the same number of elements.
-        query: The links.
-        frequencies: [Hz].
-        sign: Of phases, as for ``free_space``.
-        at_elements: Whether to each element.
-    """
-    # In float64: some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz 1e-4 rad.
-    places = []
-    for receiver in scene.receivers:
-        pose, elements = receiver.pose.to(torch.zeros((), dtype=torch.float64)), receiver.array.elements.double().cpu()
-        places.append(pose.world(elements) if at_elements else pose.position[None])
-    places = torch.stack(places).to(query.transmitters.device)[query.receivers]
-    distances = (query.transmitters.double()[:, None] - places).norm(dim=-1)
-    return free_space(distances[..., None], frequencies.to(distances.device), sign)
-
-
-def direct_gains(scene: Scene, query: Query) -> Float[Tensor, "b"]:
-    """Field gain of each receiver's elements towards the transmitter, seen from the array's middle; float64.
-
-    On the very middle no direction is seen, and the gain is that along the array's normal.
-    """
-    gains = torch.ones(len(query), dtype=torch.float64, device=query.transmitters.device)
-    for receiver in query.receivers.unique().tolist():
-        own, antenna = query.receivers == receiver, scene.receivers[receiver]
-        points = antenna.pose.to(gains).local(query.transmitters[own].double())
-        lengths = points.norm(dim=-1, keepdim=True)
-        gains[own] = antenna.array.gain(torch.where(lengths > 0, points / lengths, points.new_tensor([0.0, 0.0, 1.0])))
-    return gains
-
-
-def fit_gain(channels: Complex[Tensor, "k *shape"], waves: Complex[Tensor, "k *shape"]) -> Complex[Tensor, ""]:
+def fit_gain(channels: Complex[Tensor, " k *shape"], waves: Complex[Tensor, " k *shape"]) -> Complex[Tensor, ""]:
     """The complex gain of measured channels over waves predicted at a gain of 1; complex128.
 
     Its magnitude is the median over the links of |h| / |w|, its phase that of the sum of w* h / (|w| |h|). So each link
-    has one vote, however weak or loud it is: a fit of least squares follows the loudest links, one of least relative
-    errors those in the deepest shadow (docs/results.md has both figures).
+    counts once, weak or strong: least squares follows the strongest links, least relative errors follow links in the
+    deepest shadow (docs/results.md has both figures).
 
     Args:
         channels: Measured, h of each link.
-        waves: Predicted, w of each link. Links of which either is silent have no vote.
+        waves: Predicted, w of each link. A link with h = 0 or w = 0 does not count.
 
     Returns:
-        The gain; 0 where no link has a vote.
+        The gain; 0 where no link counts.
     """
     h, w = (part.to(torch.complex128).flatten(1) for part in (channels, waves))
     sizes, strengths = h.norm(dim=1), w.norm(dim=1)
@@ -216,36 +138,39 @@ def fit_gain(channels: Complex[Tensor, "k *shape"], waves: Complex[Tensor, "k *s
     return (sizes / strengths)[heard].quantile(0.5) * alike.sum().sgn()
 
 
-def strength(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, "k"]) -> float:
-    """How strong channels are over waves: the median link's amplitude of each receiver, their geometric mean.
+def strength(
+    channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, " k"]
+) -> float:
+    """Amplitude of channels over waves: the median over a receiver's links, the geometric mean over receivers.
 
     Args:
         channels, waves: As for ``fit_gain``.
-        receivers: Of each link.
+        receivers: Receiver of each link.
 
     Returns:
-        The strength; 1 where nothing is heard.
+        The amplitude; 1 where all channels are 0.
     """
     gains = [fit_gain(channels[own], waves[own]).abs() for own in (receivers == k for k in receivers.unique())]
     heard = [gain.log() for gain in gains if gain > 0]
     return torch.stack(heard).mean().exp().item() if heard else 1.0
 
 
-def phase_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, "k"]) -> int:
+def phase_sign(
+    channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, " k"]
+) -> int:
     """The sign with which the phases of channels follow the direct distance.
 
-    The direct path alone, over free space, would be one number at all links of a receiver. What the mean over links
-    keeps of the power is compared for both signs; by chance alone it is about one part in the number of links. All
-    links count alike, however weak or loud they are.
+    Divided by free space, a direct path alone is the same number at all links of a receiver. For each sign, the mean
+    over links keeps a share of the power; by chance alone the share is about 1 / links. All links count alike.
 
     Args:
         channels: Measured.
         waves: ``direct_waves`` of the same links, with the sign -1.
-        receivers: Of each link.
+        receivers: Receiver of each link.
 
     Returns:
-        -1 or 1; 0 where neither keeps ``KEPT`` more than four times what chance does. Of fewer than ``TELLING`` links a
-        receiver none can.
+        -1 or 1; 0 where neither share exceeds 0.01 plus four times that of chance. With fewer than ``TELLING`` links a
+        receiver neither can.
     """
     relative, phases = _normalised(channels / waves.abs()), waves.angle()
     kept = {-1: 0.0, 1: 0.0}
@@ -258,13 +183,13 @@ def phase_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s
     total = relative.abs().square().mean().item() * len(receivers)
     best = max(kept, key=kept.get)
     chance = len(receivers.unique()) / len(receivers)
-    return best if kept[best] > (KEPT + 4 * chance) * total else 0
+    return best if kept[best] > (0.01 + 4 * chance) * total else 0
 
 
 def array_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"]) -> int:
     """The sign with which phases follow the direct distance from one element or subcarrier of a link to another.
 
-    It can be told where the links' common phases are random.
+    It shows even where each link has a random phase in common.
 
     Args:
         channels: Measured.

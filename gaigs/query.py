@@ -1,7 +1,8 @@
-"""What a model is asked: who sends, who hears, at which frequency; and a batch of such questions with their labels."""
+"""Queries: links between transmitters and receivers; batches: queries with directions and labels."""
 
+import math
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,70 +10,147 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gaigs.directions import Directions
-from gaigs.geometry import FAR, WITHIN
+from gaigs.geometry import FAR, WITHIN, Directions, Grid, Rays
 
 CARRIERS = 1e4, 3e11
-"""All carriers lie from the first to the second [Hz]; another number is in another unit."""
+"""Lowest and highest carrier [Hz]; another number is in another unit."""
 
-
-UNITS = {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}
+ROUNDING = 1e-6
+"""Relative difference below which two carriers are equal: float32 and seven printed digits round by less."""
 
 
 def unit_hint(number: float) -> str:
-    """A question about the unit in which a number that is no carrier would be one; empty where there is none."""
+    """A question about the unit in which a number would be a carrier; empty where there is none."""
+    units = {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}
     low, high = CARRIERS
-    return next((f"; in {unit}?" for unit, size in UNITS.items() if low / size <= number <= high / size), "")
+    return next((f"; in {unit}?" for unit, size in units.items() if low / size <= number <= high / size), "")
 
 
-def check_carrier(name: str, frequency: float) -> None:
-    """Raises a ``ValueError`` unless the option of that name is a carrier [Hz]."""
+def check_carrier(name: str, frequencies: float | Tensor) -> None:
+    """Raises a ``ValueError`` unless every value of the option of that name is a carrier [Hz]."""
     low, high = CARRIERS
-    if not low <= frequency <= high:
+    values = torch.as_tensor(frequencies, dtype=torch.float64).flatten()
+    for wrong in values[~((values >= low) & (values <= high))][:1].tolist():
         expected = f"a carrier in Hz, from {low:g} to {high:g}"
-        raise ValueError(f"{name} must be {expected}, got {frequency:.7g}{unit_hint(frequency)}")
+        raise ValueError(f"{name} must be {expected}, got {wrong:.7g}{unit_hint(wrong)}")
 
 
-def as_numbers(what: str, values: object, expected: str) -> Tensor:
-    """Real numbers of any kind as a float tensor.
+def as_numbers(name: str, values: object, expected: str) -> Tensor:
+    """Real numbers of any kind as a float32 tensor.
 
     Raises:
-        ValueError: They are not real numbers.
+        ValueError: The values are not real numbers.
     """
     try:
         tensor = torch.as_tensor(values)
         if tensor.is_complex() or tensor.dtype == torch.bool or np.ma.is_masked(values):
             raise TypeError(str(tensor.dtype))
-    except (TypeError, ValueError, RuntimeError, OverflowError):  # whatever torch meets in words, or in ragged lists
-        raise ValueError(f"{what} must be {expected} in real numbers, got {reprlib.repr(values)}") from None
+    except (TypeError, ValueError, RuntimeError, OverflowError):  # torch's errors for words and ragged lists
+        raise ValueError(f"{name} must be {expected} in real numbers, got {reprlib.repr(values)}") from None
     return tensor.to(torch.float32)
 
 
-def as_positions(what: str, values: object) -> Float[Tensor, "*points 3"]:
+def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
     """Positions of any kind as a float32 tensor (..., 3) [m].
 
     Raises:
-        ValueError: They are not (..., 3) real numbers, or one is not finite or too far away.
+        ValueError: The values are not (..., 3) real numbers, or one is not finite or too far away.
     """
-    positions = as_numbers(what, values, "(..., 3) positions [m]")
+    positions = as_numbers(name, values, "(..., 3) positions [m]")
     if not positions.ndim or positions.shape[-1] != 3:
-        raise ValueError(f"{what} must be (..., 3) positions [m], got shape {tuple(positions.shape)}")
+        raise ValueError(f"{name} must be (..., 3) positions [m], got shape {tuple(positions.shape)}")
     points = positions.reshape(-1, 3)
     for holds, expected in ((points.isfinite(), "finite"), (points.abs() < FAR, WITHIN)):
         if not holds.all():
             row = int((~holds).any(1).nonzero()[0])
-            raise ValueError(f"{what} must be {expected}, got {points[row].tolist()} in row {row}")
+            raise ValueError(f"{name} must be {expected}, got {points[row].tolist()} in row {row}")
     return positions
+
+
+def as_receivers(values: object, names: Sequence[str]) -> Int[Tensor, "*points"]:
+    """The index of a receiver, given by name or index, or the indices of several.
+
+    Raises:
+        ValueError: There is no such receiver.
+    """
+    expected = f"receiver must be one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
+    try:
+        indices = torch.as_tensor(names.index(values) if isinstance(values, str) else values)
+    except (ValueError, TypeError, RuntimeError, OverflowError):  # an unknown name, or torch's errors
+        raise ValueError(f"{expected}, got {reprlib.repr(values)}") from None
+    if indices.dtype not in (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8):
+        given = f"{tuple(indices.shape)} of {indices.dtype}" if indices.ndim else repr(values)
+        raise ValueError(f"{expected}, got {given}")
+    indices = indices.long()
+    wrong = indices[(indices < 0) | (indices >= len(names))]
+    if len(wrong):
+        raise ValueError(f"{expected}, got {wrong[0]}")
+    return indices
+
+
+def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, "*points"] | None:
+    """Carriers that a user asks for, or for None the only known one; None where none is known [Hz].
+
+    Raises:
+        ValueError: A carrier is out of range, differs from the only known one, or is missing beside several.
+    """
+    if values is None:
+        if len(known) > 1:
+            raise ValueError(
+                f"the training links have {len(known)} carriers, {known[0]:.7g} to {known[-1]:.7g} Hz; choose one with "
+                "frequency=..."
+            )
+        return known[0] if len(known) else None
+    frequencies = as_numbers("a frequency", values, "a carrier in Hz")
+    check_carrier("a frequency", frequencies)
+    if len(known) < 2 and not (len(known) and torch.isclose(frequencies, known[0], rtol=ROUNDING).all()):
+        carrier = f"one carrier, {known[0]:.7g} Hz" if len(known) else "no known carrier"
+        raise ValueError(f"the training links have {carrier}, so no other can be predicted; leave frequency out")
+    return frequencies
+
+
+def as_directions(directions: Directions | None, own: Grid | None, task: str) -> Directions | None:
+    """Directions that a user asks for, in float32, or for None the label's own of a task.
+
+    Raises:
+        TypeError: The directions are neither a ``Grid`` nor ``Rays``.
+        ValueError: The label has no directions; an angle is no number, or too large for radians; or rays have
+            different numbers of elevations and azimuths.
+    """
+    if directions is None:
+        return own
+    if not isinstance(directions, Directions):
+        raise TypeError(
+            "directions must be a gaigs.geometry.Grid or gaigs.geometry.Rays, or None for the label's own, got "
+            f"{type(directions).__name__}"
+        )
+    if own is None:
+        raise ValueError(f"labels of task {task!r} have no directions; leave directions out")
+    angles = {}
+    # Azimuths are periodic: a few turns are accepted, a circle in degrees is more. 1e-4 allows for rounded angles.
+    for name, most in (("elevations", math.pi / 2), ("azimuths", 20 * math.pi)):
+        expected = f"a list of angles from {-most:.4f} to {most:.4f} rad"
+        angles[name] = values = as_numbers(name, getattr(directions, name), expected)
+        if values.ndim != 1:
+            raise ValueError(f"{name} must be {expected}, got shape {tuple(values.shape)}")
+        if len(wrong := values[~(values.abs() <= most + 1e-4)]):
+            raise ValueError(f"{name} must be {expected}, got {wrong[0]:g}; Grid.degrees takes degrees")
+    if isinstance(directions, Grid):
+        return Grid(**angles)
+    rows, columns = map(len, angles.values())
+    if rows != columns:
+        raise ValueError(f"rays must have as many elevations as azimuths, got {rows} and {columns}; Grid has rows")
+    return Rays(**angles)
 
 
 @dataclass
 class Query:
-    """Links, each of one transmitter to one receiver. Two are alike only if all their fields are.
+    """Links from one transmitter to one receiver each. Two are equal only if all their fields are.
 
     Attributes:
         transmitters: Positions, world frame (b, 3) [m].
         receivers: Indices into the scene's receivers (b,).
-        frequencies: Of the carrier (b,) [Hz], from 10 kHz to 300 GHz; None where it is unknown.
+        frequencies: Carriers (b,) [Hz], from 10 kHz to 300 GHz; None where they are unknown.
 
     Example:
         >>> query = gaigs.Query(torch.tensor([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]), torch.tensor([0, 0]))
@@ -81,13 +159,51 @@ class Query:
     """
 
     transmitters: Float[Tensor, "b 3"]
-    receivers: Int[Tensor, "b"]
-    frequencies: Float[Tensor, "b"] | None = None
+    receivers: Int[Tensor, " b"]
+    frequencies: Float[Tensor, " b"] | None = None
+
+    @classmethod
+    def from_positions(
+        cls, positions: object, receiver: object, frequency: object, names: Sequence[str], known: Float[Tensor, " f"]
+    ) -> tuple["Query", tuple[int, ...]]:
+        """Links from transmitters at the positions that a user gives; every number is checked here, and only here.
+
+        Args:
+            positions: Positions (..., 3) [m], anything that becomes a float tensor; or a whole query.
+            receiver: Name or index of the receiver, or an index for each position.
+            frequency: Carrier, one for all or one for each position [Hz]; None is the known one.
+            names: Names of the scene's receivers.
+            known: Different carriers of the training links, ascending [Hz]; empty where they are unknown.
+
+        Returns:
+            The links in the order of ``positions.reshape(-1, 3)``, and the leading axes of the positions.
+
+        Raises:
+            ValueError: As of ``as_positions``, ``as_receivers`` and ``as_frequencies``; the receivers or frequencies
+                are neither one nor one for each position; or a query comes with a receiver or a frequency.
+        """
+        if isinstance(positions, Query):
+            if frequency is not None or not isinstance(receiver, int) or receiver:
+                raise ValueError("a query has its own receivers and frequencies; leave receiver and frequency out")
+            positions, receiver, frequency = positions.transmitters, positions.receivers, positions.frequencies
+        positions = as_positions("transmitters", positions)
+        shape = positions.shape[:-1]
+
+        def spread(name: str, values: Tensor) -> Tensor:
+            if values.ndim and values.shape != shape:
+                expected = f"one, or one for each of the {tuple(shape)} positions"
+                raise ValueError(f"{name} must be {expected}, got {tuple(values.shape)}")
+            return values.expand(shape).reshape(-1)
+
+        points = positions.reshape(-1, 3)
+        receivers = spread("receivers", as_receivers(receiver, names)).to(points.device)
+        frequencies = as_frequencies(frequency, known.cpu().float())
+        return cls(points, receivers, None if frequencies is None else spread("frequencies", frequencies)), shape
 
     def __len__(self) -> int:
         return len(self.transmitters)
 
-    def __getitem__(self, index: slice | Int[Tensor, "k"]) -> "Query":
+    def __getitem__(self, index: slice | Int[Tensor, " k"]) -> "Query":
         """Some of the links."""
         frequencies = None if self.frequencies is None else self.frequencies[index]
         return Query(self.transmitters[index], self.receivers[index], frequencies)
@@ -98,18 +214,17 @@ class Query:
         return Query(self.transmitters.to(device), self.receivers.to(device), frequencies)
 
     def parts(self, size: int) -> Iterator["Query"]:
-        """The links in their order, so many at a time."""
-        return (self[start : start + size] for start in range(0, len(self), size))
+        """The links in their order, at most ``size`` at a time; a query without links is one part."""
+        return (self[start : start + size] for start in range(0, max(len(self), 1), size))
 
-    def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, "b"]]:
+    def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
         """The different places and frequencies, or the different links.
 
         Args:
-            with_receivers: Whether links to two receivers differ. Where they do not, each place has one of its
-                receivers, whichever.
+            with_receivers: True if links to two receivers differ. If False, each place has any one of its receivers.
 
         Returns:
-            One link of each kind, sorted by position, frequency and receiver; and which of them each link is.
+            The different links, sorted by position, frequency and receiver; and the index among them of each link.
         """
         columns = self.transmitters
         others = [self.frequencies] if self.frequencies is not None else []
@@ -126,14 +241,14 @@ class Query:
 
 @dataclass
 class Batch:
-    """A query with the directions asked for and what was measured.
+    """A query with directions and labels.
 
     Attributes:
         query: The links.
-        directions: Those to predict, for all links the same; None where the label has none.
-        labels: What was measured (b, ...), of the task's shape; None when predicting.
-        shares: Weights of the mean over these links, and of that over their places, in the mean over all processes
-            that train together; 1 where there is a single one.
+        directions: Directions to predict, the same for all links; None where the label has none.
+        labels: Measured values (b, ...), of the task's shape; None when predicting.
+        shares: Weights of the mean over these links, and of the mean over their places, in the mean over all processes
+            that train together; 1 for a single process.
     """
 
     query: Query

@@ -1,137 +1,32 @@
-"""What a model must know of a data set to be built: receivers with their arrays, the box of places, the task."""
+"""The scene of a model: receivers with their arrays, the box of the training transmitters, the task."""
 
 import functools
-import math
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float
 from torch import Tensor
 
+from gaigs.antenna import Array, Receiver
 from gaigs.geometry import Pose
+from gaigs.propagation import free_space
 from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.task import Task
 
-VERSION = 1
-"""Of the format of ``Scene.state``. Version 0, which had no number, is read too: see ``Scene.from_state``."""
-
-PATTERNS = ("isotropic", "cosine")
-"""Field patterns of an element: alike in all directions, or the cosine of the angle off the array's normal and 0 behind
-it, as of a patch."""
-
-
-def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, "pairs"]]:
-    """The different vectors from one place to another, to nine decimals, and which of them each pair of places has."""
-    apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)
-    return torch.unique(apart, dim=0, return_inverse=True)
-
-
-@dataclass(frozen=True)
-class Array:
-    """A receiver's antenna: one element or several, fed apart.
-
-    Attributes:
-        elements: Positions in the array's own frame (e, 3) [m].
-        pattern: Field pattern of each element, one of ``PATTERNS``.
-
-    Raises:
-        ValueError: There is no such pattern, or the elements are not (e, 3).
-
-    Example:
-        >>> len(gaigs.Array.planar(4, 4, pitch=0.16)), len(gaigs.Array.single())
-        (16, 1)
-    """
-
-    elements: Float[Tensor, "e 3"]
-    pattern: str = "isotropic"
-
-    def __post_init__(self) -> None:
-        if self.pattern not in PATTERNS:
-            raise ValueError(f"an array's pattern must be one of {', '.join(PATTERNS)}, got {self.pattern!r}")
-        if self.elements.ndim != 2 or self.elements.shape[1] != 3 or not len(self.elements):
-            raise ValueError(f"an array's elements must be (e, 3) positions [m], got {tuple(self.elements.shape)}")
-
-    @classmethod
-    def single(cls) -> "Array":
-        """One isotropic antenna."""
-        return cls(torch.zeros(1, 3))
-
-    @classmethod
-    def planar(cls, rows: int, columns: int, pitch: float, pattern: str = "isotropic") -> "Array":
-        """Elements in the array's x-y plane about its middle, column by column: y runs fastest.
-
-        Args:
-            rows: Elements along y.
-            columns: Elements along x.
-            pitch: Between neighbouring elements [m].
-            pattern: One of ``PATTERNS``.
-
-        Raises:
-            ValueError: There is no element, or the pitch is not positive and finite.
-        """
-        if rows < 1 or columns < 1 or not 0 < pitch < math.inf:
-            raise ValueError(
-                f"an array must have at least 1 x 1 elements at a positive pitch, got {rows} x {columns} at {pitch} m"
-            )
-        steps = lambda count: (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * pitch
-        x, y = torch.meshgrid(steps(columns), steps(rows), indexing="ij")
-        return cls(torch.stack((x, y, 0 * x), -1).flatten(0, 1), pattern)
-
-    def __len__(self) -> int:
-        return len(self.elements)
-
-    @functools.cached_property
-    def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, "pairs"], Float[Tensor, "l"]]:
-        """The different vectors from one element to another [m], which of them each pair of elements has, and how many
-        pairs have each; float64.
-
-        What powers alone say of a field, its covariance, an array hears by these only: 49 for a 4 x 4 array.
-        """
-        # Kept beyond this call: made in inference mode they could not be saved for a later backward pass.
-        with torch.inference_mode(False):
-            steps, pairs = differences(self.elements.clone().double())
-            return steps, pairs, torch.bincount(pairs).double()
-
-    def gain(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Field gain of an element towards unit vectors in the array's frame."""
-        if self.pattern == "cosine":
-            return directions[..., 2].clamp(min=0)
-        return torch.ones_like(directions[..., 2])
-
-
-@dataclass(frozen=True)
-class Receiver:
-    """An antenna array or gateway.
-
-    Attributes:
-        name: In files and tables.
-        pose: Position [m] and orientation in the room.
-        array: Its elements; one isotropic antenna by default.
-
-    Example:
-        >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])
-        >>> len(gaigs.Receiver("door", pose, gaigs.Array.planar(4, 4, pitch=0.16)).array)
-        16
-    """
-
-    name: str
-    pose: Pose
-    array: Array = field(default_factory=Array.single)
-
 
 @dataclass(frozen=True)
 class Scene:
-    """What a checkpoint stores of a data set, so that a model loads without the data.
+    """The part of a data set that a checkpoint stores, so that a model loads without the data.
 
     Attributes:
-        receivers: Who hears.
-        lower, upper: Corners of the box that holds the training transmitters, world frame (3,) [m].
-        spacing: Median distance from a training transmitter to the next one elsewhere [m].
-        task: What the labels are.
-        frequencies: The training links' different carriers, ascending (f,) [Hz]; empty where they are unknown.
-        bandwidth: Of the band around each carrier that a label's power is averaged over, 0 for a carrier alone [Hz];
-            None where it is unknown.
+        receivers: Antenna arrays or gateways.
+        lower, upper: Corners of the box of the training transmitters, world frame (3,) [m].
+        spacing: Median distance of a training transmitter to the nearest other one [m].
+        task: Task of the labels.
+        frequencies: Distinct carriers of the training links, ascending (f,) [Hz]; empty if unknown.
+        bandwidth: Band around each carrier over which a label's power is averaged, 0 for a carrier alone [Hz]; None if
+            unknown.
 
     Example:
         >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
@@ -144,11 +39,11 @@ class Scene:
     upper: Float[Tensor, "3"]
     spacing: float
     task: Task
-    frequencies: Float[Tensor, "f"] = field(default_factory=lambda: torch.zeros(0))
+    frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0))
     bandwidth: float | None = None
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
-        """Where the receivers stand [m], on the device and in the dtype of ``like``."""
+        """Positions of the receivers [m], on the device and in the dtype of ``like``."""
         return torch.stack([receiver.pose.position for receiver in self.receivers]).to(like)
 
     @functools.cached_property
@@ -159,20 +54,19 @@ class Scene:
 
     @property
     def has_band(self) -> bool:
-        """Whether the training links have several carriers, so that the frequency tells something."""
+        """True if the training links have several carriers."""
         return len(self.frequencies) > 1
 
-    def band_positions(self, query: Query) -> Float[Tensor, "b"]:
-        """Where in the training links' band each carrier lies, by its logarithm: -1 at the lowest, 1 at the highest.
+    def band_positions(self, query: Query) -> Float[Tensor, " b"]:
+        """Positions of carriers in the training links' band, by the logarithm: -1 at the lowest, 1 at the highest.
 
         Raises:
-            ValueError: The query says no frequency.
+            ValueError: The query has no frequency.
         """
         if query.frequencies is None:
             low, high = self.frequencies[0].item(), self.frequencies[-1].item()
             raise ValueError(
-                f"the data have {len(self.frequencies)} carriers, {low:.6g} to {high:.6g} Hz, so a frequency must be "
-                "given"
+                f"a frequency must be given: the data have {len(self.frequencies)} carriers, {low:.6g} to {high:.6g} Hz"
             )
         low, high = self.frequencies.double().log()[[0, -1]].tolist()
         return ((2 * query.frequencies.double().log() - low - high) / (high - low)).to(query.transmitters.dtype)
@@ -180,7 +74,6 @@ class Scene:
     def state(self) -> dict:
         """The scene in plain tensors, lists and strings, for a checkpoint."""
         return {
-            "version": VERSION,
             "receivers": [
                 {
                     "name": receiver.name,
@@ -201,35 +94,89 @@ class Scene:
 
     @classmethod
     def from_state(cls, state: dict) -> "Scene":
-        """The inverse of ``state``; takes the states of earlier versions too.
+        """The inverse of ``state``.
 
         Raises:
-            ValueError: The state is of a later version, or its task is not installed here.
+            ValueError: The task is not installed.
         """
-        version = state.get("version", 0)
-        if version > VERSION:
-            raise ValueError(f"a scene must be of version {VERSION} or earlier, got {version}; update gaigs")
-        if version == 0:
-            state = _from_version_0(state)
         receivers = tuple(
             Receiver(r["name"], Pose(r["position"], r["rotation"]), Array(r["elements"], r["pattern"]))
             for r in state["receivers"]
         )
         box = state["lower"], state["upper"], state["spacing"]
-        return cls(receivers, *box, registry("task").build(state["task"]), state["frequencies"], state.get("bandwidth"))
+        return cls(receivers, *box, registry("task").build(state["task"]), state["frequencies"], state["bandwidth"])
 
 
-def _from_version_0(state: dict) -> dict:
-    """Receivers were [name, position, rotation]; the labels were spectra where there was a grid, else RSSI."""
-    single = Array.single()
-    receivers = [
-        {"name": name, "position": position, "rotation": rotation}
-        | {"elements": single.elements, "pattern": single.pattern}
-        for name, position, rotation in state["receivers"]
-    ]
-    task = {"name": "rssi"}
-    if state["grid"] is not None:
-        elevations, azimuths = state["grid"]
-        task = {"name": "spectrum", "elevations": elevations, "azimuths": azimuths}
-        task["normalisation"] = state["normalisation"]
-    return state | {"receivers": receivers, "task": task, "frequencies": torch.zeros(0)}
+def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
+    """The frequency of each link [Hz]: the query's, else the data's only one; for channels the middle of their band.
+
+    Raises:
+        ValueError: The query has no frequency, and the data have none or several.
+    """
+    if scene.task.dtype.is_complex:
+        return scene.task.frequencies.mean().to(query.transmitters).expand(len(query))
+    if query.frequencies is not None:
+        return query.frequencies
+    if len(scene.frequencies) != 1:
+        raise ValueError(
+            f"each link must have a frequency [Hz], as the data have {len(scene.frequencies)}; give the query its "
+            "frequencies, or the data theirs"
+        )
+    return scene.frequencies.to(query.transmitters).expand(len(query))
+
+
+def check_elements(what: str, scene: Scene) -> None:
+    """Checks that labels are channels, with as many elements as each receiver's array.
+
+    Args:
+        what: The component that takes nothing else, as errors name it.
+        scene: Task and receivers.
+
+    Raises:
+        ValueError: Labels are not channels, or an array has another number of elements.
+    """
+    task = scene.task
+    if not task.dtype.is_complex or len(task.shape) != 2:
+        raise ValueError(f"{what} gives complex channels, and labels of task {task.name!r} are none; take another")
+    for receiver in scene.receivers:
+        if len(receiver.array) != task.shape[0]:
+            raise ValueError(
+                f"the labels have {task.shape[0]} elements, and the array of {receiver.name} {len(receiver.array)}; "
+                "give the data's elements"
+            )
+
+
+def direct_waves(
+    scene: Scene, query: Query, frequencies: Float[Tensor, " s"], sign: int = -1, at_elements: bool = True
+) -> Complex[Tensor, "b e s"]:
+    """Free space from each transmitter to the elements of its receiver, or to its middle alone (e = 1).
+
+    Args:
+        scene: Its receivers' arrays have the same number of elements.
+        query: The links.
+        frequencies: [Hz].
+        sign: Sign of the phases, as for ``free_space``.
+        at_elements: True for each element, False for the middle of the array.
+    """
+    # In float64: some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz 1e-4 rad.
+    places = []
+    for receiver in scene.receivers:
+        pose, elements = receiver.pose.to(torch.zeros((), dtype=torch.float64)), receiver.array.elements.double().cpu()
+        places.append(pose.world(elements) if at_elements else pose.position[None])
+    places = torch.stack(places).to(query.transmitters.device)[query.receivers]
+    distances = (query.transmitters.double()[:, None] - places).norm(dim=-1)
+    return free_space(distances[..., None], frequencies.to(distances.device), sign)
+
+
+def direct_gains(scene: Scene, query: Query) -> Float[Tensor, " b"]:
+    """Field gain of each receiver's elements towards the transmitter, from the middle of the array; float64.
+
+    A transmitter in the very middle has no direction; its gain is that along the array's normal.
+    """
+    gains = torch.ones(len(query), dtype=torch.float64, device=query.transmitters.device)
+    for receiver in query.receivers.unique().tolist():
+        own, antenna = query.receivers == receiver, scene.receivers[receiver]
+        points = antenna.pose.to(gains).local(query.transmitters[own].double())
+        lengths = points.norm(dim=-1, keepdim=True)
+        gains[own] = antenna.array.gain(torch.where(lengths > 0, points / lengths, points.new_tensor([0.0, 0.0, 1.0])))
+    return gains

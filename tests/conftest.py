@@ -3,11 +3,16 @@
 Properties are tried on the same examples each time, and none is timed.
 """
 
+import os
+import signal
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
 
 torch.set_num_threads(1)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell runs the tests in the background
 settings.register_profile(
     "gaigs",
     derandomize=True,
@@ -31,6 +36,8 @@ def tracer(tmp_path_factory):
     except (ImportError, RuntimeError) as error:
         pytest.skip(str(error))
     with pytest.MonkeyPatch.context() as patch:
+        kernels = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "pocl" / "kcache"
+        patch.setenv("POCL_CACHE_DIR", os.environ.get("POCL_CACHE_DIR", str(kernels)))  # OpenCL keeps its own
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("DRJIT_LIBLLVM_PATH", library)
         patch.setattr(tracing, "RAYS", 5_000)

@@ -1,7 +1,7 @@
-"""What two labels have in common by distance and order, against sets whose answer is known."""
+"""The agreement of labels by distance and order, on sets with known answers."""
 
-import csv
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -99,15 +99,13 @@ def test_repeated_places_without_noise_agree_fully(task):
 
 
 @pytest.mark.parametrize("counted", [10**9, 3_000])
-def test_pairs_are_those_of_one_receiver_and_carrier_each_once(counted, monkeypatch):
-    monkeypatch.setattr(agreement, "COUNTED", counted)
-    monkeypatch.setattr(agreement, "BLOCK", 500)
+def test_pairs_are_those_of_one_receiver_and_carrier_each_once(counted):
     random = torch.Generator().manual_seed(0)
     places = torch.rand(90, 3, generator=random)
     receivers, carriers = torch.arange(90) % 2, 1e9 + (torch.arange(90) // 2 % 2).float()
     links = of_readings(places, torch.arange(90), receivers)
     links = replace(links, query=Query(links.query.transmitters, receivers, carriers))
-    found, groups = measure(links, seeded()), receivers + 2 * (carriers > 1e9)
+    found, groups = measure(links, seeded(), counted, block=500), receivers + 2 * (carriers > 1e9)
     i, j = torch.combinations(torch.arange(90)).T
     i, j = (ends[groups[i] == groups[j]] for ends in (i, j))
     cells = found.cell((places[i] - places[j]).double().norm(dim=1).numpy(), (j - i).numpy())
@@ -117,6 +115,7 @@ def test_pairs_are_those_of_one_receiver_and_carrier_each_once(counted, monkeypa
         assert found.pairs.ravel().tolist() == true.tolist()
     else:
         assert found.share < 1
+        assert "drawn at random, with all others" in agreement._remarks(found)[1]
         assert (found.pairs.ravel() <= true).all()
         assert found.pairs.sum() > found.share * true.sum()
     for cell, scores in found.scores.items():  # labels are the links' numbers: differences are the separations
@@ -128,23 +127,15 @@ def test_pairs_are_those_of_one_receiver_and_carrier_each_once(counted, monkeypa
             assert sorted(compared) == sorted((j - i).numpy()[cells == cell])
 
 
-def test_of_many_pairs_random_ones_are_compared(monkeypatch):
-    monkeypatch.setattr(agreement, "NUMBERS", 0)
-    monkeypatch.setattr(agreement, "BLOCK", 10_000)
+def test_of_many_pairs_random_ones_are_compared():
     links, whole = two_passes(), measure(two_passes(), seeded())
-    found = measure(links, seeded())
+    found, again, other = (measure(links, np.random.default_rng(seed), block=10_000, most=30) for seed in (0, 0, 1))
     assert np.array_equal(found.pairs, whole.pairs)
-    compared = [len(scores["mae_db"]) for scores in found.scores.values()]
-    assert compared == [min(agreement.FEWEST, count) for count in found.pairs.ravel() if count]
-    other = measure(links, np.random.default_rng(1))
-    assert any(
-        not torch.equal(a["mae_db"], b["mae_db"])
-        for a, b in zip(found.scores.values(), other.scores.values(), strict=True)
-    )
-    again = measure(links, seeded())
-    assert all(
-        torch.equal(a["mae_db"], b["mae_db"]) for a, b in zip(found.scores.values(), again.scores.values(), strict=True)
-    )
+    scores = [[values["mae_db"].tolist() for values in drawn.scores.values()] for drawn in (found, again, other)]
+    assert [len(values) for values in scores[0]] == [min(30, count) for count in found.pairs.ravel() if count]
+    assert scores[0] == scores[1] != scores[2]
+    (remark,) = agreement._remarks(found)
+    assert "which counts as that of measurement" in remark
 
 
 def test_a_place_that_is_measured_again_counts_anew():
@@ -186,10 +177,9 @@ def test_nothing_is_expected_where_no_test_link_has_a_known_one():
     assert on_split(measure(links, seeded()), links, seeded(), [])[0] == {}
 
 
-def test_baselines_of_large_labels_are_left_out(monkeypatch):
-    monkeypatch.setattr(agreement, "LOOKED_UP", 0)
+def test_baselines_of_large_labels_are_left_out():
     links = two_passes()
-    rows, remarks = on_split(measure(links, seeded()), links, seeded(), [{"name": "mean"}])
+    rows, remarks = on_split(measure(links, seeded()), links, seeded(), [{"name": "mean"}], looked_up=0)
     assert [*rows] == ["one label as near", "mean of many as near"]
     assert remarks[-1].startswith("the baselines are left out")
 
@@ -205,7 +195,7 @@ def test_labels_at_one_place_are_refused():
 @pytest.mark.parametrize("n", [1, 2])
 def test_links_of_which_no_two_are_alike_are_refused(n):
     links = of_readings(torch.rand(n, 3), torch.zeros(n), torch.arange(n))
-    with pytest.raises(ValueError, match=f"two or more at one carrier, and none of {n} links has another like it"):
+    with pytest.raises(ValueError, match=f"no two of {n} links have the same receiver and carrier"):
         measure(links, seeded())
 
 
@@ -232,17 +222,13 @@ def test_any_task(task, tmp_path, capsys):
     score = example_links(task).task.pair_score
     run(config, tmp_path / "run")
     folder = tmp_path / "run"
-    assert {path.name for path in folder.iterdir()} == {f"agreement.{ending}" for ending in ("md", "csv", "png")}
+    assert {path.name for path in folder.iterdir()} == {"agreement.md", "agreement.png"}
     page, said = (folder / "agreement.md").read_text(), capsys.readouterr().out
     assert page.startswith(f"Median {score} of two labels")
-    for row in ("one label as near", "mean of many as near", "`mean`"):
-        assert f"| {row} | " in page
+    for row in ("one label as near", "mean of many as near", "mean"):
+        assert f"| {row} | " in page.replace("`", "")
         assert row in said
     assert "columns tell nothing of time" in page
-    with open(folder / "agreement.csv", newline="") as file:
-        lines = [*csv.DictReader(file)]
-    places = 40 * 39 // 2
-    assert sum(int(line["pairs"]) for line in lines) == places * (4 if task == "rssi" else 1)
-    assert all(float(line["p10"]) <= float(line["median"]) <= float(line["p90"]) for line in lines)
-    (last,) = {line["separation_from"] for line in lines if not line["separation_to"]}
-    assert last == "4"
+    first, *cells = re.findall(r"\), ([\d,]+) ", page)
+    pairs = sum(int(count.replace(",", "")) for count in (first, *cells))
+    assert pairs == 40 * 39 // 2 * (4 if task == "rssi" else 1)

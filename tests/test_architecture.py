@@ -1,4 +1,4 @@
-"""The house stands as docs/architecture.md draws it: imports go down, a name is a place."""
+"""Imports go to lower layers only, docs/architecture.md draws them, and a component's name is its file's."""
 
 import ast
 import re
@@ -11,13 +11,11 @@ import yaml
 from gaigs.registry import KINDS, find_holders
 
 ROOT = Path(__file__).parents[1]
-
-
-# --- what the code has ---
+LONGEST_CHAIN = 12
 
 
 def imports(package):
-    """What each module of a package imports of that package, inside functions too."""
+    """The modules of a package that each module imports, inside functions too."""
     files = {}
     for file in package.rglob("*.py"):
         parts = (package.name, *file.relative_to(package).with_suffix("").parts)
@@ -30,24 +28,24 @@ def imports(package):
                 case ast.Import(names=names):
                     targets += [alias.name for alias in names]
                 case ast.ImportFrom(module=base, names=names, level=level):
-                    assert not level, f"{module} must import by whole names"
-                    whole = [f"{base}.{alias.name}" for alias in names]
-                    targets += [target if target in files else base for target in whole]
+                    assert not level, f"{module} must import by absolute names"
+                    absolute = [f"{base}.{alias.name}" for alias in names]
+                    targets += [target if target in files else base for target in absolute]
         found[module] = {target for target in targets if target in files}
     return found
 
 
-def room(module):
-    """The folder or file of the package that a module lies in."""
+def part(module):
+    """The file or folder directly in the package that holds a module."""
     return [*module.split("."), "__init__"][1]
 
 
-def between_rooms(imported):
-    return {(room(a), room(b)) for a, targets in imported.items() for b in targets if room(a) != room(b)}
+def between_parts(imported):
+    return {(part(a), part(b)) for a, targets in imported.items() for b in targets if part(a) != part(b)}
 
 
-def circle(imported):
-    """A circle of modules that import each other, or None."""
+def cycle(imported):
+    """Modules that import each other in a circle, or None."""
     try:
         TopologicalSorter(imported).prepare()
     except CycleError as error:
@@ -55,31 +53,28 @@ def circle(imported):
     return None
 
 
-def upward(imported, floors):
-    """Pairs of rooms of which the first imports the second, though it is no lower."""
-    return sorted((a, b) for a, b in between_rooms(imported) if floors[b] >= floors[a])
-
-
-# --- what the page says ---
+def not_downward(imported, layers):
+    """Imports of a part from a part in the same or a higher layer."""
+    return sorted((a, b) for a, b in between_parts(imported) if layers[b] >= layers[a])
 
 
 def drawn(text):
-    """The diagram: floor of each room, counted from the ground; arrows; rooms that are kinds."""
+    """The diagram: the layer of each part, counted from the ground; the arrows; the parts that are kinds."""
     (diagram,) = re.findall(r"^```mermaid\n(.*?)^```$", text, re.M | re.S)
     labels = dict(re.findall(r'^ +(\w+)\["(\w+)"\]$', diagram, re.M))
-    called = lambda word: labels.get(word, word)
-    floors = {}
-    for height, rooms in re.findall(r'^  subgraph F(\d+)\[" "\]\n(.*?)^  end$', diagram, re.M | re.S):
-        for word in re.findall(r"^ +(\w+)", rooms, re.M):
-            assert called(word) not in floors, f"{word} is drawn twice"
-            floors[called(word)] = int(height)
-    arrows = {(called(a), called(b)) for a, b in re.findall(r"^  (\w+) --> (\w+)$", diagram, re.M)}
+    label = lambda word: labels.get(word, word)
+    layers = {}
+    for height, parts in re.findall(r'^  subgraph L(\d+)\[" "\]\n(.*?)^  end$', diagram, re.M | re.S):
+        for word in re.findall(r"^ +(\w+)", parts, re.M):
+            assert label(word) not in layers, f"{word} is drawn twice"
+            layers[label(word)] = int(height)
+    arrows = {(label(a), label(b)) for a, b in re.findall(r"^  (\w+) --> (\w+)$", diagram, re.M)}
     (kinds,) = re.findall(r"^  class (\S+) kind$", diagram, re.M)
-    return floors, arrows, kinds.split(",")
+    return layers, arrows, kinds.split(",")
 
 
 def reached(start, arrows):
-    """Rooms that arrows lead to."""
+    """Parts to which arrows lead."""
     found, new = set(), {start}
     while new:
         new = {b for a, b in arrows if a in new} - found
@@ -97,102 +92,101 @@ def page():
     return (ROOT / "docs/architecture.md").read_text()
 
 
-# --- the rules ---
-
-
-def test_each_room_is_drawn_once(imported, page):
-    floors, _, kinds = drawn(page)
-    assert floors.keys() == {room(module) for module in imported}
+def test_each_part_is_drawn_once(imported, page):
+    layers, _, kinds = drawn(page)
+    assert layers.keys() == {part(module) for module in imported}
     assert kinds == [*KINDS]
+    assert max(layers.values()) <= LONGEST_CHAIN
 
 
-def test_no_room_imports_upwards(imported, page):
-    assert not upward(imported, drawn(page)[0])
-
-
-def test_no_modules_import_each_other(imported):
-    assert circle(imported) is None
+def test_imports_go_to_lower_layers(imported, page):
+    assert not_downward(imported, drawn(page)[0]) == []
+    assert cycle(imported) is None
 
 
 def test_arrows_are_imports_and_imports_follow_from_arrows(imported, page):
     _, arrows, _ = drawn(page)
-    pairs = between_rooms(imported)
+    pairs = between_parts(imported)
     assert arrows <= pairs
     assert [(a, b) for a, b in sorted(pairs) if b not in reached(a, arrows)] == []
     assert [(a, b) for a, b in sorted(arrows) if b in reached(a, arrows - {(a, b)})] == [], "follows from others"
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_name_is_a_place(kind, page):
+def test_a_components_name_is_its_files(kind, page):
     built_in = [holder for holder in find_holders(kind)[0] if holder.file and holder.root is None]
     for holder in built_in:
-        places = {f"{kind}/{holder.name}.py", f"{kind}/{holder.name}/__init__.py"}
-        assert holder.file.relative_to(ROOT / "gaigs").as_posix() in places
+        place = ROOT / "gaigs" / kind / holder.name
+        assert holder.file == place.with_suffix(".py") or holder.file.is_relative_to(place)
     names = {holder.name for holder in built_in}
     assert len(names) == len(built_in)
-    files = {file.stem: yaml.safe_load(file.read_text()) for file in (ROOT / "conf" / kind).glob("*.yaml")}
-    parts = {stem: content.get(kind, content) for stem, content in files.items()}  # tasks and data choose others, too
-    for stem, part in parts.items():
-        named = part["name"] if "name" in part else part["defaults"][0]
+    presets = {file.stem: yaml.safe_load(file.read_text()) for file in (ROOT / "conf" / kind).glob("*.yaml")}
+    for stem, content in presets.items():
+        preset = content.get(kind, content)  # tasks and data choose other parts, too
+        named = preset["name"] if "name" in preset else preset["defaults"][0]
         assert named == stem or (stem not in names and named in names)
     (row,) = re.findall(rf"^\| `{kind}` \|.*\|(.*)\|$", page, re.M)
     assert {*re.findall(r"`(\w+)`", row)} == names
 
 
-# --- that the rules can be broken ---
+def test_class_names_are_unique():
+    nodes = [node for file in (ROOT / "gaigs").rglob("*.py") for node in ast.parse(file.read_text()).body]
+    names = [node.name for node in nodes if isinstance(node, ast.ClassDef)]
+    assert sorted(name for name in {*names} if names.count(name) > 1) == []
 
-HOUSE = {
+
+# --- that a broken rule is found ---
+
+FILES = {
     "__init__": "",
-    "roof": "from house import middle\n",
-    "middle/__init__": "from house.ground import stone\n",
-    "middle/table": "import house.ground\n",
+    "top": "from package import middle\n",
+    "middle/__init__": "from package.ground import stone\n",
+    "middle/table": "import package.ground\n",
     "ground": "stone = 1\n",
 }
-FLOORS = {"__init__": 4, "roof": 3, "middle": 2, "ground": 1}
+LAYERS = {"__init__": 4, "top": 3, "middle": 2, "ground": 1}
 
 
-def build(folder, **changes):
-    for name, text in (HOUSE | changes).items():
-        file = folder / "house" / f"{name}.py"
+def write(folder, **changes):
+    for name, text in (FILES | changes).items():
+        file = folder / "package" / f"{name}.py"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)
-    return folder / "house"
+    return imports(folder / "package")
 
 
-def test_a_house_in_order(tmp_path):
-    house = imports(build(tmp_path))
-    assert house["house.middle.table"] == {"house.ground"}
-    assert between_rooms(house) == {("roof", "middle"), ("middle", "ground")}
-    assert not upward(house, FLOORS)
-    assert circle(house) is None
+def test_a_package_in_order(tmp_path):
+    found = write(tmp_path)
+    assert found["package.middle.table"] == {"package.ground"}
+    assert between_parts(found) == {("top", "middle"), ("middle", "ground")}
+    assert not not_downward(found, LAYERS)
+    assert not_downward(found, LAYERS | {"ground": 2}) == [("middle", "ground")], "the same layer is no lower one"
+    assert cycle(found) is None
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "import house.middle.table",
-        "from house.middle import table",
-        "from house import middle",
-        "from house import stone",
-        "def late():\n    from house.middle.table import leg",
+        "import package.middle.table",
+        "from package.middle import table",
+        "from package import middle",
+        "from package import stone",
+        "def late():\n    from package.middle.table import leg",
     ],
 )
-def test_an_arrow_upwards_is_found(text, tmp_path):
-    house = imports(build(tmp_path, ground=f"{text}\n"))
-    assert upward(house, FLOORS) == [("ground", "__init__" if "stone" in text else "middle")]
+def test_an_import_upwards_is_found(text, tmp_path):
+    found = write(tmp_path, ground=f"{text}\n")
+    assert not_downward(found, LAYERS) == [("ground", "__init__" if "stone" in text else "middle")]
 
 
-def test_a_neighbour_is_no_floor_below(tmp_path):
-    assert upward(imports(build(tmp_path)), FLOORS | {"ground": 2}) == [("middle", "ground")]
-
-
-def test_a_circle_within_a_room_is_found(tmp_path):
-    house = imports(build(tmp_path, **{"middle/__init__": "from house.middle.table import leg\n"}))
-    assert circle(house) is None
-    text = {"middle/__init__": "from house.middle.table import leg\n", "middle/table": "from house.middle import leg\n"}
-    assert {*circle(imports(build(tmp_path, **text)))} == {"house.middle", "house.middle.table"}
+def test_a_cycle_within_a_part_is_found(tmp_path):
+    text = {
+        "middle/__init__": "from package.middle.table import leg\n",
+        "middle/table": "from package.middle import leg\n",
+    }
+    assert {*cycle(write(tmp_path, **text))} == {"package.middle", "package.middle.table"}
 
 
 def test_a_relative_import_is_refused(tmp_path):
-    with pytest.raises(AssertionError, match=r"house\.roof must import by whole names"):
-        imports(build(tmp_path, roof="from . import middle\n"))
+    with pytest.raises(AssertionError, match=r"package\.top must import by absolute names"):
+        write(tmp_path, top="from . import middle\n")

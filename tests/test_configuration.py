@@ -1,5 +1,6 @@
 """What the configuration files choose together, and what they ask of the place they are used in."""
 
+import functools
 import logging
 import tomllib
 from importlib import metadata
@@ -15,7 +16,6 @@ from gaigs.registry import registry
 ROOT = Path(__file__).parents[1]
 DATA = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
 MIRRORED = {"spectrum": "mirrored", "rssi": "mirrored_rssi", "csi": "mirrored_csi"}
-POOLINGS = {"spectrum": "array_response", "rssi": "mean_power", "csi": "element_sum"}
 TRENDS = {"spectrum": None, "rssi": {"name": "mean"}, "csi": None}
 
 
@@ -23,12 +23,12 @@ TRENDS = {"spectrum": None, "rssi": {"name": "mean"}, "csi": None}
 def configure():
     """Composes the configuration; with Hydra's own part, as it stands."""
 
-    def configure(*overrides, whole=False):
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            config = compose("config", [*overrides], return_hydra_config=whole)
-        return config if whole else OmegaConf.to_container(config, resolve=True)
+    def configure(*overrides, with_hydra=False):
+        config = compose("config", [*overrides], return_hydra_config=with_hydra)
+        return config if with_hydra else OmegaConf.to_container(config, resolve=True)
 
-    return configure
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        yield functools.cache(configure)
 
 
 # --- a model of several tasks ---
@@ -40,9 +40,10 @@ def test_a_model_chooses_what_suits_it_for_every_task(configure, task):
     assert config == configure(f"+experiment={MIRRORED[task]}")
     assert config["task"]["name"] == task
     model = config["model"]
-    parts = ("name", "placement", "deformation", "projection", "rasterizer", "pooling")
+    parts = ("name", "placement", "deformation", "pooling")
     names = [model[part] if part == "name" else model[part]["name"] for part in parts]
-    assert names == ["mirrored", "mirrored", "none", "direction_cosine", "aperture", POOLINGS[task]]
+    assert names == ["mirrored", "mirrored", "none", f"path_{task}"]
+    assert model["projection"] is model["rasterizer"] is None
     assert (model["gaussians"], model["trend"]) == (None, TRENDS[task])
     assert (config["kriging"], config["threads"], config["trainer"]["max_steps"]) == (True, 1, 900)
 
@@ -101,7 +102,7 @@ def test_systems_have_one_budget_whatever_they_choose(configure, task, model):
 @pytest.mark.parametrize("task", DATA)
 def test_systems_are_swept_over_as_far_as_they_are_installed(configure, task, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # where no plug-in is
-    settings = configure(f"+experiment=systems_{task}", whole=True).hydra
+    settings = configure(f"+experiment=systems_{task}", with_hydra=True).hydra
     listed = OmegaConf.to_container(settings.sweeper.params)["model"]
     names = listed.removeprefix("${installed:").removesuffix("}").replace(" ", "").split(",")
     assert {"gaigs", "mirrored"} <= {*names}
@@ -113,8 +114,8 @@ def test_systems_are_swept_over_as_far_as_they_are_installed(configure, task, mo
 
 
 def test_a_choice_by_task_is_made_where_there_is_one():
-    assert known("pooling", "mirrored/rssi", "spectrum") == "mirrored/rssi"
-    assert known("pooling", "mirrored/delay", "mean_power") == "mean_power"
+    assert known("pooling", "path_rssi", "spectrum") == "path_rssi"
+    assert known("pooling", "path_delay", "path_rssi") == "path_rssi"
 
 
 def test_what_is_not_installed_is_left_out_and_told(caplog):
@@ -128,7 +129,7 @@ def test_what_is_not_installed_is_left_out_and_told(caplog):
 
 def test_two_jobs_at_a_time_where_that_is_installed(configure, monkeypatch):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs gaigs[parallel]")
-    settings = lambda *more: configure("+experiment=systems_rssi", *more, whole=True).hydra.launcher
+    settings = lambda *more: configure.__wrapped__("+experiment=systems_rssi", *more, with_hydra=True).hydra.launcher
     assert settings()["n_jobs"] == 2
     assert settings()["_target_"].endswith("JoblibLauncher")
     assert settings("hydra/launcher=basic")["_target_"].endswith("BasicLauncher")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.directions import Grid, Rays
+from gaigs.geometry import Grid, Rays
 
 GRID = Grid.degrees(range(5, 90, 10), range(0, 360, 30))
 
@@ -108,9 +108,3 @@ def test_a_sphere_of_too_few_pixels_is_refused(rows, columns):
 def test_rows_of_unknown_extent_have_no_solid_angle(rows):
     with pytest.raises(ValueError, match=f"take at least 2 rows, got {rows}; use a finer grid"):
         _ = Grid(torch.zeros(rows), torch.zeros(4)).solid_angles
-
-
-def test_nothing_has_a_shape_too():
-    assert Grid(torch.zeros(0), torch.zeros(4)).vectors().shape == (0, 4, 3)
-    assert GRID.flatten()[:0].vectors().shape == (0, 3)
-    assert Grid(torch.tensor([0.3]), torch.tensor([0.5])).pitch == 0

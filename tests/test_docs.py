@@ -151,7 +151,8 @@ def test_programs_exist(page):
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     for command in commands(page):
         program = Path(command[0]).name
-        assert program in {"python", "python3", "pip", "pytest", "source", "torchrun", *scripts}, command
+        known = "python python3 pip pytest ruff mypy pre-commit source torchrun".split()
+        assert program in (*known, *scripts), command
         if "-m" in command:
             module = command[command.index("-m") + 1]
             assert find_spec(f"{module}.__main__"), module
@@ -171,8 +172,8 @@ def test_commands_compose(page, composed):
         ]
         first = [values[0] for values in choices]
         composed(*first)
-        for position, values in enumerate(choices):  # each value of a sweep once, beside the others' first
-            for value in values[1:]:
+        for position, values in enumerate(choices):  # each word of a sweep once, beside the others' first
+            for value in (value for value in values[1:] if not re.search(r"=[-+.\de]+$", value)):
                 composed(*first[:position], value, *first[position + 1 :])
 
 
@@ -277,7 +278,6 @@ def test_the_plug_ins_train_by_their_commands(runs):
         ("gaigs", "arrival", "gaussians.means"),
         ("direction_mlp", "spectrum", "receivers.weight"),
         ("gaigs", "spectrum", "placement.share"),
-        ("judged", "spectrum", "generator.gaussians.means"),
         ("gaigs", "spectrum", "gaussians.means"),
     ]
     for folder, (model, task, weights) in zip(runs, expected, strict=True):
@@ -299,6 +299,7 @@ def test_a_task_of_ones_own_is_told_in_its_own_words(runs):
         assert radio_map["values_ns"].shape[0] == 1
     drawn = {path.stem for path in (folder / "figures").glob("*.png")}
     assert drawn >= {"radio_map", "predicted_against_measured", "error_cdf"}
+    assert {path.stem for path in (runs[2] / "figures").glob("*.png")} >= {"room", "angle_cdf"}
 
 
 def test_the_readme_predicts(place, runs):

@@ -1,4 +1,4 @@
-"""Rotations and poses against scipy, semi-axes and spherical coordinates against their definitions."""
+"""Rotations, poses and spherical harmonics against scipy, angles against the conventions."""
 
 import math
 
@@ -10,9 +10,7 @@ from scipy.special import sph_harm_y
 
 from gaigs.geometry import (
     Pose,
-    from_spherical,
     quaternions_to_rotations,
-    semi_axes,
     spherical_harmonics,
     to_spherical,
 )
@@ -34,13 +32,6 @@ def test_the_length_of_a_quaternion_gets_no_gradient(quats):
     weights = torch.arange(9.0, dtype=torch.float64).view(3, 3)
     (gradient,) = torch.autograd.grad((quaternions_to_rotations(quats) * weights).sum(), quats)
     torch.testing.assert_close((gradient * quats).sum(-1), torch.zeros(20, dtype=torch.float64), rtol=0, atol=1e-12)
-
-
-def test_semi_axes_are_the_rotated_axes_times_the_scales(quats):
-    scales = torch.rand(20, 3, dtype=torch.float64) + 0.1
-    matrices = semi_axes(quats, scales)
-    axes = torch.from_numpy(Rotation.from_quat(quats.roll(-1, -1).numpy()).as_matrix())
-    torch.testing.assert_close(matrices, axes * scales[:, None, :])
 
 
 def test_a_pose_reads_scalar_last_quaternions():
@@ -80,13 +71,6 @@ def test_a_pose_takes_dtype_and_device_of_a_tensor():
 def test_impossible_poses_are_refused(position, quaternion, message):
     with pytest.raises(ValueError, match=message):
         Pose.from_xyzw(position, quaternion)
-
-
-def test_spherical_coordinates_there_and_back():
-    points = torch.randn(50, 3, dtype=torch.float64)
-    azimuths, elevations, distances = to_spherical(points)
-    torch.testing.assert_close(elevations, torch.asin(points[:, 2] / distances))
-    torch.testing.assert_close(distances[:, None] * from_spherical(azimuths, elevations), points)
 
 
 def test_directions_have_the_angles_of_the_convention():

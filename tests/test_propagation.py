@@ -9,19 +9,11 @@ import pytest
 import torch
 from scipy.constants import speed_of_light
 
+from gaigs.antenna import Array, Receiver
 from gaigs.geometry import Pose
-from gaigs.propagation import (
-    array_sign,
-    carriers,
-    check_elements,
-    direct_gains,
-    direct_waves,
-    free_space,
-    fresnel,
-    phase_sign,
-)
+from gaigs.propagation import array_sign, free_space, fresnel, phase_sign
 from gaigs.query import Query
-from gaigs.scene import Array, Receiver
+from gaigs.scene import carriers, check_elements, direct_gains, direct_waves
 from gaigs.testing import example_links
 
 FREQUENCIES = torch.tensor([2.40e9, 2.44e9, 2.48e9], dtype=torch.float64)
@@ -126,13 +118,6 @@ def test_reflection_is_passive_and_total_at_grazing(surface):
     assert te[0].item() == pytest.approx(-1)
     assert tm[0].item() == pytest.approx(-1)
     torch.testing.assert_close(te[-1], -tm[-1])
-
-
-def test_at_brewsters_angle_nothing_of_one_polarisation_is_reflected():
-    brewster = torch.tensor([math.cos(math.atan(2.0))], dtype=torch.float64)  # of a refractive index of 2
-    te, tm = fresnel(complex(4), brewster)
-    assert abs(tm.item()) < 1e-12
-    assert abs(te.item()) > 0.5
 
 
 def test_each_surface_may_have_its_own_permittivity_and_learns_it():

@@ -1,16 +1,166 @@
-"""Queries: what makes two alike, checked against Python's own sets, and batches of them."""
+"""Queries: checks of what a user asks for, equal links, and batches."""
 
+import math
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
-from gaigs.directions import Grid
-from gaigs.query import Batch, Query
+from gaigs.geometry import Grid, Rays
+from gaigs.query import Batch, Query, as_directions
+
+PLACE = [[1.0, 2, 3]]
+NONE, ONE, BAND = torch.zeros(0), torch.tensor([2.437123e9]), torch.tensor([1e9, 2e9, 4e9])
+QUERY = Query(torch.zeros(2, 3), torch.zeros(2, dtype=torch.long))
+
+
+def ask(positions=PLACE, receiver=0, frequency=None, known=NONE):
+    return Query.from_positions(positions, receiver, frequency, ["west", "east"], known)
+
+
+@pytest.mark.parametrize(
+    ("positions", "message"),
+    [
+        ([1.0, 2], r"\(..., 3\) positions \[m\], got shape \(2,\)"),
+        ([[1.0, 2]], r"got shape \(1, 2\)"),
+        (3.0, r"got shape \(\)"),
+        ([[1.0, 2, 3], [0, math.nan, 1]], r"must be finite, got \[0.0, nan, 1.0\] in row 1"),
+        ([[1.0, math.inf, 3]], "must be finite"),
+        ([[1.0, 2, 3], [0, -1e5, 0]], r"within 1e5 m of the origin .*, got \[0.0, -100000.0, 0.0\] in row 1"),
+        (torch.ones(1, 3, dtype=torch.complex64), r"must be \(..., 3\) positions \[m\] in real numbers"),
+        ([[1.0, 2, 3], [1.0, 2]], r"in real numbers, got \[\[1.0, 2, 3\], \[1.0, 2\]\]"),
+        ("west", "in real numbers, got 'west'"),
+        (None, "in real numbers, got None"),
+        (np.ones((1, 3), dtype=bool), "in real numbers"),
+        (np.ma.array([[1.0, 2, 3]], mask=[[True, False, False]]), "in real numbers, got masked_array"),
+        (replace(QUERY, transmitters=torch.full((2, 3), math.nan)), "transmitters must be finite"),
+        (replace(QUERY, receivers=torch.full((2,), 9)), "receiver must be one of 0 = west"),
+        (replace(QUERY, frequencies=torch.full((2,), 60.0)), r"must be a carrier in Hz, .* got 60; in GHz\?"),
+    ],
+)
+def test_impossible_positions_are_refused(positions, message):
+    with pytest.raises(ValueError, match=message) as error:
+        ask(positions)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("receiver", "message"),
+    [
+        (2, "must be one of 0 = west, 1 = east, got 2"),
+        (-1, "got -1"),
+        ("north", "got 'north'"),
+        (True, "got True"),
+        (1.0, "got 1.0"),
+        (["west"], r"got \['west'\]"),
+        (10**30, "got 1000"),
+        (torch.tensor([0.0]), r"got \(1,\) of torch.float32"),
+        (np.array([0, 7, 1]), "got 7"),
+        (torch.tensor([0, 1]), r"one for each of the \(1,\) positions, got \(2,\)"),
+        (torch.tensor([[0]]), r"one for each of the \(1,\) positions, got \(1, 1\)"),
+    ],
+)
+def test_impossible_receivers_are_refused(receiver, message):
+    with pytest.raises(ValueError, match=message) as error:
+        ask(receiver=receiver)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("known", [NONE, ONE, BAND])
+@pytest.mark.parametrize(
+    ("frequency", "message"),
+    [
+        (0.0, r"^a frequency must be a carrier in Hz, from 10000 to 3e\+11, got 0$"),
+        (math.nan, "got nan$"),
+        (math.inf, "got inf$"),
+        (9e11, r"got 9e\+11$"),
+        (0.95, r"got 0\.95; in GHz\?$"),
+        (950, r"got 950; in MHz\?$"),
+        (torch.tensor([2.4e9, 5.0]), r"got 5; in GHz\?$"),
+        ("2 GHz", "must be a carrier in Hz in real numbers, got '2 GHz'"),
+        (1e9 + 1j, "must be a carrier in Hz in real numbers, got"),
+    ],
+)
+def test_impossible_frequencies_are_refused(frequency, message, known):
+    with pytest.raises(ValueError, match=message):
+        ask(frequency=frequency, known=known)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"frequency": 1e9}, "the training links have no known carrier, so no other can be predicted; leave frequency"),
+        ({"frequency": 60e9, "known": ONE}, r"have one carrier, 2\.437123e\+09 Hz, so no other can be predicted"),
+        ({"frequency": float(ONE) * (1 + 2e-6), "known": ONE}, "have one carrier"),
+        ({"known": BAND}, r"have 3 carriers, 1e\+09 to 4e\+09 Hz; choose one with frequency="),
+        ({"positions": QUERY, "known": BAND}, "have 3 carriers"),
+        ({"frequency": BAND, "known": BAND}, r"one for each of the \(1,\) positions, got \(3,\)"),
+        ({"positions": QUERY, "receiver": 1}, "a query has its own receivers and frequencies"),
+        ({"positions": QUERY, "receiver": "west"}, "a query has its own receivers and frequencies"),
+        ({"positions": QUERY, "frequency": 1e9}, "leave receiver and frequency out"),
+    ],
+)
+def test_contradictory_questions_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ask(**arguments)
+
+
+def test_one_value_or_one_for_each_position():
+    query, shape = ask(torch.zeros(2, 2, 3), [[0, 1], [1, 1]], 2e9, BAND)
+    assert shape == (2, 2)
+    assert query.transmitters.shape == (4, 3)
+    assert query.receivers.tolist() == [0, 1, 1, 1]
+    assert query.frequencies.tolist() == [2e9] * 4
+    query, _ = ask(PLACE * 3, "east", BAND, BAND)
+    assert query.receivers.tolist() == [1, 1, 1]
+    assert torch.equal(query.frequencies, BAND)
+    for index in (np.array([1], dtype=np.uint8), np.int16(1), torch.tensor(1, dtype=torch.int32)):
+        assert ask(receiver=index)[0].receivers.tolist() == [1]
+    assert ask(QUERY)[0].frequencies is None
+    for frequency in (None, float(ONE), 2.437123e9, ONE, float(ONE) * (1 + 5e-7)):
+        assert ask(frequency=frequency, known=ONE)[0].frequencies.shape == (1,)
+
+
+OWN = Grid.degrees(range(10, 90, 10), range(0, 360, 10))
+
+
+@pytest.mark.parametrize(
+    ("directions", "error", "message"),
+    [
+        (30, TypeError, r"must be a gaigs\.geometry\.Grid or gaigs\.geometry\.Rays, .* got int"),
+        (Rays([0.5], [90.0]), ValueError, "azimuths must be .* rad, got 90; Grid.degrees takes degrees"),
+        (Rays([-2.0], [0.0]), ValueError, "elevations must be .* -1.5708 to 1.5708 rad, got -2; Grid"),
+        (Grid([math.nan], [0.0]), ValueError, "elevations must be .* rad, got nan"),
+        (Rays(["up"], [0.0]), ValueError, r"elevations must be .* in real numbers, got \['up'\]"),
+        (Rays(0.5, [0.0]), ValueError, r"elevations must be .* rad, got shape \(\)"),
+        (Rays([0.5, 0.6], [0.0]), ValueError, "as many elevations as azimuths, got 2 and 1"),
+    ],
+)
+def test_impossible_directions_are_refused(directions, error, message):
+    with pytest.raises(error, match=message):
+        as_directions(directions, OWN, "spectrum")
+
+
+def test_directions_become_lists_in_float32():
+    assert as_directions(None, OWN, "spectrum") is OWN
+    assert as_directions(None, None, "rssi") is None
+    with pytest.raises(ValueError, match="labels of task 'rssi' have no directions; leave directions out"):
+        as_directions(OWN, None, "rssi")
+
+    class Ring(Rays):
+        pass
+
+    ring = as_directions(Ring([math.pi / 2 + 1e-5] * 3, np.arange(3)), OWN, "spectrum")
+    assert type(ring) is Rays
+    assert ring.azimuths.dtype == ring.elevations.dtype == torch.float32
+
 
 both = pytest.mark.parametrize("with_receivers", [False, True])
 
 
 def make(n=60, dtype=torch.float32, frequencies=True, seed=0):
-    """Links between few places, receivers and carriers, so that many are alike."""
+    """Links between few places, receivers and carriers, so that many are equal."""
     generator = torch.Generator().manual_seed(seed)
     draw = lambda count: torch.randint(count, (n,), generator=generator)
     places = torch.tensor([[0.1, 2, 3], [0.1, 2, -3], [-1, 7, 1], [0.1, -2, 3]], dtype=dtype)
@@ -19,13 +169,11 @@ def make(n=60, dtype=torch.float32, frequencies=True, seed=0):
 
 
 def keys(query, with_receivers):
-    """What two links differ by, as tuples of Python's numbers, in the order that they are sorted by."""
-    rows = query.transmitters.tolist()
-    if query.frequencies is not None:
-        rows = [[*row, frequency] for row, frequency in zip(rows, query.frequencies.tolist(), strict=True)]
-    if with_receivers:
-        rows = [[*row, receiver] for row, receiver in zip(rows, query.receivers.tolist(), strict=True)]
-    return [tuple(row) for row in rows]
+    """Fields by which links differ, as tuples of Python's numbers, in the order of sorting."""
+    columns = [query.transmitters.double()]
+    columns += [] if query.frequencies is None else [query.frequencies.double()[:, None]]
+    columns += [query.receivers.double()[:, None]] if with_receivers else []
+    return [tuple(row) for row in torch.cat(columns, 1).tolist()]
 
 
 @both
@@ -38,24 +186,13 @@ def test_different_links_are_those_of_a_set(with_receivers, frequencies, dtype):
     assert [keys(different, with_receivers)[i] for i in which] == keys(query, with_receivers)
     assert different.transmitters.dtype == dtype
     assert which.dtype == different.receivers.dtype == torch.long
-
-
-def test_each_field_alone_tells_links_apart():
-    query = Query(torch.zeros(2, 3), torch.zeros(2, dtype=torch.long), torch.full((2,), 1e9))
-    assert len(query.unique(True)[0]) == 1
-    for axis in range(3):
-        moved = Query(query.transmitters.clone(), query.receivers, query.frequencies)
-        moved.transmitters[1, axis] = 1e-30
-        assert len(moved.unique(False)[0]) == 2
-    other = Query(query.transmitters, torch.arange(2), query.frequencies)
-    assert [len(other.unique(seen)[0]) for seen in (False, True)] == [1, 2]
-    other = Query(query.transmitters, query.receivers, torch.tensor([1e9, 1e9 + 64]))
-    assert len(other.unique(False)[0]) == 2
+    for i, receiver in enumerate(different.receivers):
+        assert receiver in query.receivers[which == i]
 
 
 @both
 def test_a_place_at_minus_zero_is_the_place_at_zero(with_receivers):
-    query = Query(torch.tensor([[0.0, 1, 2], [-0.0, 1, 2], [0.0, 1, -0.0]]), torch.zeros(3, dtype=torch.long))
+    query = Query(torch.tensor([[0.0, 1, 2], [-0.0, 1, 2], [1e-30, 1, -0.0]]), torch.zeros(3, dtype=torch.long))
     _, which = query.unique(with_receivers)
     assert which[0] == which[1] != which[2]
 
@@ -70,46 +207,24 @@ def test_no_links_are_no_different_links(with_receivers, frequencies):
     assert (different.frequencies is None) == (frequencies is None)
 
 
-def test_where_receivers_do_not_count_each_place_keeps_one_of_its_own():
-    query = make()
-    different, which = query.unique(with_receivers=False)
-    for i, receiver in enumerate(different.receivers):
-        assert receiver in query.receivers[which == i]
-
-
-@pytest.mark.parametrize(
-    "index", [slice(1, 20, 3), torch.tensor([4, 4, 0]), torch.zeros(0).long(), torch.arange(60) > 40]
-)
-def test_some_links_have_all_their_fields(index):
-    query = make()
-    some = query[index]
-    for field in ("transmitters", "receivers", "frequencies"):
-        assert torch.equal(getattr(some, field), getattr(query, field)[index])
-    assert make(frequencies=False)[index].frequencies is None
-
-
 @pytest.mark.parametrize("size", [1, 7, 60, 100])
 def test_parts_are_the_links_in_their_order(size):
     query = make()
     parts = [*query.parts(size)]
     assert [len(part) for part in parts[:-1]] == [size] * (len(parts) - 1)
     assert 1 <= len(parts[-1]) <= size
-    assert torch.equal(torch.cat([part.transmitters for part in parts]), query.transmitters)
-    assert torch.equal(torch.cat([part.frequencies for part in parts]), query.frequencies)
-    assert not [*query[:0].parts(size)]
+    for field in ("transmitters", "receivers", "frequencies"):
+        assert torch.equal(torch.cat([getattr(part, field) for part in parts]), getattr(query, field))
+    assert [len(part) for part in query[:0].parts(size)] == [0]
+    assert make(frequencies=False)[torch.tensor([4, 4, 0])].frequencies is None
 
 
 def test_a_batch_goes_to_another_device_as_a_whole():
-    grid = Grid.degrees(range(1, 4), range(5))
-    batch = Batch(make(), grid, torch.zeros(60, 3, 5), (0.5, 0.25)).to("meta")
+    batch = Batch(make(), Grid.degrees(range(1, 4), range(5)), torch.zeros(60, 3, 5), (0.5, 0.25)).to("meta")
     tensors = [batch.query.transmitters, batch.query.receivers, batch.query.frequencies, batch.labels]
     tensors += [batch.directions.elevations, batch.directions.azimuths]
     assert {tensor.device.type for tensor in tensors} == {"meta"}
     assert batch.shares == (0.5, 0.25)
     assert len(batch) == 60
-
-
-def test_a_batch_without_labels_or_directions_goes_too():
-    batch = Batch(make(frequencies=False)).to("meta")
-    assert batch.labels is batch.directions is batch.query.frequencies is None
-    assert batch.shares == (1.0, 1.0)
+    bare = Batch(make(frequencies=False)).to("meta")
+    assert bare.labels is bare.directions is bare.query.frequencies is None

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from lightning import Trainer
-from omegaconf import OmegaConf
 from torch.optim.lr_scheduler import StepLR
 
 import gaigs
@@ -63,36 +62,13 @@ def component(kind, name, body="value = 1"):
     return f"from gaigs.registry import register\n\n\n@register({kind!r}, {name!r})\nclass Component:\n    {body}\n"
 
 
-BUILT_IN = {
-    "task": {"spectrum", "rssi", "csi"},
-    "data": {"nerf2_spectrum", "nerf2_rssi", "rssi_csv", "csi_npz", "synthetic", "synthetic_rssi", "synthetic_csi"}
-    | {"sionna", "sionna_rssi", "sionna_csi"},
-    "split": {"official", "random", "sparse", "runs", "blocks"},
-    "placement": {"free"},
-    "tokenizer": {"ga", "euclidean", "multiview"},
-    "deformation": {"two_branch", "none"},
-    "projection": {"mercator", "equirectangular", "direction_cosine"},
-    "rasterizer": {"torch", "opencl", "fastest"},
-    "pooling": {"spectrum", "softmax_attention", "mean_power", "element_sum"},
-    "loss": {"absolute", "squared", "huber", "l1_ssim", "log_relative_error", "relative_error"},
-    "benchmark": {"accuracy", "all", "budgets", "guard", "rasterizer", "step"},
-    "model": {"gaigs", "mean", "knn", "path_loss", "friis", "gaussian_process", "kriging"},
-    "training": {"descent", "adversarial"},
-}
-
-
-def test_each_kind_has_its_components():
-    assert BUILT_IN.keys() == set(KINDS)
-    for kind, names in BUILT_IN.items():
-        assert names <= set(registry(kind).names()), kind
-        assert all(callable(registry(kind).get(name)) for name in names - {"opencl"})  # which needs a driver
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_built_in_file_bears_the_registered_name(kind):
     holders, unreadable = find_holders(kind)
     folder = Path(gaigs.__path__[0]) / kind
     assert not unreadable
+    assert holders
+    assert all(callable(registry(kind).get(h.name)) for h in holders if h.file and h.name not in ("opencl", "aperture"))
     assert [h.name for h in holders if h.file and h.file.parent == folder] == sorted(
         file.stem for file in folder.glob("[!_]*.py") if "@register(" in file.read_text()
     )
@@ -138,17 +114,11 @@ def test_an_unknown_name_suggests_the_nearest_and_lists_all(models):
 
 
 def test_build_passes_options_and_the_context_that_is_asked_for(models):
-    config = OmegaConf.create({"lambda_": 0.33, "model": {"name": "waveguide", "width": "${lambda_}", "modes": 2}})
-    built = models.build(config.model, scene="room", frequency=9e8)
+    config = {"name": "waveguide", "width": 0.33, "modes": 2}
+    built = models.build(config, scene="room", frequency=9e8)
     assert (built.scene, built.width, built.modes) == ("room", 0.33, 2)
+    assert config.keys() == {"name", "width", "modes"}, "the caller's configuration is left as it was"
     assert configuration_of(built) == {"name": "waveguide", "width": 0.33, "modes": 2}, "without the context"
-
-
-def test_build_hands_over_plain_python(models):
-    config = {"name": "horn", "taper": OmegaConf.create([1, "${.0}"])}
-    assert models.build(config, scene="room") == (0.0, {"taper": [1, 1], "scene": "room"})
-    assert type(models.build(config)[1]["taper"]) is list
-    assert config.keys() == {"name", "taper"}, "the caller's configuration is left as it was"
 
 
 @pytest.mark.parametrize(
@@ -162,7 +132,6 @@ def test_build_hands_over_plain_python(models):
         ),
         ({"name": "waveguide", "width": 1, "scene": 2}, r"'waveguide' has no option 'scene'; it has: width, modes"),
         ({"name": "horn", "scene": 2}, r"'horn' has no option 'scene'; it has: gain_db"),
-        (OmegaConf.create({"name": "waveguide", "width": "???"}), r"needs values for width, which stand at '\?\?\?'"),
     ],
 )
 def test_build_refuses(models, config, message):
@@ -189,7 +158,7 @@ def test_what_is_registered_can_be_called(models):
         models.register("mast")(3)
 
 
-@pytest.mark.parametrize("config", [["horn"], OmegaConf.create(["horn"]), None, 3])
+@pytest.mark.parametrize("config", [["horn"], None, 3])
 def test_build_needs_a_name_or_a_mapping(models, config):
     with pytest.raises(TypeError, match="must be a mapping with the key 'name', got"):
         models.build(config)
@@ -306,15 +275,15 @@ def exits():
     [
         (lambda steps: 1 / steps, {"steps": 0}, "ZeroDivisionError: division by zero"),
         (lambda order: 10.0**order, {"order": 999}, "OverflowError: "),
-        (lambda count: bytes(count), {"count": 2**62}, "MemoryError: "),
+        (lambda count: bytes(count), {"count": 2**62}, "MemoryError:"),
         (lambda count: torch.empty(count), {"count": 2**58}, "RuntimeError: "),
         (exits, {}, "SystemExit: 0"),
         (StepLR, {"optimizer": 3, "step_size": 1}, "TypeError: int is not an Optimizer"),
     ],
 )
 def test_what_says_nothing_of_its_options_is_told_with_them(function, options, cause):
-    told = f"horn cannot be made with {options}: {cause}"
-    with pytest.raises(ValueError, match=f"^{re.escape(told)}"):
+    keys = ", ".join(options) or "none"
+    with pytest.raises(ValueError, match=rf"^horn cannot be made \({re.escape(cause)}.*\)\ncheck its options: {keys}$"):
         call("horn", function, options)
 
 
@@ -358,7 +327,7 @@ def test_types_of_the_context_are_the_callers_own():
 
 
 def test_annotations_in_quotes_are_checked_where_they_can_be_read():
-    def quoted(count: "int", scene: "Scene" = None): ...
+    def quoted(count: "int", scene: "Scene" = None): ...  # noqa: F821
 
     with pytest.raises(ValueError, match="needs option count"):
         call("horn", quoted, {})

@@ -1,3 +1,5 @@
+"""One run: interruption and resume, the run folder, refused options and data."""
+
 import errno
 import hashlib
 import json
@@ -11,19 +13,17 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from PIL import Image
 
 import gaigs
-from gaigs import checkpoint, evaluation, runs
-from gaigs.configuration import conf_dir
+from gaigs import checkpoint, configuration, runs
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.geometry import Pose
 from gaigs.processes import Stopped, stopping
 from gaigs.radio_maps import RadioMap
 from gaigs.report.curves import read_curves
+from gaigs.runs import evaluation
 from gaigs.testing import example_links
 from gaigs.training.descent import Descent
 
@@ -42,59 +42,52 @@ SMALL = (
     "baselines=[{name: mean}, {name: knn, k: 3, power: 2.0}]",
 )
 CASES = {
-    "validation": (),
-    "no validation": ("split.validation=0",),
-    "no validation in time": ("trainer.val_check_interval=100",),
-    "density control": (
-        "training.density={every: 3, start: 3, stop: 9, gradient: 1.0e-4, split_angle: 0.3, opacity: 0.005, "
-        "max_count: 50}",
+    "validation": (3, ()),  # within a pass
+    "no validation": (5, ("split.validation=0",)),
+    "no validation in time": (3, ("trainer.val_check_interval=100",)),
+    "density control": (  # before a density round
+        5,
+        (
+            "training.density={every: 3, start: 3, stop: 9, gradient: 1.0e-4, split_angle: 0.3, opacity: 0.005, "
+            "max_count: 50}",
+        ),
     ),
     "early stop": (  # the first step drives all opacities to 0 or 1, so the second validation is as good as the first
-        "trainer.val_check_interval=3",
-        "training.patience=1",
-        "training.learning_rates={means: 0, quats: 0, log_scales: 0, opacity_logits: 1.0e+5, signal: 0, network: 0}",
+        3,
+        (
+            "trainer.val_check_interval=3",
+            "training.patience=1",
+            "training.learning_rates={means: 0, quats: 0, log_scales: 0, opacity_logits: 1e5, signal: 0, network: 0}",
+        ),
     ),
 }
+"""The step at which a run is interrupted, and its options."""
+
 METRICS = [
-    "task",
-    "data",
-    "split",
-    "seed",
-    "device",
-    "rasterizer",
-    "train_seconds",
-    "inference_ms",
-    "render_ms",
-    "num_gaussians",
-    "num_gaussians_start",
-    "num_parameters",
-    "checkpoint_bytes",
-    "models",
-    "validation",
-    "validation_score",
-    "receivers",
-]
+    "task", "data", "split", "seed", "device", "rasterizer", "train_seconds", "inference_ms", "render_ms",
+    "num_gaussians", "num_gaussians_start", "num_parameters", "checkpoint_bytes", "models", "validation",
+    "validation_score", "receivers",
+]  # fmt: skip
 
 
 def configure(*overrides):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", [*SMALL, *overrides]), resolve=True)
+    return gaigs.compose(*SMALL, *overrides)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def no_figures():
     """Figures take longer than all else; the tests of gaigs.report and of the command line draw them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluation, "write_figures", lambda *_: None)
+        patch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
         yield
 
 
 @pytest.fixture(scope="module", params=CASES)
 def case(request, tmp_path_factory):
-    """A configuration and the folder of its run, which nothing interrupted."""
-    config = configure(*CASES[request.param])
-    folder = tmp_path_factory.mktemp("whole")
-    return config, folder, runs.run(config, folder)
+    """A step, a configuration, and the folder of its run, which nothing interrupted."""
+    at, options = CASES[request.param]
+    config, folder = configure(*options), tmp_path_factory.mktemp("uninterrupted")
+    return at, config, folder, runs.run(config, folder)
 
 
 def interrupt(monkeypatch, at, times=1):
@@ -137,9 +130,8 @@ def assert_same_run(metrics, folder, others, other):
         np.testing.assert_array_equal(curves[name], resumed[name], name)
 
 
-@pytest.mark.parametrize("at", [3, 5, 6])  # within a pass; before a validation; before a density round or early stop
-def test_an_interrupted_run_ends_as_if_it_had_not_been(case, at, tmp_path, monkeypatch):
-    config, folder, metrics = case
+def test_an_interrupted_run_ends_as_if_it_had_not_been(case, tmp_path, monkeypatch):
+    at, config, folder, metrics = case
     handler = signal.getsignal(signal.SIGINT)
     with monkeypatch.context() as patch:
         interrupt(patch, at)
@@ -151,10 +143,11 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(case, at, tmp_path, monke
     assert signal.getsignal(signal.SIGINT) is handler
 
 
-def test_a_run_goes_on_from_a_save_every_step_and_after_several_interruptions(case, tmp_path, monkeypatch):
-    config, folder, metrics = case
+@pytest.mark.parametrize("case", ["density control"], indirect=True)
+def test_a_run_is_resumed_after_several_interruptions_with_a_save_every_step(case, tmp_path, monkeypatch):
+    _, config, folder, metrics = case
     config = config | {"save_every": 0}
-    for at in (1, 2, 4):
+    for at in (1, 2, 6):
         with monkeypatch.context() as patch:
             interrupt(patch, at)
             with pytest.raises(KeyboardInterrupt):
@@ -167,7 +160,7 @@ def test_a_run_goes_on_from_a_save_every_step_and_after_several_interruptions(ca
 
 
 def test_the_cases_are_what_they_are_called(case):
-    config, folder, metrics = case
+    _, config, folder, metrics = case
     best, last = (torch.load(folder / f"{name}.ckpt", weights_only=True) for name in ("best", "last"))
     changed = metrics["num_gaussians"] != metrics["num_gaussians_start"]
     assert changed == (config["training"]["density"] is not None)
@@ -189,16 +182,18 @@ def test_a_second_ctrl_c_stops_within_the_step(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("hook", "message", "left"),
-    [("on_fit_start", "stopped", False), ("on_train_end", "stopped after step 14", True)],
-    ids=["before the first step", "behind the last one"],
+    ("hook", "number", "message", "left"),
+    [
+        ("on_fit_start", signal.SIGINT, "stopped", False),
+        ("on_fit_start", signal.SIGTERM, "stopped", False),
+        ("on_train_end", signal.SIGTERM, "stopped after step 2", True),
+    ],
 )
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_around_the_steps_stops_a_run_too(hook, message, left, number, tmp_path, monkeypatch):
     """Lightning would exit with 1 and no word before them; behind them no step comes that could look at it."""
     monkeypatch.setattr(Descent, hook, lambda *_: signal.raise_signal(number), raising=False)
     with stopping(), pytest.raises(Stopped, match=f"{message}$") as stop:
-        runs.run(configure(), tmp_path)
+        runs.run(configure("trainer.max_steps=2"), tmp_path)
     assert stop.value.number == number
     assert (tmp_path / "last.ckpt").exists() == left
     assert not (tmp_path / "metrics.json").exists()
@@ -275,17 +270,13 @@ def test_a_finished_run_started_again_ends_at_once(finished, monkeypatch):
     assert digest(folder) == before
 
 
-@pytest.mark.parametrize("text", ["", '{"task": "spectrum", "mod', "{}"])
-def test_damaged_metrics_of_a_finished_run_are_named(finished, tmp_path, text):
+def test_damaged_metrics_of_a_finished_run_are_named(finished, tmp_path):
     config, folder, _ = finished
     copy = shutil.copytree(folder, tmp_path / "run")
-    (copy / "metrics.json").write_text(text)
+    (copy / "metrics.json").write_text('{"task": "spectrum", "mod')
     before = digest(copy)
-    with pytest.raises(
-        ValueError, match=r"run/metrics\.json must hold what a run writes, .* move the file elsewhere"
-    ) as error:
+    with pytest.raises(ValueError, match=r"run/metrics\.json"):
         runs.run(config, copy)
-    assert "\n" not in str(error.value)
     assert digest(copy) == before
 
 
@@ -304,31 +295,19 @@ def lose(*keys):
 @pytest.mark.parametrize(
     ("name", "spoil", "message"),
     [
-        (
-            "last.ckpt",
-            lambda path: path.write_bytes(path.read_bytes()[:-999]),
-            "last.ckpt must be a checkpoint of gaigs",
-        ),
-        ("last.ckpt", lambda path: path.write_bytes(b""), "last.ckpt must be a checkpoint of gaigs, and is damaged"),
-        ("last.ckpt", lose("loops", "split"), "last.ckpt must hold the state of a training, and lacks loops, split"),
-        (
-            "best.ckpt",
-            lambda path: path.write_bytes(path.read_bytes()[:-999]),
-            "best.ckpt must be a checkpoint of gaigs",
-        ),
+        ("last.ckpt", lambda path: path.write_bytes(path.read_bytes()[:-999]), "last.ckpt is damaged"),
+        ("last.ckpt", lose("loops", "split"), "last.ckpt lacks loops, split of a training"),
+        ("best.ckpt", lambda path: path.write_bytes(b""), "best.ckpt is damaged"),
     ],
 )
-def test_a_damaged_checkpoint_to_go_on_from_destroys_nothing(finished, tmp_path, name, spoil, message):
+def test_a_damaged_checkpoint_to_resume_from_destroys_nothing(finished, tmp_path, name, spoil, message):
     config, folder, _ = finished
     copy = shutil.copytree(folder, tmp_path / "run")
     (copy / "metrics.json").unlink()
     spoil(copy / name)
     before = digest(copy)
-    with pytest.raises(
-        ValueError, match=rf"the training cannot go on: .*{message}.*; move .*last\.ckpt elsewhere"
-    ) as error:
+    with pytest.raises(ValueError, match=rf"cannot resume the training: .*{message}.*\nmove .*last\.ckpt elsewhere"):
         runs.run(config, copy)
-    assert "\n" not in str(error.value)
     assert digest(copy) == before
 
 
@@ -354,16 +333,14 @@ def test_a_damaged_configuration_in_the_folder_is_named(text, finished, tmp_path
     config, folder, _ = finished
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(
-        ValueError, match=r"config\.yaml must be what a run wrote, and is damaged .*; take another copy"
-    ):
+    with pytest.raises(ValueError, match=r"cannot parse .*config\.yaml: "):
         runs.run(config, tmp_path)
 
 
 def test_a_folder_that_lost_its_configuration_is_refused(finished, tmp_path):
     config, folder, _ = finished
     shutil.copy(folder / "metrics.json", tmp_path)
-    with pytest.raises(ValueError, match=r"must be free or hold a run, and it holds metrics\.json of something else"):
+    with pytest.raises(ValueError, match=r"holds metrics\.json of something else"):
         runs.run(config, tmp_path)
 
 
@@ -396,7 +373,7 @@ def test_a_run_killed_behind_its_training_only_tests_anew(finished, tmp_path, mo
         with pytest.raises(ZeroDivisionError):
             runs.run(config, tmp_path)
     monkeypatch.setattr(Descent, "training_step", lambda *_: 1 / 0)
-    trained = torch.load(tmp_path / "last.ckpt", weights_only=True)["callbacks"]["Timer"]["time_elapsed"]["train"]
+    trained = torch.load(tmp_path / "last.ckpt", weights_only=True)["callbacks"]["Budget"]["seconds"]
     others = runs.run(config, tmp_path)
     assert_same_run(metrics, folder, others, tmp_path)
     assert others["train_seconds"] == trained
@@ -410,9 +387,9 @@ def test_another_configuration_in_the_same_folder_is_refused(left, finished, tmp
     before = digest(folder)
     other = config | {"seed": 1, "gaussians": config["gaussians"] | {"count": 31}}
     other["model"] = config["model"] | {"gaussians": other["gaussians"]}
-    with pytest.raises(ValueError, match="of the same configuration") as error:
+    message = r"a run of another configuration: gaussians\.count was 30, is 31; seed was 0, is 1\nchoose another"
+    with pytest.raises(ValueError, match=message):
         runs.run(other, folder)
-    assert "but gaussians.count was 30, is 31; seed was 0, is 1; choose another folder" in str(error.value)
     assert digest(folder) == before
 
 
@@ -434,18 +411,9 @@ def test_a_folder_with_nothing_to_go_on_from_is_free(tmp_path):
 def test_a_folder_of_something_else_is_left_alone(name, tmp_path):
     (tmp_path / name).write_text("my: own\n")
     before = digest(tmp_path)
-    with pytest.raises(ValueError, match=f"must be free or hold a run, and it holds {name} of something else"):
+    with pytest.raises(ValueError, match=f"holds {name} of something else"):
         runs.run(configure("trainer.max_steps=1"), tmp_path)
     assert digest(tmp_path) == before
-
-
-def test_a_damaged_checkpoint_is_refused(finished, tmp_path):
-    config, folder, _ = finished
-    for name in ("config.yaml", "software.json"):
-        (tmp_path / name).write_text((folder / name).read_text())
-    (tmp_path / "last.ckpt").write_bytes((folder / "last.ckpt").read_bytes()[:5000])
-    with pytest.raises(ValueError, match=r"last\.ckpt must be a checkpoint of gaigs, and is damaged"):
-        runs.run(config, tmp_path)
 
 
 @pytest.mark.parametrize(("model", "others"), [("knn", ["mean"]), ("mean", ["knn"])])
@@ -472,53 +440,55 @@ def test_tensorboard_logs_beside_the_csv(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "message"),
+    ("options", "message"),
     [
-        (["+tokenizer.widht=3"], r"tokenizer 'euclidean' has no option 'widht' \(did you mean 'width'\?\); it has: "),
-        (["+gaussians.conut=3"], r"gaussians has no option 'conut' \(did you mean 'count'\?\); it has: count, near"),
         (
-            ["+deformation.header=[]"],
-            r"deformation 'two_branch' has no option 'header' \(did you mean 'heads'\?\); it has: width",
+            {"+model.gaussians.conut": 3},
+            r"gaussians has no option 'conut' \(did you mean 'count'\?\); it has: count, near",
         ),
-        (["+training.batchsize=3"], r"training 'descent' has no option 'batchsize' \(did you mean 'batch_size'\?\)"),
+        ({"+training.batchsize": 3}, r"training 'descent' has no option 'batchsize' \(did you mean 'batch_size'\?\)"),
+        ({"+training.thinning.strid": 2}, r"training.thinning has no option 'strid' \(did you mean 'stride'\?\)"),
         (
-            ["+training.thinning.strid=2"],
-            r"training.thinning has no option 'strid' \(did you mean 'stride'\?\); it has: stride, rays",
+            {"+training.learning_rates.netwrk": 1},
+            r"training.learning_rates has no key 'netwrk' \(did you mean 'network'\?\)",
         ),
-        (["+training.learning_rates.netwrk=1"], r"rates has 'netwrk' \(did you mean 'network'\?\), and the model"),
-        (["+training.schedule.warm=1"], r"training.schedule has no option 'warm' \(did you mean 'warmup'\?\)"),
-        (["+foo=3"], r"the configuration has no key 'foo'"),
-        (["+task.foo=3"], r"task has no key 'foo'; it has: name, trend, baselines"),
-        (["+task.tren.name=mean"], r"task has no key 'tren' \(did you mean 'trend'\?\)"),
-        (["task.trend=friis"], r"task.trend must be a mapping or null, got 'friis'"),
-        (["baselines=[{name: mean}, {name: mean}]"], r"baselines must have different names, got 'mean' twice"),
-        (["baselines=[{name: gaigs2}]"], r"unknown model 'gaigs2'"),
+        ({"+training.schedule.warm": 1}, r"training.schedule has no option 'warm' \(did you mean 'warmup'\?\)"),
+        ({"baselines": ["mean", {"name": "mean"}]}, r"baselines must have different names, got 'mean' twice"),
+        ({"baselines": ["gaigs2"]}, r"unknown model 'gaigs2'"),
+        ({"baselines": [{"k": 3}]}, r"baselines must be names or model configurations with a name, got {'k': 3}"),
+        ({"baselines": [{"name": "mirrored", "pooling": "path_spectrum"}]}, r"baseline 'mirrored' has to be trained"),
+        ({"task.name": "rssi"}, r"the labels of data 'synthetic' are of task 'spectrum', and"),
+        ({"training.density": {"evry": 3}}, r"density has no option 'evry' \(did you mean 'every'\?\)"),
+        ({"+trainer.callbacks": []}, r"trainer has no option 'callbacks'"),
         (
-            ["task.name=rssi"],
-            r"the labels of data 'synthetic' are of task 'spectrum', and the configuration is for 'rssi'",
+            {"+trainer.accumulate_grad_batches": 2},
+            r"trainer.accumulate_grad_batches must be 1; set",
         ),
-        (["training.density={evry: 3}"], r"density has no option 'evry' \(did you mean 'every'\?\)"),
-        (["training.density=3"], r"training 'descent' option 'density' must be a mapping or null, got 3"),
-        (["+trainer.max_step=3"], r"trainer has no option 'max_step' \(did you mean 'max_steps'\?\)"),
-        (["+trainer.callbacks=[]"], r"trainer has no option 'callbacks'"),
-        (["+trainer.accumulate_grad_batches=2"], r"trainer.accumulate_grad_batches must be 1; set training.batch_size"),
-        (["trainer.devices=2", "trainer.strategy=ddp_spawn"], r"trainer.strategy must be auto for one process or ddp"),
-        (["+trainer.limit_val_batches=2"], r"trainer.limit_val_batches must be left out"),
-        (["+trainer.limit_val_batches=1"], r"trainer.limit_val_batches must be left out"),
-        (["+trainer.limit_train_batches=0"], r"trainer.limit_train_batches must be left out"),
-        (["+trainer.limit_train_batches=1"], r"trainer.limit_train_batches must be left out"),
-        (["+trainer.overfit_batches=1"], r"trainer.overfit_batches must be left out"),
-        (["+trainer.overfit_batches=0.5"], r"trainer.overfit_batches must be left out"),
-        (["+trainer.fast_dev_run=true"], r"trainer.fast_dev_run must be left out"),
-        (["task.trend={name: gaigs}"], r"the trend must be fitted at once .* and gaigs has to be trained itself"),
-        (["trainer.max_steps=-1"], r"trainer.max_steps must be at least 1, got -1"),
-        (["split.name=blcks"], r"unknown split 'blcks' \(did you mean 'blocks'\?\)"),
+        (
+            {"trainer.devices": 2, "trainer.strategy": "ddp_spawn"},
+            r"trainer.strategy must be auto for one",
+        ),
+        ({"+trainer.limit_val_batches": 2}, r"trainer.limit_val_batches must be left out"),
+        ({"+trainer.limit_train_batches": 1}, r"trainer.limit_train_batches must be left out"),
+        ({"+trainer.overfit_batches": 0.5}, r"trainer.overfit_batches must be left out"),
+        ({"+trainer.fast_dev_run": True}, r"trainer.fast_dev_run must be left out"),
+        ({"task.trend": {"name": "gaigs"}}, r"the trend must be fitted at once .* and gaigs has to be trained itself"),
     ],
 )
-def test_a_wrong_option_is_named(overrides, message, tmp_path):
+def test_a_wrong_option_is_named(options, message, small, tmp_path):
+    config = OmegaConf.create(small)
+    for key, value in options.items():
+        OmegaConf.update(config, key.removeprefix("+"), value, merge=False)
+        if key == "task.trend":
+            config.model.trend = value
     with pytest.raises((ValueError, TypeError), match=message):
-        gaigs.run(configure(*overrides), tmp_path)
+        gaigs.run(configuration.resolve(config), tmp_path)
     assert not list(tmp_path.glob("*.ckpt"))
+
+
+@pytest.fixture(scope="module")
+def small():
+    return configure()
 
 
 @pytest.fixture(scope="module")
@@ -530,35 +500,19 @@ def rfid(tmp_path_factory):
     return folder
 
 
-def nan_position(folder):
-    lines = (folder / "tx_pos.csv").read_text().splitlines()
-    lines[3] = "0.5,nan,1.0"
-    (folder / "tx_pos.csv").write_text("\n".join(lines))
-    return r"tx_pos\.csv, line 4, column y: expected a finite number, got 'nan'"
-
-
-def wide_image(folder):
-    Image.fromarray(np.zeros((90, 361), np.uint8)).save(folder / "spectrum" / "00004.png")
-    return r"00004\.png: expected 90 x 360 pixels, got 90 x 361"
-
-
-def missing_image(folder):
-    (folder / "spectrum" / "00004.png").unlink()
-    return r"00004\.png: missing"
-
-
 def measured(folder):
     """A configuration of measured spectra."""
     config = configure("trainer.max_steps=2")
     return config | {"data": {"name": "nerf2_spectrum", "root": str(folder)}}
 
 
-@pytest.mark.parametrize("damage", [nan_position, wide_image, missing_image])
-def test_damaged_data_are_refused_and_left_alone(damage, rfid, tmp_path):
+def test_damaged_data_are_refused_and_left_alone(rfid, tmp_path):
     data = shutil.copytree(rfid, tmp_path / "data")
-    message = damage(data)
+    lines = (data / "tx_pos.csv").read_text().splitlines()
+    lines[3] = "0.5,nan,1.0"
+    (data / "tx_pos.csv").write_text("\n".join(lines))
     before = digest(data)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"tx_pos\.csv, line 4: expected a finite number, got 'nan' in column y"):
         runs.run(measured(data), tmp_path / "run")
     assert digest(data) == before
 
@@ -580,7 +534,7 @@ def test_another_split_in_the_same_folder_is_refused():
     runs.folder.check_same_links(links, links, Path("last.ckpt"))
     exchanged = links | {"split": links["split"] | {"train": torch.tensor([0, 3]), "test": torch.tensor([1])}}
     for others in (exchanged, links | {"links": "another"}):
-        with pytest.raises(ValueError, match=r"last\.ckpt must be of these very data"):
+        with pytest.raises(ValueError, match=r"the data have changed since last\.ckpt was written"):
             runs.folder.check_same_links(links, others, Path("last.ckpt"))
 
 
@@ -611,13 +565,11 @@ RSSI = (
 
 
 def rssi_run(folder, *overrides):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = OmegaConf.to_container(compose("config", [*RSSI, *overrides]), resolve=True)
-    return config, runs.run(config, folder)
+    return runs.run(gaigs.compose(*RSSI, *overrides), folder)
 
 
 def test_rssi_from_end_to_end(tmp_path):
-    _, metrics = rssi_run(tmp_path)
+    metrics = rssi_run(tmp_path)
     assert list(metrics) == METRICS
     assert list(metrics["models"]) == ["gaigs", "mean", "knn", "path_loss", "gaussian_process"]
     assert list(metrics["receivers"]) == ["west", "south", "east", "north"]
@@ -646,13 +598,11 @@ def test_rssi_that_learns_nothing_keeps_its_trend(tmp_path):
 def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path):
     """Whatever the steps do: here they drive all apart. The start is looked at before the first revision."""
     options = (
-        "+experiment=mirrored_csi", "data.transmitters=60", "split.validation=0.5", "kriging=false",
+        "+experiment=mirrored_csi", "data.transmitters=30", "data.order=1", "split.validation=0.5", "kriging=false",
         "baselines=[{name: friis}]", "trainer.max_steps=6", "trainer.val_check_interval=3", *SMALL[9:11],
-        "training.learning_rates={planes: 10, paths: 10, obstacles: 10}",
+        "training.learning_rates={planes: 10, paths: 10, obstacles: 10}", "placement.planes=6", "placement.order=1",
     )  # fmt: skip
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = OmegaConf.to_container(compose("config", [*options]), resolve=True)
-    metrics = runs.run(config, tmp_path)
+    metrics = runs.run(gaigs.compose(*options), tmp_path)
     own, free_space = (metrics["validation"][name] for name in ("mirrored", "friis"))
     for name in ("sinad_db_mean", "snr_db_median", "nmse_db"):
         assert own[name] == pytest.approx(free_space[name], abs=1e-2)
@@ -663,12 +613,12 @@ def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path):
 # --- what computed a run ---
 
 
-def test_a_folder_of_an_earlier_version_is_refused_in_one_sentence(finished, tmp_path):
+def test_a_folder_of_an_earlier_version_is_refused(finished, tmp_path):
     config, folder, _ = finished
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     (copy / "software.json").unlink()
-    with pytest.raises(ValueError, match=r"copy was begun by gaigs 0.1 or earlier, and this is .*; choose another"):
+    with pytest.raises(ValueError, match=r"copy was begun by gaigs 0.1 or earlier, and this is .*\nchoose another"):
         runs.run(config, copy)
     (copy / "software.json").write_text('{"gaigs": "0.1.3"}')
     with pytest.raises(ValueError, match=r"copy was begun by gaigs 0.1.3, and this is"):
@@ -703,7 +653,7 @@ def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch):
     for file in (other, own):
         text = file.read_text()
         file.write_text(text + "\n")
-        with pytest.raises(ValueError, match="of the same plug-ins, and the source of model own_mean has changed"):
+        with pytest.raises(ValueError, match=r"the source of model own_mean has changed since .*run was begun"):
             runs.folder.claim(folder, config)
         file.write_text(text)
     (tmp_path / "plugins/unrelated.py").write_text("")

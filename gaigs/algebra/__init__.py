@@ -14,17 +14,16 @@ from torch import Tensor
 class Algebra:
     """The Clifford algebra G(p, q, r): of n = p + q + r basis vectors p square to +1, q to -1 and r to 0.
 
-    A multivector is the last axis of a tensor, ``k = 2**n`` numbers, one a basis blade. Basis vectors stand in the
-    order null, positive, negative; blades by grade, then in the order of a dictionary. They count from e0 if there is
-    a null vector, else from e1, so that
+    A multivector is the last axis of a tensor: ``k = 2**n`` components, one for each basis blade. The order of basis
+    vectors is null, positive, negative; blades are sorted by grade, then by their vectors. Vectors count from e0 if
+    there is a null vector, else from e1:
 
     - G(3,0,1), ``PROJECTIVE``: e0² = 0, e1² = e2² = e3² = 1, components
       ``1, e0, e1, e2, e3, e01, e02, e03, e12, e13, e23, e012, e013, e023, e123, e0123``;
     - G(3,1,0), ``SPACETIME``: e1² = e2² = e3² = 1, e4² = -1, components
       ``1, e1, e2, e3, e4, e12, e13, e14, e23, e24, e34, e123, e124, e134, e234, e1234``.
 
-    Tables are made once for each signature, device and dtype; every operation follows those of its input, takes any
-    leading axes, and is differentiable.
+    Every operation takes any leading axes, device and dtype, and is differentiable.
 
     Raises:
         ValueError: A count is negative, or all are zero.
@@ -52,7 +51,7 @@ class Algebra:
     def __post_init__(self):
         if min(self.p, self.q, self.r) < 0 or self.dimension == 0:
             raise ValueError(
-                f"a signature (p, q, r) must count at least one basis vector and none negative, got "
+                f"a signature (p, q, r) must have at least one basis vector and no negative count, got "
                 f"({self.p}, {self.q}, {self.r}); Algebra(3, 0, 1) is the projective one"
             )
 
@@ -79,7 +78,7 @@ class Algebra:
 
     @property
     def homogeneous(self) -> int:
-        """Position of the blade of all vectors that are not null: e123, a projective point's homogeneous coordinate."""
+        """Index of the blade of all vectors that are not null: e123, a projective point's homogeneous coordinate."""
         return _vectors(self.dimension).index(tuple(range(self.r, self.dimension)))
 
     def product(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
@@ -87,7 +86,7 @@ class Algebra:
         return self._multiply("product", x, y)
 
     def wedge(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
-        """Outer product x ∧ y; in the projective algebra what two elements share, such as the line of two planes."""
+        """Outer product x ∧ y; in the projective algebra the intersection, such as the line of two planes."""
         return self._multiply("wedge", x, y)
 
     def join(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
@@ -100,15 +99,15 @@ class Algebra:
     def product_and_join(
         self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
     ) -> tuple[Float[Tensor, "*batch k"], Float[Tensor, "*batch k"]]:
-        """``product`` and ``join`` of the same multivectors, in little more than the time of one."""
+        """``product`` and ``join`` of the same multivectors in one multiplication."""
         return self._multiply("product_and_join", x, y).chunk(2, -1)
 
     def inner(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch"]:
-        """Invariant inner product, the scalar part of reverse(x) y; blades with a null vector do not count."""
+        """Invariant inner product, the scalar part of reverse(x) y; blades with a null vector have weight 0."""
         return (x * y * self.table("metric", x)).sum(-1)
 
     def reverse(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
-        """The vectors of every blade in opposite order."""
+        """Reversal: the vectors of every blade in opposite order."""
         return x * self.table("reverse", x)
 
     def involute(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
@@ -126,7 +125,7 @@ class Algebra:
         return x * self.table("grades", x)[grade]
 
     def dual(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
-        """Right complement: blade ∧ dual(blade) is the pseudoscalar; it needs no metric, so null vectors do no harm."""
+        """Right complement: blade ∧ dual(blade) is the pseudoscalar; defined for null vectors too."""
         return x @ self.table("dual", x)
 
     def undual(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
@@ -134,9 +133,9 @@ class Algebra:
         return x @ self.table("dual", x).mT
 
     def sandwich(self, versor: Float[Tensor, "*#batch k"], x: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
-        """What a versor makes of x: u x u⁻¹ for an even u, u involute(x) u⁻¹ for an odd one.
+        """Motion of x by a versor u: u x u⁻¹ for an even u, u involute(x) u⁻¹ for an odd one.
 
-        A vector u thus mirrors in the hyperplane orthogonal to it, and products of vectors rotate and translate.
+        A vector u mirrors at the hyperplane orthogonal to it; products of vectors rotate and translate.
 
         Raises:
             ValueError: A versor has no inverse: its square u reverse(u) is zero.
@@ -144,7 +143,7 @@ class Algebra:
         square = self.inner(versor, versor)[..., None]
         if not (square != 0).all():
             raise ValueError("a versor must be a product of vectors that are not null, got one whose square is zero")
-        # Even and odd parts of x apart, because involute(u) carries the sign of an odd versor and leaves an even one.
+        # Even and odd parts of x are moved separately: involute(u) has the sign of an odd versor.
         odd = (x - self.involute(x)) / 2
         moved = self.product(versor, x - odd) + self.product(self.involute(versor), odd)
         return self.product(moved, self.reverse(versor)) / square
@@ -162,8 +161,8 @@ class Algebra:
         return _table(self, name, like.dtype, like.device)
 
     def _multiply(self, name: str, x: Tensor, y: Tensor) -> Tensor:
-        # All k² products of components, then one matrix multiplication, with the components first in memory so that
-        # both run along the batch: a third faster on a CPU, both ways, than gathering the table's non-zero terms.
+        # All k² products of components, then one matrix multiplication, components first in memory: on a CPU a third
+        # faster than gathering the table's non-zero terms.
         x, y = torch.broadcast_tensors(x, y)
         batch = x.shape[:-1]
         rows, columns = (factor.movedim(-1, 0).reshape(self.size, batch.numel()) for factor in (x, y))
@@ -211,8 +210,8 @@ def _tables(algebra: Algebra) -> dict[str, Tensor]:
     infinite = [algebra.r == 1 and len(blade) == algebra.dimension - 1 and 0 in blade for blade in blades]
     ideal = [square(blade[1:]) if at_infinity else 0.0 for blade, at_infinity in zip(blades, infinite, strict=True)]
     reverse = (-1.0) ** (count * (count - 1) // 2).double()
-    # Mirrors and motions leave null vectors as they are, so wedging one of their blades to a grade is equivariant, and
-    # so is taking the grade alone (the blade 1). Every such map is numbered, by blade and then by grade.
+    # Motions leave null vectors unchanged, so the wedge of a grade with one of their blades, 1 included, is
+    # equivariant. Maps are numbered by blade, then by grade.
     null_blades = [i for i, blade in enumerate(blades) if all(vector < algebra.r for vector in blade)]
     first, maps = 0, []
     for i in null_blades:

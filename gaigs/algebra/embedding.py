@@ -1,9 +1,9 @@
 """Points, planes and motions of space as multivectors, and back.
 
-All but the last pair belong to the projective algebra G(3,0,1) and the component order of ``gaigs.algebra.Algebra``. A
-plane is a vector, a point the trivector in which three planes meet, and ``PROJECTIVE.sandwich`` moves either with a
-rotor, a translator or a reflection. Multiples of a multivector mean the same plane, point or motion; a mirrored point
-comes out with a factor of -1, which ``extract_point`` divides away.
+All but the last pair belong to the projective algebra G(3,0,1), in the component order of ``gaigs.algebra.Algebra``. A
+plane is a vector, a point the trivector in which three planes meet; ``PROJECTIVE.sandwich`` moves both by a rotor, a
+translator or a reflection. Multiples of a multivector are the same plane, point or motion; a mirrored point has a
+factor of -1, which ``extract_point`` divides away.
 
 Source: Brehmer et al., Geometric Algebra Transformer, 2023, table 1.
 """
@@ -44,14 +44,14 @@ def embed_point(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]
 
 
 def extract_point(multivectors: Float[Tensor, "*batch 16"]) -> Float[Tensor, "*batch 3"]:
-    """Points [m] of trivectors; not finite where e123 is zero, which means a direction."""
+    """Points [m] of trivectors; not finite for directions, whose e123 is zero."""
     return extract_direction(multivectors) / _extract(multivectors, "e123")
 
 
 def embed_direction(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
-    """Oriented directions, of any length, as points at infinity: trivectors without e123, which no translation moves.
+    """Directions of any length as points at infinity: trivectors without e123, unchanged by translations.
 
-    A mirrored direction comes out negated, as the e123 of a mirrored point does.
+    A mirrored direction is negated, as the e123 of a mirrored point is.
     """
     x, y, z = directions.unbind(-1)
     return _embed(e023=-x, e013=y, e012=-z)
@@ -79,7 +79,7 @@ def extract_plane(
 def embed_reflection(
     normals: Float[Tensor, "*batch 3"], offsets: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 16"]:
-    """The mirror at the plane {x: normal · x = offset} as a unit versor.
+    """Mirrors at planes {x: normal · x = offset} as unit versors.
 
     Raises:
         ValueError: A normal is zero.
@@ -87,7 +87,7 @@ def embed_reflection(
     normals, offsets = _of_moderate_length(normals, offsets)
     length = normals.norm(dim=-1)
     if not (length > 0).all():
-        raise ValueError("a mirror needs a normal, got one of length zero")
+        raise ValueError("a mirror needs a normal, got one of length zero; check the planes")
     return embed_plane(normals / length[..., None], offsets / length)
 
 
@@ -101,7 +101,7 @@ def extract_reflection(
 
 
 def _of_moderate_length(normals: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """The same planes times a power of two, so that squares of their normals neither overflow nor vanish."""
+    """Planes times a power of two, so that squares of their normals neither overflow nor vanish."""
     exponents = torch.frexp(normals.detach().abs().amax(-1)).exponent
     scale = torch.ldexp(torch.ones_like(offsets), -exponents.clamp(-126, 126))
     return normals * scale[..., None], offsets * scale
@@ -133,11 +133,11 @@ def extract_translator(multivectors: Float[Tensor, "*batch 16"]) -> Float[Tensor
 def embed_event(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
     """Points [m] as events at time zero, vectors x e1 + y e2 + z e3 of the space-time algebra G(3,1,0).
 
-    Its motions are rotations, boosts and mirrors about the origin; translations are none of them.
+    Its motions are rotations, boosts and mirrors about the origin, without translations.
     """
     return functional.pad(points, (1, 12))
 
 
 def extract_event(multivectors: Float[Tensor, "*batch 16"]) -> Float[Tensor, "*batch 3"]:
-    """Points [m] at which events of the space-time algebra happen, whatever their time."""
+    """Points [m] of events of the space-time algebra at any time."""
     return multivectors[..., 1:4]

@@ -18,21 +18,13 @@ from torch.nn import functional
 from gaigs.algebra import Algebra
 from gaigs.algebra.mix import Mix
 
-NORM_FLOOR = 0.01
-"""Added to the squared size in the norm: components with e0 have no size, and light-like ones cancel, so tokens may be
-large where their size is zero. They grow tenfold at most, and the gradient at zero is finite. GATr's value."""
-
-HOMOGENEOUS_FLOOR = 1e-3
-"""Added to h² where a trivector is divided by its e123 component h: a direction has h = 0. GATr's value."""
-
 
 class EquivariantLinear(nn.Module):
     """The most general equivariant linear map, learnt for every pair of channels.
 
     It is a sum of basis maps: the projection to each of the n + 1 grades and, with a null vector e0, e0 times each
-    grade but the highest: nine maps for the projective algebra, five for space-time. Multiplying by the pseudoscalar is
-    none of them, because a mirror would change its sign. Scalars mix with the multivectors' component 1, which takes
-    the bias.
+    grade but the highest: nine maps for the projective algebra, five for space-time. Multiplication by the pseudoscalar
+    is excluded, because a mirror changes its sign. Scalars mix with the multivectors' component 1, which has the bias.
 
     Args:
         algebra: Signature of the multivectors.
@@ -49,7 +41,7 @@ class EquivariantLinear(nn.Module):
         self.weight = nn.Parameter(torch.empty(int(self.maps.max()) + 1, multivectors[0], multivectors[1]))
         self.from_scalars = nn.Linear(scalars[0], multivectors[1])
         self.to_scalars = nn.Linear(multivectors[0] + scalars[0], scalars[1])
-        # Components keep their variance: one of 1 / (channels in) a weight, as in a layer of plain numbers.
+        # Weights of variance 1 / (channels in) keep the components' variance.
         bound = (3 / (multivectors[0] + scalars[0])) ** 0.5
         for weight in (self.weight, self.from_scalars.weight, self.to_scalars.weight):
             nn.init.uniform_(weight, -bound, bound)
@@ -60,7 +52,7 @@ class EquivariantLinear(nn.Module):
         self, multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
     ) -> tuple[Float[Tensor, "*batch c_out k"], Float[Tensor, "*batch s_out"]]:
         device = self.weight.device.type
-        if torch.is_autocast_enabled(device):  # products by hand are those of the weights' precision
+        if torch.is_autocast_enabled(device):  # computed in the precision of the weights
             with torch.autocast(device, enabled=False):
                 return self(multivectors.to(self.weight.dtype), scalars.to(self.weight.dtype))
         null_wedges = self.algebra.table("null_wedges", self.weight)
@@ -71,9 +63,9 @@ class EquivariantLinear(nn.Module):
 class GeometricBilinear(nn.Module):
     """Products of learnt pairs of channels: the geometric product and the join of each.
 
-    Geometric products of points make no lines or planes through them; joins do. A mirror changes a join's sign, so
-    joins are multiplied by the e123 component of a reference, whose sign it changes too. Without a null vector products
-    alone reach every grade, so there are twice as many pairs and no joins.
+    Joins give the lines and planes through points, which geometric products do not. A mirror changes a join's sign, so
+    joins are multiplied by the e123 component of a reference, whose sign it also changes. Without a null vector
+    products alone reach every grade, so there are twice as many products and no joins.
 
     Raises:
         ValueError: The multivectors are odd in number and half of them would have to be joins.
@@ -84,7 +76,7 @@ class GeometricBilinear(nn.Module):
     def __init__(self, algebra: Algebra, multivectors: int, scalars: int):
         super().__init__()
         if algebra.r and multivectors % 2:
-            raise ValueError(f"half of the multivectors are joins, so their number must be even, got {multivectors}")
+            raise ValueError(f"multivectors must be even, got {multivectors}: one half are products, the other joins")
         self.algebra = algebra
         factors = multivectors if algebra.r else 2 * multivectors
         self.factors = EquivariantLinear(algebra, (multivectors, factors), (scalars, scalars))
@@ -105,13 +97,17 @@ class GeometricBilinear(nn.Module):
         return self.output(torch.cat((products, orientation * joins), -2), scalars)
 
 
+HOMOGENEOUS_FLOOR = 1e-3
+"""Floor of h² in the division of a trivector by its e123 component h, which is 0 for a direction. GATr's value."""
+
+
 class GeometricAttention(nn.Module):
     """Multi-head attention of all tokens to all tokens, by invariants of their multivectors and scalars.
 
-    The logit of a query and a key is their inner product plus the product of their scalars. The inner product does not
-    see the components with e0 and hence not where a projective point lies. There the logit also holds minus the squared
-    distance of two points, -w(g) w(h) |g y - h x|² for trivectors whose e123 is g or h and whose other components are x
-    or y, with w(h) = h / (h² + floor).
+    The logit of a query and a key is their inner product plus the product of their scalars. The inner product ignores
+    components with e0, and with them the positions of projective points. So in that algebra the logit also has minus
+    the squared distance of two points, -w(g) w(h) |g y - h x|² for trivectors with e123 of g and h and other components
+    x and y, with w(h) = h / (h² + floor).
 
     Args:
         algebra: Signature of the multivectors.
@@ -149,7 +145,7 @@ class GeometricAttention(nn.Module):
         self.register_buffer("form", form, persistent=False)
 
     def features(self, multivectors: Float[Tensor, "*batch c k"]) -> Float[Tensor, "*batch c f"]:
-        """What logits are made of: the components that the inner product sees, and w(h) (x·x, h², h x) of points."""
+        """Factors of the logits: components of the inner product, and w(h) (x·x, h², h x) of points."""
         seen, x = multivectors.index_select(-1, self.blades).split(self.parts, -1)
         if not x.shape[-1]:
             return seen
@@ -161,17 +157,17 @@ class GeometricAttention(nn.Module):
     def forward(
         self, multivectors: Float[Tensor, "*batch tokens c k"], scalars: Float[Tensor, "*batch tokens s"]
     ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
-        """What each token sees of all."""
+        """Each token's attention to all tokens."""
         query, key, value = self._project(multivectors, scalars)
         return self._read(functional.scaled_dot_product_attention(query, key, value).movedim(-3, -2))
 
     def look(
         self, multivectors: Float[Tensor, "tokens c k"], scalars: Float[Tensor, "tokens s"], groups: tuple[int, int]
     ) -> tuple[Float[Tensor, "b c k"], Float[Tensor, "b s"]]:
-        """What the first token of each group sees of its group, and of the tokens that are alike for all groups.
+        """Attention of the first token of each group to its group and to the tokens common to all groups.
 
         Args:
-            multivectors: Tokens' multivectors: one group after the other, then those that are alike, if any.
+            multivectors: Tokens' multivectors: one group after the other, then any common ones.
             scalars: Likewise.
             groups: Number of groups, and of tokens in each.
         """
@@ -207,13 +203,18 @@ class GeometricAttention(nn.Module):
         return self.output(multivectors, scalars.flatten(-2))
 
 
+NORM_FLOOR = 0.01
+"""Added to the squared size: components with e0 have no size and light-like ones cancel, so large tokens may have size
+zero. They grow at most tenfold, and the gradient at zero is finite. GATr's value."""
+
+
 def equivariant_norm(
     algebra: Algebra, multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
 ) -> tuple[Float[Tensor, "*batch c k"], Float[Tensor, "*batch s"]]:
     """Layer normalisation: a token's multivectors by their mean size, its scalars by mean and variance.
 
-    The squared size of a multivector is the sum over its grades of |inner(x, x)|, which no motion changes and which in
-    a signature of both signs cannot cancel between the grades.
+    The squared size of a multivector is the sum over its grades of |inner(x, x)|: invariant, and without cancellation
+    between grades in a signature of both signs.
 
     Source: GATr, "Layer normalization"; de Haan, Cohen & Brehmer, Euclidean, Projective, Conformal, 2023, for the sum
     over grades.
@@ -265,14 +266,14 @@ class GATrBlock(nn.Module):
             multivectors: Tokens' multivectors.
             scalars: Tokens' scalars.
             reference: A multivector that moves with the tokens, such as the mean of the network's inputs. Only its e123
-                is read, and nothing in an algebra without a null vector; see ``GeometricBilinear``.
+                has an influence, and only in an algebra with a null vector; see ``GeometricBilinear``.
         """
         return self.transform(*self.attend(multivectors, scalars), reference)
 
     def attend(
         self, multivectors: Float[Tensor, "*batch tokens c k"], scalars: Float[Tensor, "*batch tokens s"]
     ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
-        """The block's first half, in which tokens look at each other."""
+        """The block's first half: attention between tokens."""
         attended = self.attention(*equivariant_norm(self.algebra, multivectors, scalars))
         return multivectors + attended[0], scalars + attended[1]
 
@@ -290,7 +291,7 @@ class GATrBlock(nn.Module):
         scalars: Float[Tensor, "*batch tokens s"],
         reference: Float[Tensor, "*#batch k"],
     ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
-        """The block's second half, each token by itself."""
+        """The block's second half, for each token alone."""
         products = self.bilinear(*equivariant_norm(self.algebra, multivectors, scalars), reference)
         made = self.linear(*gated_gelu(*products))
         return multivectors + made[0], scalars + made[1]

@@ -1,6 +1,6 @@
-"""What ``layers.EquivariantLinear`` computes, with its gradient written by hand.
+"""The function of ``layers.EquivariantLinear`` with its gradient by hand.
 
-Its tensors are so small that a training step would spend most of its time on autograd's calls between them.
+Its tensors are so small that autograd's calls would take most of a training step.
 """
 
 import torch
@@ -9,17 +9,17 @@ from torch.autograd.function import once_differentiable
 
 
 class Mix(torch.autograd.Function):
-    """Components and channels of multivectors, and scalars, mixed.
+    """Mixes components and channels of multivectors, and scalars.
 
-    One matrix a component, (k, tokens, channels): on a CPU three times as fast as one matrix over channels and
-    components, which is nine tenths zeros. The result keeps that order in memory, so only the first layer copies.
+    One matrix for each component, (k, tokens, channels), is three times as fast on a CPU as one matrix over channels
+    and components, nine tenths of which are zeros. The result has that order in memory, so only the first layer copies.
 
     Args:
         multivectors: (*tokens, c, k).
         scalars: (*tokens, s).
         weight: A matrix for each equivariant map (maps, c, c_out).
-        from_weight, from_bias: What scalars add to the components 1, as ``torch.nn.Linear`` has them.
-        to_weight, to_bias: The scalars of the components 1 and the scalars, likewise.
+        from_weight, from_bias: Linear map from scalars to components 1, as of ``torch.nn.Linear``.
+        to_weight, to_bias: Linear map from components 1 and scalars to scalars, likewise.
         maps: Number of the map that leads from each wedge to each component (2**r, k).
         null_wedges: Matrix of the wedge with each blade of null vectors, the first of which is 1 (2**r, k, k).
 
@@ -72,5 +72,5 @@ class Mix(torch.autograd.Function):
 
 
 def _components_first(multivectors: Tensor) -> Tensor:
-    """(k, tokens, channels), contiguous: of other layouts products are computed matrix by matrix."""
+    """(k, tokens, channels), contiguous: other layouts are multiplied matrix by matrix."""
     return multivectors.movedim(-1, 0).flatten(1, -2).contiguous()

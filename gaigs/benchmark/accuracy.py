@@ -1,81 +1,93 @@
-"""Seconds of training to reach a score, and what a prediction takes at which error: of all systems, end to end."""
+"""Seconds of training to reach a score, and the error and time of a prediction, of all systems."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
-import yaml
-
-from gaigs.benchmark import Context, Glance, Row, check_names
-from gaigs.benchmark._accuracy_page import LOOK_UPS, SYSTEMS, figures, highlights, tables
-from gaigs.benchmark._trainings import Trainings, written
-from gaigs.configuration import conf_dir, plugin_conf_dirs
-from gaigs.registry import check_type, register, registry
+from gaigs.benchmark import Context, Row, grouped, number, table
+from gaigs.benchmark.trainings import Score, Trainings, sections, written
+from gaigs.registry import register, registry
 from gaigs.report.systems import read_published
+from gaigs.report.table import monitor_names
 
-OF_TRAINED = "kriging"
-"""The model that is made of a trained one alone."""
+SYSTEMS, LOOK_UPS = "system", "look-up"
+"""Axes of all systems, and of the task's baselines, which have no training."""
+
+INTRODUCTION = """# Accuracy against time
+
+All systems train for the same time on the same links. Seconds are those of training with its validations, and of
+kriging, which follows. A level is reached at the first validation with at least that score. No other row is both more
+accurate and faster in a prediction than those in bold. Steps are those to the last validation.
+"""
 
 
 @register("benchmark", "accuracy")
 class Accuracy(Trainings):
-    """Trains every system for the same time, and the values of some axes; look-ups stand beside them.
+    """Trains every system, and the values of some axes, for the same time; look-ups stand beside them.
 
     Args:
-        trainer, axes, minutes, device: As for ``Trainings``.
-        levels: Validation scores, by the score's name, of which the time to reach them is told; those that the look-ups
-            reach are told anyway.
-        systems: Models; None: all that are installed but those that some task names as a baseline.
+        trainer, axes: See ``Trainings``.
+        levels: Validation scores, by name of the score, to which the time is measured beside those of the look-ups.
+        systems: Models; None: all installed ones with a published name, see ``conf/published.yaml``.
 
     Raises:
-        TypeError, ValueError: An option does not have its form.
+        TypeError, ValueError: An option has another form.
     """
 
     name = "accuracy"
 
     def __init__(
-        self,
-        trainer: dict,
-        axes: dict,
-        levels: dict,
-        systems: list[str] | None = None,
-        minutes: float | None = None,
-        device: str | None = None,
+        self, trainer: dict, axes: dict[str, dict], levels: dict[str, list[float]], systems: list[str] | None = None
     ):
-        super().__init__(trainer, axes, minutes, device)
-        for score, found in levels.items():
-            check_type(f"benchmark.levels.{score}", found, list[float])
-        if systems:
-            check_names("systems", systems, registry("model").names())
+        super().__init__(trainer, axes)
         self.levels, self.systems = levels, systems
 
     def cells(self, context: Context) -> Iterator[list[Row]]:
-        look_ups = self.reference(context)["baselines"]
-        systems = installed() if self.systems is None else self.systems
-        for device in context.devices:
-            for config in look_ups:
-                options = [f"++model.{key}={written(value)}" for key, value in config.items() if key != "name"]
-                yield self.cell(context, device, options, axis=LOOK_UPS, key="model", value=config["name"])
-            for name in systems:
-                yield self.cell(context, device, (), axis=SYSTEMS, key="model", value=name)
-            yield from self.cells_of_axes(context, device)
+        for config in self.reference(context)["baselines"]:
+            options = [f"++model.{key}={written(value)}" for key, value in config.items() if key != "name"]
+            yield self.cell(context, options, axis=LOOK_UPS, key="model", value=config["name"])
+        known, published = registry("model").names(), read_published().names
+        for name in [name for name in published if name in known] if self.systems is None else self.systems:
+            yield self.cell(context, (), axis=SYSTEMS, key="model", value=name)
+        yield from self.cells_of_axes(context)
 
     def tables(self, rows: Sequence[Row]) -> str:
-        return tables(rows, self.levels)
+        parts = [INTRODUCTION]
+        for heading, score, own in sections(self.name, rows):
+            levels = self.all_levels(own, score)
+            systems = [row for row in own if row["axis"] in (SYSTEMS, LOOK_UPS)]
+            parts += [heading, _table(sorted(systems, key=lambda row: score.loss(row["test"])), levels, score)]
+            for (axis, key, of, default), values in grouped(own, "axis", "key", "of", "default").items():
+                if axis not in (SYSTEMS, LOOK_UPS):
+                    parts.append(f"**{axis}**: `{key}` of `{of or 'the command line'}`; the default is {default}\n")
+                    parts.append(_table(values, levels, score))
+        return "\n".join(parts)
 
-    def figures(self, rows: Sequence[Row]) -> Mapping:
-        return figures(rows)
+    def all_levels(self, rows: Sequence[Row], score: Score) -> dict[str, float]:
+        """Levels by the column's title, the easiest first."""
+        found = {f"{level:g}": level for level in self.levels.get(monitor_names(rows[0]["task"])[0], ())}
+        for row in rows:
+            if row["axis"] == LOOK_UPS and row["validation"]:
+                found[f"`{row['value']}` {number(row['validation'])}"] = float(row["validation"])
+        return dict(sorted(found.items(), key=lambda item: -score.loss(item[1])))
 
-    def highlights(self, rows: Sequence[Row]) -> Sequence[Glance]:
-        return highlights(rows)
 
-
-def installed() -> list[str]:
-    """Models that may need a training, those that publications name first and in their order.
-
-    What some task names as a baseline has none.
-    """
-    without = {OF_TRAINED}
-    for folder in (conf_dir(), *plugin_conf_dirs()):
-        for file in sorted(folder.glob("task/*.yaml")):
-            without |= {config["name"] for config in yaml.safe_load(file.read_text())["task"].get("baselines", ())}
-    names, order = set(registry("model").names()) - without, [*read_published().names]
-    return sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))
+def _table(rows: Sequence[Row], levels: Mapping[str, float], score: Score) -> str:
+    """Scores, seconds to each level, and costs; in bold the rows that no other one beats in error and time."""
+    ahead = []
+    for row in sorted(rows, key=lambda row: (float(row["inference_ms"]), score.loss(row["test"]))):
+        if not ahead or score.loss(row["test"]) < score.loss(ahead[-1]["test"]):
+            ahead.append(row)
+    compared = registry("task").get(rows[0]["task"]).metrics()[score.first].title
+    columns = {"": "name", score.title: "test"} | ({compared: "compared"} if compared != score.title else {})
+    columns |= {"validation": "validation", "inference [ms]": "inference_ms", "rendering [ms]": "render_ms"}
+    columns |= {"training [s]": "train_seconds", **{f"s to {level}": level for level in levels}}
+    columns |= {"steps": "steps", "parameters": "num_parameters", "checkpoint [bytes]": "checkpoint_bytes"}
+    lines, published = [], read_published().names
+    for row in rows:
+        name = published.get(row["value"], row["value"]) if row["key"] == "model" else row["value"]
+        name = f"`{row['value']}`" if row["axis"] == LOOK_UPS else name
+        found = {"name": f"**{name}**" if row in ahead else name}
+        curve = [tuple(map(float, point.split(":"))) for point in row["curve"].split()]  # seconds, validation score
+        for title, level in levels.items():
+            found[title] = next((time for time, value in curve if score.loss(value) <= score.loss(level)), "")
+        lines.append(row | found)
+    return table(lines, columns)

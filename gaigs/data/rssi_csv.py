@@ -1,26 +1,26 @@
-"""Received signal strength from one table; docs/data.md describes its columns."""
+"""Received signal strength in one table; docs/data.md describes its columns."""
 
 import math
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from gaigs.data import Links
-from gaigs.data.nerf2_rssi import LOUDEST, gateway, read_walls, to_dbm
-from gaigs.io.tables import find_file, number_places, read_lines, refuse, to_cells, to_columns, to_coordinates
+from gaigs.data.readings import LOUDEST, gateway, to_dbm
+from gaigs.io.files import write_text
+from gaigs.io.tables import find_file, number_places, quote, read_lines, split_cells, split_rows, to_coordinates
+from gaigs.io.walls import read_walls
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.task.rssi import Rssi
 
-ENDS = ("tx", "rx")
+ENDS = {"tx": "transmitter", "rx": "receiver"}
 COLUMNS = (*(f"{end}_{axis}" for end in ENDS for axis in "xyz"), "rss_dbm")
 """Positions of transmitter and receiver [m], and the reading [dBm]."""
 
-FIXED = 64
-"""Places that the end which stands still may have, each a receiver of its own."""
-
 QUIETEST = -200.0
-"""No level lies below it [dBm]: thermal noise alone is -174 dBm in 1 Hz."""
+"""Lower bound of readings [dBm]: thermal noise alone is -174 dBm in 1 Hz."""
 
 
 @register("data", "rssi_csv")
@@ -32,56 +32,54 @@ def read(
 ) -> Links:
     """A data set from a table with a heading, one reading a line: one link for each reading that was heard.
 
-    Unless told, the end with fewer places is the fixed one, the receiver's in a tie. Its places become the receivers,
-    ``rx1`` ... or ``tx1`` ... in the order in which they appear, and look along the world's axes; the other end moves
-    and gives the transmitters. A fixed transmitter with a moving receiver is thus read as the reverse, which
+    By default the end with fewer places is the fixed one, the receiver's in a tie. Its places become the receivers,
+    ``rx1`` ... or ``tx1`` ... in the order of their first appearance, and look along the world's axes. The other end
+    moves and gives the transmitters. A fixed transmitter with a moving receiver is thus read as the reverse, which
     reciprocity allows: a channel attenuates alike either way, so where an antenna's gain is the same for sending and
     hearing, the reading is what the fixed end would hear if the moving one sent with the fixed one's power.
 
-    Readings of ``not_heard`` were not heard; they, and fixed places that nothing was heard at, are left out and counted
+    Readings of ``not_heard`` were not heard. They, and fixed places that nothing was heard at, are left out and counted
     in the remarks, which also count levels below it. The readings of one place of the moving end share a row. There is
     no official split.
 
     Args:
-        file: Has the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m] and ``rss_dbm`` in any
-            order and in any case; others are ignored, and named in the remarks.
-        layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; none unless given.
-        fixed: The end that stands still, ``tx`` or ``rx``.
-        not_heard: What stands for a reading that was not heard [dBm]; all others lie in [-200, 0).
+        file: Table with the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m] and ``rss_dbm`` in
+            any order and in any case; others are ignored, and named in the remarks.
+        layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; None for no walls.
+        fixed: End that stands still, ``tx`` or ``rx``.
+        not_heard: Value of readings that were not heard [dBm]; all others lie in [-200, 0).
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: ``fixed`` or ``not_heard`` is none of these, the fixed end has more than 64 places, or something is
-            wrong with the files; the message lists the defects by file, line and value.
+        ValueError: An option is out of range, the fixed end has more than 64 places, or a file has a defect; the
+            message names file, line and value.
     """
     if fixed not in (None, *ENDS):
         raise ValueError(f"fixed must be tx or rx, or null for the end with fewer places, got {fixed!r}")
     if not isinstance(not_heard, int | float) or not math.isfinite(not_heard):
         raise ValueError(f"not_heard must be a finite number [dBm], got {not_heard!r}; write such a number in the file")
     file = find_file(file, "a table of readings")
-    defects: list[str] = []
-    points, dbm, ignored = _read_table(file, not_heard, defects)
-    walls = torch.zeros(0, 2, 3) if layout is None else read_walls(Path(layout).expanduser(), defects)
-    refuse(file, defects)
+    points, dbm, ignored = _read_table(file, not_heard)
+    walls = torch.zeros(0, 2, 3) if layout is None else read_walls(Path(layout).expanduser())
 
     numbered = {end: number_places(points[end]) for end in ENDS}
     tx, rx = (len(numbered[end][0]) for end in ENDS)
-    counts = f"{FIXED} places at most, got {tx} of the transmitter and {rx} of the receiver"
-    if min(tx, rx) > FIXED:
-        raise ValueError(
-            f"{file}: one end must stand at {counts}: both ends move; keep the readings of a few places of one end"
-        )
-    fixed = fixed or ("rx" if rx <= tx else "tx")
+    fixed, is_chosen = fixed or ("rx" if rx <= tx else "tx"), fixed is not None
     moving = "tx" if fixed == "rx" else "rx"
     places, at = numbered[fixed]
-    if len(places) > FIXED:
-        raise ValueError(f"{file}: with fixed={fixed} this end must stand at {counts}; set fixed={moving} or null")
+    most = 64  # each fixed place is a receiver of its own
+    if len(places) > most:
+        is_other_better = is_chosen and min(tx, rx) <= most
+        advice = f"set fixed={moving} or null" if is_other_better else "keep the readings of a few places of one end"
+        raise ValueError(
+            f"{file}: the fixed end must stand at {most} places at most, got {tx} of the transmitter and {rx} of the "
+            f"receiver; {advice}"
+        )
     heard = torch.tensor([value != not_heard for value in dbm])
     present, receivers = at[heard].unique(return_inverse=True)
     transmitters = torch.tensor(points[moving])[heard]
-    words = {"tx": "transmitter", "rx": "receiver"}
     remarks = (
-        f"{len(transmitters)} readings of a moving {words[moving]} at {len(present)} places of a fixed {words[fixed]}; "
+        f"{len(transmitters)} readings of a moving {ENDS[moving]} at {len(present)} places of a fixed {ENDS[fixed]}; "
         f"{int((~heard).sum())} of {not_heard:g} dBm were not heard and are left out"
     )
     silent = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
@@ -102,33 +100,37 @@ def read(
     )
 
 
-def _read_table(file: Path, not_heard: float, defects: list[str]) -> tuple[dict[str, list], list[float], list[str]]:
-    """Positions of either end [m], readings [dBm], and the columns that are none of ours."""
-    lines = read_lines(file, f"a heading with {','.join(COLUMNS)}", defects)
-    written = to_cells(lines[0]) if lines else []
+def write(folder: str | Path, links: Links) -> None:
+    """Writes readings as ``room.csv`` in a folder, a table that ``read`` reads.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    receivers = np.array([receiver.pose.position.numpy() for receiver in links.receivers])
+    index = links.query.receivers.numpy()
+    table = np.column_stack((links.query.transmitters.numpy(), receivers[index], links.labels.numpy()))
+    rows = [",".join(f"{value:.9g}" for value in row) for row in table]  # nine digits give the same float32
+    write_text(Path(folder) / "room.csv", "\n".join((",".join(COLUMNS), *rows)) + "\n")
+
+
+def _read_table(file: Path, not_heard: float) -> tuple[dict[str, list], list[float], list[str]]:
+    """Positions of either end [m], readings [dBm], and the names of other columns."""
+    lines = read_lines(file, f"a heading with {','.join(COLUMNS)}")
+    written = split_cells(lines[0])
     names = [name.lower() for name in written]
-    points, dbm = {end: [] for end in ENDS}, []
-    has_semicolons = bool(lines) and ";" in lines[0]
-    if has_semicolons:
-        defects.append(f"{file.name}, line 1: columns are separated by commas, got semicolons in {lines[0]!r}")
+    if ";" in lines[0]:
+        raise ValueError(f"{file}, line 1: expected commas between columns, got semicolons in {quote(lines[0])}")
     for name in COLUMNS:
-        if lines and not has_semicolons and names.count(name) != 1:
-            defects.append(f"{file.name}, line 1: expected one column {name}, got {names.count(name)} in {lines[0]!r}")
+        if (count := names.count(name)) != 1:
+            raise ValueError(f"{file}, line 1: expected one column {name}, got {count} in {quote(lines[0])}")
     if len(lines) == 1:
-        defects.append(f"{file.name}: no readings below the heading")
-    if defects:
-        return points, dbm, []
+        raise ValueError(f"{file}: no readings below the heading")
     at = [names.index(name) for name in COLUMNS]
-    for number, line in enumerate(lines[1:], 2):
-        place = f"{file.name}, line {number}"
-        cells = to_columns(place, line, names, defects)
-        if not cells:
-            continue
-        cells = [cells[k] for k in at]
-        coordinates = to_coordinates(place, COLUMNS, cells[:6], defects)
-        points["tx"].append(coordinates[:3])
-        points["rx"].append(coordinates[3:])
-        dbm += to_dbm(place, COLUMNS[6:], cells[6:], QUIETEST, not_heard, defects)
-    if not defects and all(value == not_heard for value in dbm):
-        defects.append(f"{file.name}: expected a reading that was heard, got none but {not_heard:g} dBm")
+    rows = {number: [cells[k] for k in at] for number, cells in split_rows(file, lines, names, 1).items()}
+    positions = to_coordinates(file, {number: cells[:6] for number, cells in rows.items()}, COLUMNS)
+    levels = {number: cells[6:] for number, cells in rows.items()}
+    dbm = [value for (value,) in to_dbm(file, levels, COLUMNS[6:], QUIETEST, not_heard)]
+    if all(value == not_heard for value in dbm):
+        raise ValueError(f"{file}: expected a reading that was heard, got none but {not_heard:g} dBm")
+    points = {"tx": [row[:3] for row in positions], "rx": [row[3:] for row in positions]}
     return points, dbm, [name for name in written if name.lower() not in COLUMNS]

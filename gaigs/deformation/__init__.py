@@ -1,4 +1,4 @@
-"""Deformations say how each Gaussian changes for a query, from the tokens."""
+"""Deformations predict the change of each Gaussian for a query from the tokens."""
 
 from abc import ABC, abstractmethod
 from typing import NamedTuple
@@ -6,13 +6,12 @@ from typing import NamedTuple
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed, Tokens
 from gaigs.query import Query
-from gaigs.tokenizer import Tokens
 
 
 class Residuals(NamedTuple):
-    """What a query changes in the Gaussians; None where nothing does.
+    """Changes of the Gaussians for a query; None: no change.
 
     Source: GAI-GS, "Scene Mapping Network": d_rotation, d_scaling, d_signal, d_attn and the attenuation delta.
     """
@@ -25,11 +24,11 @@ class Residuals(NamedTuple):
 
 
 class Deformation(nn.Module, ABC):
-    """The contract of kind ``deformation``; a constructor is offered ``scene``, ``channels`` and ``tokenizer_widths``.
+    """The contract of kind ``deformation``; a constructor may take ``scene``, ``channels`` and ``tokenizer_widths``.
 
     Attributes:
-        reads_tokens: Whether it looks at tokens; where it does not, no tokenizer is made.
-        sees_receivers: Whether two receivers of one place hear differently changed Gaussians.
+        reads_tokens: True if it needs tokens; if False, no tokenizer is built.
+        sees_receivers: True if the change depends on the receiver.
     """
 
     reads_tokens: bool = True
@@ -37,10 +36,10 @@ class Deformation(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, tokens: Tokens | None, placed: Placed, query: Query) -> Residuals:
-        """What each query changes.
+        """Changes for each query.
 
         Args:
-            tokens: Of the queries and Gaussians; None where it reads none.
-            placed: Where the Gaussians stand, without a gradient.
-            query: Who sends, who hears, at which frequency.
+            tokens: Tokens of the queries and Gaussians; None if ``reads_tokens`` is False.
+            placed: Placed Gaussians, without a gradient.
+            query: Transmitters, receivers and frequencies.
         """

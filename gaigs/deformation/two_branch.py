@@ -9,26 +9,25 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gaigs.deformation import Deformation, Residuals
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed, Tokens
 from gaigs.query import Query
 from gaigs.registry import register
-from gaigs.tokenizer import Tokens
 
 HEADS = ("rotation", "scale", "signal", "opacity", "attenuation")
 """In the order of ``Residuals``."""
 
-CLEAR = 0.98
-"""The attenuation delta that training starts from: nearly transparent."""
+INITIAL_ATTENUATION = 0.98
+"""Attenuation delta at the start of training: nearly transparent."""
 
-DARKEST = 1e-6
-"""The least attenuation delta, -120 dB: its logarithm, which is what is rendered with, stays finite."""
+LEAST_ATTENUATION = 1e-6
+"""Least attenuation delta, -120 dB: its logarithm, which rendering uses, stays finite."""
 
 
 class TokenLinear(nn.Module):
     """A linear layer on the concatenation [hidden, E(P_x), E(P_TX), CLS] of every (transmitter, Gaussian) pair.
 
-    It is the sum of one linear map of each part, so the part that depends on the Gaussian alone is computed n times,
-    the transmitter's and the scene's b times, and only ``hidden`` b x n times; the concatenation never exists.
+    It is the sum of a linear map of each part, computed n times for the Gaussians, b times for transmitters and scenes,
+    and b x n times only for ``hidden``; the concatenation is never built.
     """
 
     def __init__(self, tokens: tuple[int, int, int], width: int, hidden: int = 0):
@@ -39,7 +38,7 @@ class TokenLinear(nn.Module):
             nn.Linear(part, width, bias=False) if part else None for part in (scene + transmitter, gaussian, hidden)
         )
         bound = max(scene + gaussian + transmitter + hidden, 1) ** -0.5
-        for parameter in self.parameters():  # as one layer over the whole concatenation would start
+        for parameter in self.parameters():  # as for one layer over the concatenation
             nn.init.uniform_(parameter, -bound, bound)
 
     def forward(self, tokens: Tokens, hidden: Float[Tensor, "b n h"] | None = None) -> Float[Tensor, "b n width"]:
@@ -54,7 +53,7 @@ class TokenLinear(nn.Module):
 
 
 class ResidualLayer(nn.Module):
-    """h + GELU(W h): keeps what earlier layers know of the geometry."""
+    """h + GELU(W h), which keeps the geometry of earlier layers."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -70,14 +69,14 @@ class TwoBranch(Deformation):
 
     Attenuation branch: f = residual layers on [E(P_x), E(P_TX), CLS]; heads for the opacity residual and delta.
     Signal branch: h = residual layers on [f, E(P_x), E(P_TX), CLS]. Heads on [f, h]: rotation, scale, signal.
-    Heads other than the signal's start at zero residual, delta at ``CLEAR``.
+    Heads other than the signal's start at zero residual, delta at ``INITIAL_ATTENUATION``.
 
     Args:
         tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens.
         channels: Signal channels of a Gaussian.
         width: Of both branches.
-        attenuation_layers, signal_layers: Residual layers of each branch, behind its first layer.
-        heads: Which of ``HEADS`` exist; what only a head left out would need has no parameters.
+        attenuation_layers, signal_layers: Residual layers of each branch after its first layer.
+        heads: Heads in use, of ``HEADS``; branches that no head needs have no parameters.
 
     Raises:
         ValueError: There is no such head, or a width or number of layers is out of range.
@@ -126,7 +125,7 @@ class TwoBranch(Deformation):
                 nn.init.zeros_(head.weight)
                 nn.init.zeros_(head.bias)
         if "attenuation" in heads:
-            nn.init.constant_(self.heads["attenuation"].bias, math.log(CLEAR / (1 - CLEAR)))
+            nn.init.constant_(self.heads["attenuation"].bias, math.log(INITIAL_ATTENUATION / (1 - INITIAL_ATTENUATION)))
 
     def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
         """Residuals for every pair of a query and a Gaussian."""
@@ -140,10 +139,11 @@ class TwoBranch(Deformation):
             features |= dict.fromkeys(("rotation", "scale", "signal"), torch.cat((attenuation, signal), -1))
         for name, head in self.heads.items():
             results[name] = head(features[name])
-        if results["signal"] is not None:
+        if "signal" in self.heads:
             results["signal"] = results["signal"][..., None]
-        if results["opacity"] is not None:
+        if "opacity" in self.heads:
             results["opacity"] = results["opacity"].squeeze(-1)
-        if results["attenuation"] is not None:
-            results["attenuation"] = DARKEST + (1 - DARKEST) * results["attenuation"].squeeze(-1).sigmoid()
+        if "attenuation" in self.heads:
+            shares = results["attenuation"].squeeze(-1).sigmoid()
+            results["attenuation"] = LEAST_ATTENUATION + (1 - LEAST_ATTENUATION) * shares
         return Residuals(*results.values())

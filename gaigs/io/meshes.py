@@ -1,5 +1,6 @@
-"""Meshes of rooms as files, Wavefront OBJ and PLY: what is wrong is told with its file, line and value."""
+"""Mesh files of rooms: Wavefront OBJ and PLY."""
 
+import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from jaxtyping import Float
 from plyfile import PlyData
 
 from gaigs.geometry import FAR, WITHIN
-from gaigs.io.tables import NUMBER, read_lines, refuse
+from gaigs.io.tables import NUMBER, read_lines
 
 Face = tuple[int, ...]
 """Numbers of a polygon's vertices, from 0."""
@@ -17,31 +18,23 @@ Groups = dict[tuple[str, str], list[Face]]
 """Faces of a mesh, by the names of their object and material."""
 
 NO_NAME = "mesh", "unnamed"
-"""Of an object and a material that have none."""
+"""Names of an object and a material without a name."""
 
 
 def read_obj(file: Path) -> tuple[Float[np.ndarray, "v 3"], Groups]:
     """Vertices [m] and faces of a Wavefront OBJ file.
 
     Raises:
-        ValueError: It cannot be read, or is as ``parse_obj`` refuses it.
+        ValueError: The file cannot be read, or has a defect.
     """
-    defects: list[str] = []
-    lines = read_lines(file, "a mesh of 'v x y z' and 'f i j k'", defects)
-    refuse(file.parent, defects)
-    return parse_obj(lines, str(file))
+    return parse_obj(read_lines(file, "a mesh of 'v x y z' and 'f i j k'"), str(file))
 
 
 def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3"], Groups]:
-    """The same from the file's lines.
-
-    Args:
-        lines: Of the file.
-        source: What errors call it.
+    """Vertices [m] and faces of the lines of a Wavefront OBJ file; errors name the source.
 
     Raises:
-        ValueError: A line holds no numbers where it must, a vertex is too far away, or a face takes vertices that do
-            not stand before it.
+        ValueError: A line lacks numbers, a vertex is too far away, or a face refers to a vertex that is not above it.
     """
     vertices: list[list[float]] = []
     groups: Groups = {}
@@ -61,7 +54,7 @@ def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3
                     groups.setdefault((name, material), []).append(face)
         except ValueError as error:
             shown = line.strip() if len(line) < 80 else f"{line.strip()[:80]} ..."
-            raise ValueError(f"{source}, line {number}, must hold {error}, got {shown!r}") from error
+            raise ValueError(f"{source}, line {number}: expected {error}, got {shown!r}") from error
     return np.array(vertices, dtype=float).reshape(-1, 3), groups
 
 
@@ -90,46 +83,45 @@ def read_ply(file: Path) -> tuple[np.ndarray, list[Face]]:
     """Vertices, as a structured array with x, y and z [m] among its columns, and faces of a PLY file.
 
     Raises:
-        ValueError: It is damaged, a column of the vertices holds no numbers, a vertex is too far away, or a face takes
-            vertices that there are not.
+        ValueError: The file is damaged, a column of the vertices holds no numbers, a vertex is too far away, or a face
+            refers to a missing vertex.
     """
     try:
         content = PlyData.read(str(file), mmap=False)
         vertices = content["vertex"].data
         vertices = vertices.astype([(column, float) for column in vertices.dtype.names])
-        points = np.stack([vertices[axis] for axis in "xyz"], -1)
+        points = positions(vertices)
         faces = [tuple(map(int, face)) for face in _indices(content)]
-    except Exception as error:  # whatever plyfile and numpy meet in a damaged header
-        told = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(
-            f"{file} must be a whole .ply file of vertices x, y, z and of faces or none: {told}"
-        ) from error
+    except Exception as error:  # damaged headers make plyfile and numpy raise exceptions of many types
+        cause = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"cannot parse {file}: {cause}; expected a .ply file of vertices x, y, z") from error
     check_mesh(points, faces, str(file))
     return vertices, faces
 
 
+def positions(vertices: np.ndarray) -> Float[np.ndarray, "v 3"]:
+    """Positions [m] of vertices as ``read_ply`` gives them."""
+    return np.stack([vertices[axis] for axis in "xyz"], -1)
+
+
+def triangles(faces: Iterable[Face]) -> list[tuple[int, int, int]]:
+    """Polygons cut into triangles, as fans about their first corners."""
+    return [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
+
+
 def check_mesh(points: Float[np.ndarray, "v 3"], faces: Sequence[Face], source: str) -> None:
-    """Sees to it that vertices [m] are near enough, and faces made of them.
-
-    Args:
-        points, faces: Of a mesh.
-        source: What errors call it.
-
-    Raises:
-        ValueError: A vertex is too far away or no number, or a face takes vertices that there are not.
-    """
+    """Raises a ``ValueError`` for a vertex too far away or without numbers, or a face that refers to a missing one."""
     if not (np.abs(points) < FAR).all():
         row = int((~(np.abs(points) < FAR)).any(1).argmax())
-        raise ValueError(f"{source} must hold {WITHIN}, got {points[row].tolist()} at vertex {row + 1}")
+        raise ValueError(f"{source}, vertex {row + 1}: expected {WITHIN}, got {points[row].tolist()}")
     for number, face in enumerate(faces, 1):
         if len(face) < 3 or not all(0 <= corner < len(points) for corner in face):
-            raise ValueError(
-                f"{source}, face {number}, must be of three vertices or more of the {len(points)} there are, got {face}"
-            )
+            expected = f"three or more of the {len(points)} vertices"
+            raise ValueError(f"{source}, face {number}: expected {expected}, got {face}")
 
 
 def _indices(content: PlyData) -> Iterable:
-    """The lists of vertices of a file's faces; none where it has no faces, or these no such list."""
+    """Vertices of each face of a file; empty if the file has no faces, or these no such list."""
     columns = content["face"].data.dtype.names if "face" in content else ()
     key = next((name for name in ("vertex_indices", "vertex_index") if name in columns), None)
     return [] if key is None else content["face"].data[key]

@@ -1,11 +1,14 @@
-"""Text files of data sets: what is wrong is collected with its file, line and value, and listed by one error."""
+"""Text files of data sets: lines, tables of numbers, points and index files.
+
+An error names the file, the first line with a defect, what it holds, and how many other lines have the same defect.
+"""
 
 import csv
 import math
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -13,28 +16,31 @@ from torch import Tensor
 
 from gaigs.geometry import FAR, WITHIN
 
-SHOWN = 10
-"""Defects that an error lists one by one."""
-
-LONGEST = 400
-"""Characters of a defect that an error shows."""
+Rows = Mapping[int, Sequence[str]]
+"""Cells of each line of a table, by the line's number from 1."""
 
 BESIDE_QUOTE = re.compile(r"(?<=\")[ \t]+(?=,|$)")
 """Blanks behind a quoted cell."""
 
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
-"""A number as it is written: ``float`` takes 1_0, the digits of other scripts and infinities too."""
+"""A decimal number; ``float`` also accepts 1_0, digits of other scripts and infinities."""
+
+
+def quote(value: object) -> str:
+    """A value as errors show it: printable and short."""
+    text = repr(value)
+    return text if len(text) <= 100 else f"{text[:100]} ..."
 
 
 def find_folder(root: str | Path) -> Path:
     """The folder of a data set.
 
     Raises:
-        FileNotFoundError: There is none.
+        FileNotFoundError: There is no such folder.
     """
     root = Path(os.path.expanduser(root))
     if not os.path.isdir(root):  # Path.is_dir raises where a name is too long or a folder is closed
-        raise FileNotFoundError(f"{root} must be the folder of a data set, and is none; set the data's root")
+        raise FileNotFoundError(f"{root} must be the folder of a data set, and is no folder; set the data's root")
     return root
 
 
@@ -42,7 +48,7 @@ def find_file(file: str | Path, content: str) -> Path:
     """The file of a data set that is one file.
 
     Raises:
-        FileNotFoundError: There is none.
+        FileNotFoundError: There is no such file.
     """
     file = Path(os.path.expanduser(file))
     if not os.path.isfile(file):
@@ -51,113 +57,132 @@ def find_file(file: str | Path, content: str) -> Path:
 
 
 def has_file(file: Path) -> bool:
-    """Whether a folder has an optional file. One that cannot be read, as a link to nothing, is there too."""
+    """True if a folder has an optional file; a broken link counts, so that reading it is an error."""
     return os.path.lexists(file)
 
 
-def refuse(place: Path, defects: Sequence[str]) -> None:
-    """Raises a ``ValueError`` that lists the defects, if there are any."""
-    if defects:
-        shown = [defect if len(defect) <= LONGEST else f"{defect[:LONGEST]} ..." for defect in defects[:SHOWN]]
-        shown = ["".join(c if c.isprintable() else ascii(c)[1:-1] for c in defect) for defect in shown]
-        more = [f"... and {len(defects) - SHOWN} more"] if len(defects) > SHOWN else []
-        count = "1 defect" if len(defects) == 1 else f"{len(defects)} defects"
-        raise ValueError("\n  ".join([f"{place} has {count}:", *shown, *more]))
+def check_empty(folder: Path) -> None:
+    """Raises a ``FileExistsError`` unless a folder to be written is empty or missing."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder} must be an empty folder or missing; choose another name")
 
 
-def read_lines(file: Path, expected: str, defects: list[str]) -> list[str]:
-    """Lines of a text file without the blank ones at its end."""
-    text, reason = "", None
-    if not has_file(file):
-        reason = "missing"
-    elif not os.path.isfile(file):  # a pipe would be waited for
-        reason = "no file, but a folder, a device or a link to nothing"
-    else:
-        try:
-            text = file.read_text(encoding="utf-8-sig")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = f"unreadable ({error})"
-    if reason:
-        defects.append(f"{file.name}: {reason}; expected {expected}")
-        return []
-    lines = text.rstrip().splitlines()
+def read_lines(file: Path, content: str) -> list[str]:
+    """Lines of a text file without the blank ones at its end; errors name the expected content.
+
+    Raises:
+        ValueError: The file is missing, cannot be read, is not UTF-8, or is empty.
+    """
+    if not os.path.isfile(file):  # reading a pipe would block
+        state = "no file, but a folder, a device or a broken link" if has_file(file) else "missing"
+        raise ValueError(f"{file}: {state}; expected {content}")
+    try:
+        lines = file.read_text(encoding="utf-8-sig").rstrip().splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"cannot parse {file}: not UTF-8 at byte {error.start}; expected {content}") from None
+    except OSError as error:
+        raise ValueError(f"cannot read {file}: {error.strerror}; expected {content}") from None
     if not lines:
-        defects.append(f"{file.name}: empty; expected {expected}")
+        raise ValueError(f"{file}: empty; expected {content}")
     return lines
 
 
-def read_points(file: Path, names: Sequence[str], expected: str, defects: list[str]) -> list[list[float]]:
-    """Coordinates, one point a line; a first line of their names may head them."""
-    lines = read_lines(file, expected, defects)
-    header = bool(lines) and [cell.lower() for cell in to_cells(lines[0])] == [*names]
+def refuse(file: Path, wrong: Mapping[int, str], expected: str) -> None:
+    """Raises a ``ValueError`` if there are wrong lines, given the content of each by its number."""
+    if wrong:
+        number, got = next(iter(wrong.items()))
+        others = {1: "", 2: " and 1 other line"}.get(len(wrong), f" and {len(wrong) - 1} other lines")
+        raise ValueError(f"{file}, line {number}{others}: expected {expected}, got {got}")
+
+
+def read_points(file: Path, names: Sequence[str], content: str) -> list[list[float]]:
+    """Coordinates [m], one point a line; the first line may hold their names.
+
+    Raises:
+        ValueError: The file cannot be read, a line has another number of columns, or a coordinate is not finite or too
+            far away.
+    """
+    lines = read_lines(file, content)
+    header = [cell.lower() for cell in split_cells(lines[0])] == [*names]
     if header and len(lines) == 1:
-        defects.append(f"{file.name}: no positions below the header")
-    points = []
-    for number, line in [*enumerate(lines, 1)][header:]:
-        place = f"{file.name}, line {number}"
-        cells = to_columns(place, line, names, defects)
-        points.append(to_coordinates(place, names, cells, defects) if cells else [])
-    return points
+        raise ValueError(f"{file}: no positions below the header")
+    return to_coordinates(file, split_rows(file, lines, names, int(header)), names)
 
 
-def to_cells(line: str) -> list[str]:
+def split_cells(line: str) -> list[str]:
     """Cells of a line with commas, without the blanks around them."""
     try:
-        # Only blanks may stand beside quotes: what else does, csv would join to what they hold.
+        # csv joins text beside a quoted cell to it, so that only blanks may stand there.
         (cells,) = csv.reader([BESIDE_QUOTE.sub("", line)], skipinitialspace=True, strict=True)
-    except csv.Error:  # a quote inside a cell or without its end, or a cell of 100,000 characters: no table of ours
+    except csv.Error:  # a quote inside a cell or without its end, or a cell of 100,000 characters
         cells = []
     return [cell.strip() for cell in cells] or [line]
 
 
-def to_columns(place: str, line: str, names: Sequence[str], defects: list[str]) -> list[str]:
-    """Cells of a line, one for each name; none, and a defect, where their number is another."""
-    cells = to_cells(line)
-    if len(cells) == len(names):
-        return cells
-    defects.append(f"{place}: expected {len(names)} columns {','.join(names)}, got {len(cells)}: {line!r}")
-    return []
+def split_rows(file: Path, lines: Sequence[str], names: Sequence[str], skip: int) -> dict[int, list[str]]:
+    """Cells of all lines but the first few; a ``ValueError`` unless each line has one for each name."""
+    rows = {number: split_cells(line) for number, line in enumerate(lines[skip:], skip + 1)}
+    wrong = {n: f"{len(cells)}: {quote(lines[n - 1])}" for n, cells in rows.items() if len(cells) != len(names)}
+    refuse(file, wrong, f"{len(names)} columns {quote(','.join(names))}")
+    return rows
 
 
 def to_numbers(
-    place: str,
-    names: Sequence[str],
-    cells: Sequence[str],
-    holds: Callable[[float], bool],
-    expected: str,
-    defects: list[str],
-) -> list[float]:
-    """Cells of a line as numbers, each of which must hold; all that do not are one defect."""
-    values = [to_number(cell) for cell in cells]
-    wrong = [k for k, value in enumerate(values) if not holds(value)]
-    if wrong:
-        columns = f"column{'s' if len(wrong) > 1 else ''} {', '.join(names[k] for k in wrong)}"
-        defects.append(f"{place}, {columns}: expected {expected}, got {', '.join(repr(cells[k]) for k in wrong)}")
-    return values
+    file: Path, rows: Rows, names: Sequence[str], holds: Callable[[float], bool], expected: str
+) -> list[list[float]]:
+    """Cells of a table as numbers; a ``ValueError`` where one is out of range. A cell without a number is NaN."""
+    numbers = [[to_number(cell) for cell in cells] for cells in rows.values()]
+    wrong = {}
+    for (line, cells), values in zip(rows.items(), numbers, strict=True):
+        if bad := [k for k, value in enumerate(values) if not holds(value)]:
+            wrong[line] = f"{quote(cells[bad[0]])} in column {names[bad[0]]}"
+    refuse(file, wrong, expected)
+    return numbers
 
 
-def to_coordinates(place: str, names: Sequence[str], cells: Sequence[str], defects: list[str]) -> list[float]:
-    """Cells of a line as coordinates [m], finite and near enough for float32."""
-    if all(math.isfinite(to_number(cell)) for cell in cells):
-        return to_numbers(place, names, cells, lambda value: abs(value) < FAR, WITHIN, defects)
-    return to_numbers(place, names, cells, math.isfinite, "a finite number", defects)
+def to_coordinates(file: Path, rows: Rows, names: Sequence[str]) -> list[list[float]]:
+    """Cells of a table as coordinates [m]; a ``ValueError`` where one is not finite, or too far for float32."""
+    to_numbers(file, rows, names, math.isfinite, "a finite number")
+    return to_numbers(file, rows, names, lambda value: abs(value) < FAR, WITHIN)
 
 
 def to_number(cell: str) -> float:
-    """What a cell says, not a number where it says none."""
+    """The number in a cell; NaN for any other text."""
     return float(cell) if NUMBER.fullmatch(cell.strip()) else math.nan
 
 
 def to_index(text: str) -> int | None:
-    """A whole number from 0 in decimal digits; None where there is none."""
+    """A whole number from 0 in decimal digits; None for any other text."""
     if not (text.isascii() and text.isdecimal()):
         return None
     digits = text.lstrip("0")
-    return int(digits or "0") if len(digits) < 19 else sys.maxsize  # Python takes no thousands of digits
+    return int(digits or "0") if len(digits) < 19 else sys.maxsize  # Python converts at most 4300 digits
+
+
+def read_parts(root: Path, parse: Callable[[str], Hashable | None], expected: str) -> tuple[list, list]:
+    """Entries of ``train_index.txt`` and ``test_index.txt``, one a line; ``parse`` gives None for a wrong line.
+
+    Raises:
+        ValueError: A file cannot be read, a line is wrong, or an entry is there twice.
+    """
+    places: dict[Hashable, str] = {}
+    parts = []
+    for file in (root / "train_index.txt", root / "test_index.txt"):
+        lines = dict(enumerate(read_lines(file, expected), 1))
+        entries = {number: parse(line.strip()) for number, line in lines.items()}
+        refuse(file, {number: quote(lines[number]) for number, entry in entries.items() if entry is None}, expected)
+        repeated = {}
+        for number, entry in entries.items():
+            if entry in places:
+                repeated[number] = f"{quote(lines[number])}, which is in {places[entry]} already"
+            places.setdefault(entry, f"{file.name}, line {number}")
+        refuse(file, repeated, "each entry once")
+        parts.append([*entries.values()])
+    return parts[0], parts[1]
 
 
 def number_places(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:
-    """The distinct points in the order in which they appear, and which of them each one is."""
+    """Distinct points in the order of their first appearance, and the number of each point among them."""
     numbers: dict[tuple, int] = {}
     index = [numbers.setdefault(tuple(point), len(numbers)) for point in points]
     return [*numbers], torch.tensor(index)

@@ -1,1 +1,1 @@
-"""Gaussian processes over links."""
+"""Kriging: Gaussian processes over links, below the models that use them."""

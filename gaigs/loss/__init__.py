@@ -8,16 +8,16 @@ from gaigs.query import Batch
 
 
 class Loss(Protocol):
-    """The contract of kind ``loss``. It is made with the task whose labels it compares."""
+    """The contract of kind ``loss``; a loss is built with the labels' ``task``."""
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """Of predictions and the labels of a batch.
+        """Compares predictions with the labels of a batch.
 
         Args:
             values: Predictions for the batch's directions, of the labels' shape.
             batch: Links with labels.
 
         Returns:
-            The loss, a mean over the links, and its terms by name, to be logged.
+            The loss, a mean over the links, and its terms by name for the log.
         """
         ...

@@ -8,7 +8,7 @@ from gaigs.registry import register
 
 @register("loss", "absolute")
 class Absolute(MeanError):
-    """The magnitude is what is reported, and robust: a label that is far off pulls no harder than another."""
+    """The mean absolute error, which is also reported; outliers pull no harder than other labels."""
 
     def mean(self, values: Tensor, labels: Tensor) -> Tensor:
         return (values - labels).abs().mean()

@@ -1,4 +1,6 @@
-"""What the losses share that average a function of the error."""
+"""Common part of the losses that average a function of the error."""
+
+from abc import ABC, abstractmethod
 
 from torch import Tensor
 
@@ -6,11 +8,11 @@ from gaigs.query import Batch
 from gaigs.task import Task
 
 
-class MeanError:
+class MeanError(ABC):
     """A mean over the errors of all links and directions, in the label's unit.
 
     Args:
-        task: Whose labels are compared.
+        task: The labels' task.
 
     Raises:
         ValueError: The labels are complex.
@@ -19,7 +21,7 @@ class MeanError:
     def __init__(self, task: Task):
         if task.dtype.is_complex:
             raise ValueError(
-                f"labels of task {task.name!r} are complex, and this loss takes real ones; take loss=log_relative_error"
+                f"labels of task {task.name!r} are complex, and this loss needs real ones; set loss=log_relative_error"
             )
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -27,6 +29,6 @@ class MeanError:
         errors = values - batch.labels
         return self.mean(values, batch.labels), {"mae": errors.abs().mean()}
 
+    @abstractmethod
     def mean(self, values: Tensor, labels: Tensor) -> Tensor:
         """The loss alone."""
-        raise NotImplementedError

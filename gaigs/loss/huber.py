@@ -13,8 +13,8 @@ class Huber(MeanError):
     """Half the square of an error up to ``delta``, and linear beyond.
 
     Args:
-        task: Whose labels are compared.
-        delta: Where it turns, in the label's unit (dB for RSSI).
+        task: The labels' task.
+        delta: Error at which the square turns into a line, in the label's unit (dB for RSSI).
 
     Raises:
         ValueError: ``delta`` is not positive, or the labels are complex.

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.directions import Directions, Grid
+from gaigs.geometry import Directions, Grid
 from gaigs.loss.windows import window_means
 from gaigs.query import Batch
 from gaigs.registry import register
@@ -14,13 +14,13 @@ from gaigs.task.spectrum import SSIM_WINDOW
 
 @register("loss", "l1_ssim")
 class L1Ssim:
-    """(1 - ssim) L_MAE + ssim (1 - SSIM) on a grid, or on every so many rows and columns of one.
+    """(1 - ssim) L_MAE + ssim (1 - SSIM) on the label's grid or a thinned one.
 
-    The uniform SSIM window spans the angle that the reported score's 7 pixels span on the label's own grid, though not
-    less than 3 of the pixels looked at, nor more than there are.
+    The uniform SSIM window spans the same angle as the reported score's 7 pixels on the label's own grid, at least 3
+    and at most all pixels of the thinned grid.
 
     Args:
-        task: Its grid is the one that windows are measured on.
+        task: The labels' task, whose grid sets the window's angle.
         ssim: Weight of the SSIM term, the paper's 1 - beta.
 
     Raises:
@@ -33,14 +33,14 @@ class L1Ssim:
         if not 0 <= ssim <= 1:
             raise ValueError(f"loss.ssim must be in [0, 1], got {ssim}")
         if task.directions is None:
-            raise ValueError(f"loss 'l1_ssim' compares spectra, and labels of task {task.name!r} are none")
+            raise ValueError(f"loss 'l1_ssim' compares spectra, labels of task {task.name!r} are not; choose another")
         self.ssim, self.pitch = ssim, task.directions.pitch
 
     def __call__(self, values: Float[Tensor, "b rows columns"], batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms ``l1`` and ``ssim``; see ``gaigs.loss.Loss``.
 
         Raises:
-            ValueError: The batch asks for a list of directions, which has no windows, or for fewer than 3 x 3.
+            ValueError: The batch's directions are a list, which has no windows, or fewer than 3 x 3.
         """
         window = find_window("l1_ssim", batch.directions, self.pitch, SSIM_WINDOW)
         similarity = structural_similarity(values, batch.labels, window)
@@ -49,20 +49,20 @@ class L1Ssim:
 
 
 def find_window(loss: str, directions: Directions | None, pitch: float, pixels: int) -> int:
-    """Edge of the window on a thinned grid that spans the angle of so many pixels of the label's own [pixels].
+    """Edge [pixels] of the window on a thinned grid that spans the same angle as on the label's own grid.
 
     Args:
-        loss: Who needs it, as errors call it.
-        directions: Those looked at.
-        pitch: Between neighbouring rows of the label's own grid [rad].
-        pixels: An odd number.
+        loss: Name of the loss for errors.
+        directions: The thinned grid.
+        pitch: Angle between neighbouring rows of the label's own grid [rad].
+        pixels: Edge on the label's own grid, odd.
 
     Raises:
-        ValueError: The directions are no grid, or one of fewer than 3 x 3.
+        ValueError: The directions are no grid, or fewer than 3 x 3.
     """
     if not isinstance(directions, Grid):
         raise ValueError(
-            f"loss {loss!r} needs rows and columns, and training.thinning.rays draws single directions; take "
+            f"loss {loss!r} needs rows and columns, and training.thinning.rays draws single directions; set "
             "loss=absolute or loss=squared"
         )
     smallest = min(directions.shape)
@@ -75,14 +75,14 @@ def find_window(loss: str, directions: Directions | None, pitch: float, pixels: 
 def structural_similarity(
     values: Float[Tensor, "b rows columns"], labels: Float[Tensor, "b rows columns"], window: int
 ) -> Float[Tensor, ""]:
-    """Mean SSIM over all windows that lie within the image: uniform weights, sample covariances, data range 1.
+    """Mean SSIM over all windows within the image: uniform weights, sample covariances, data range 1.
 
-    With a window of 7 on the full grid it is the reported score, scikit-image's, and differentiable.
-    torchmetrics' convolutions would take a quarter of a training step here, and leave five rows out at each border.
+    A window of 7 on the full grid gives the reported score, scikit-image's, with gradients. torchmetrics' convolutions
+    take a quarter of a training step here, and leave out five rows at each border.
 
     Source: Wang et al., Image Quality Assessment, 2004, with the constants 0.01² and 0.03².
     """
-    # Those of the labels apart, as they need no gradient.
+    # The labels' means are separate, as they need no gradient.
     x, xx, xy = window_means(torch.stack((values, values.square(), values * labels)), window)
     y, yy = window_means(torch.stack((labels, labels.square())), window)
     unbiased = window**2 / (window**2 - 1)

@@ -12,18 +12,18 @@ from gaigs.task import Task
 class LogRelativeError(RelativeError):
     """The mean over the links of ln((1 + r / floor) / (1 + r floor)), r = |h - h'|² / |h|²: the SNR between two bounds.
 
-    Between an SNR of 10 log10(floor) dB and its negative the loss is in proportion to the SNR in dB, so each link has
-    one vote. Beyond, a link pulls less and less: what is that good needs no more, and a link that is 30 dB weaker than
-    anything that explains it does not dim the room around it.
+    Between the bounds of -10 log10(floor) and 10 log10(floor) dB the loss is linear in the SNR in dB, so all links
+    have equal weight. Beyond the bounds a link pulls less and less: one of 30 dB needs no improvement, and one 30 dB
+    weaker than its prediction does not dim the room around it.
 
     Args:
-        task: Whose labels are compared.
-        floor: Relative error below which little is gained, and over whose inverse little is lost; 1e-3 is 30 dB.
+        task: The labels' task.
+        floor: Relative error at the upper bound, its inverse is that at the lower one; 1e-3 is 30 dB.
 
     Raises:
         ValueError: The floor is not in (0, 1), or the labels are real.
 
-    Source: ours; docs/results.md has what other losses cost.
+    Source: ours; docs/results.md compares losses.
     """
 
     name = "log_relative_error"
@@ -34,5 +34,5 @@ class LogRelativeError(RelativeError):
             raise ValueError(f"loss.floor must be more than 0 and less than 1, got {floor}")
         self.floor = floor
 
-    def mean(self, errors: Float[Tensor, "b"]) -> Float[Tensor, ""]:
+    def mean(self, errors: Float[Tensor, " b"]) -> Float[Tensor, ""]:
         return ((errors / self.floor).log1p() - (errors * self.floor).log1p()).mean()

@@ -13,11 +13,11 @@ from gaigs.task import Task
 class RelativeError:
     """The mean over the links of r = |h - h'|² / |h|².
 
-    A link in deep shadow, where any prediction is many times too strong, outweighs all others: the least of this mean
-    over a room is next to no prediction at all. ``log_relative_error`` is the loss without that fault.
+    A link in deep shadow, where any prediction is many times too strong, outweighs all others: predictions near zero
+    minimise this mean over a room. ``log_relative_error`` does not have that fault.
 
     Args:
-        task: Whose labels are compared.
+        task: The labels' task.
 
     Raises:
         ValueError: The labels are real.
@@ -30,19 +30,19 @@ class RelativeError:
     def __init__(self, task: Task):
         if not task.dtype.is_complex:
             raise ValueError(
-                f"labels of task {task.name!r} are real, and loss {self.name!r} takes complex channels; take "
+                f"labels of task {task.name!r} are real, and loss {self.name!r} needs complex channels; set "
                 "loss=squared"
             )
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, which is its only term; see ``gaigs.loss.Loss``."""
-        # Scaled by the strongest entry, so that squares of weak channels do not underflow; a denormal has no inverse.
+        # Scaled by the strongest entry, so that squares of weak channels do not underflow; denormals have no inverse.
         labels = batch.labels.flatten(1)
         largest = labels.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
         errors, powers = ((part / largest).abs().square().sum(1) for part in (values.flatten(1) - labels, labels))
         loss = self.mean(errors / powers)
         return loss, {self.name: loss}
 
-    def mean(self, errors: Float[Tensor, "b"]) -> Float[Tensor, ""]:
-        """The loss of relative errors."""
+    def mean(self, errors: Float[Tensor, " b"]) -> Float[Tensor, ""]:
+        """The loss for the links' relative errors."""
         return errors.mean()

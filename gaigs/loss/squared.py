@@ -8,7 +8,7 @@ from gaigs.registry import register
 
 @register("loss", "squared")
 class Squared(MeanError):
-    """The mean of the labels at a place is what it is least for."""
+    """The mean squared error; the mean of the labels at a place minimises it."""
 
     def mean(self, values: Tensor, labels: Tensor) -> Tensor:
         return (values - labels).square().mean()

@@ -1,4 +1,4 @@
-"""Means over windows, which structural similarity is made of."""
+"""Means over windows, for structural similarity."""
 
 import torch
 from jaxtyping import Float
@@ -7,14 +7,13 @@ from torch.autograd.function import once_differentiable
 
 
 def window_means(images: Float[Tensor, "*batch rows columns"], window: int) -> Float[Tensor, "*batch r c"]:
-    """Means over every square window that lies within an image.
+    """Means over every square window within an image: a faster ``torch.nn.functional.avg_pool2d`` with stride 1.
 
-    ``torch.nn.functional.avg_pool2d`` with a stride of 1, which adds up window² pixels for each on a CPU; here they are
-    added along rows and then along columns, whole images at a time.
+    On a CPU ``avg_pool2d`` adds window² pixels for each mean; here whole images are added along rows, then columns.
 
     Args:
-        images: At least as many rows and columns as the window has.
-        window: Its edge [pixels].
+        images: At least ``window`` rows and columns.
+        window: Edge of the window [pixels].
 
     Raises:
         RuntimeError: An image is smaller than the window.

@@ -1,4 +1,4 @@
-"""Free space: the direct wave, as if the room were empty."""
+"""Free space: the direct wave alone."""
 
 import torch
 from jaxtyping import Complex
@@ -7,23 +7,23 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.kriging.links import known_links
 from gaigs.model import Model, Prediction
-from gaigs.propagation import TELLING, check_elements, direct_gains, direct_waves, fit_gain, phase_sign
+from gaigs.propagation import TELLING, fit_gain, phase_sign
 from gaigs.query import Batch, Query
 from gaigs.registry import register
-from gaigs.scene import Scene
+from gaigs.scene import Scene, check_elements, direct_gains, direct_waves
 
 
 @register("model", "friis")
 class Friis(Model):
     """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, with one complex gain g for each receiver.
 
-    a is the elements' pattern towards the transmitter. The gain, ``fit_gain`` of the known links, stands for transmit
-    power, cables and the clock's phase. The sign of the phase is what the known links show, as either time convention
-    is in use. Where they show none, as without a common clock, no gain is better than 0; of fewer than ``TELLING``
-    links a receiver the sign is -1. NaN until it is fitted.
+    a is the elements' pattern towards the transmitter. The gain, ``fit_gain`` of the known links, contains transmit
+    power, cables and the clock's phase. The sign of the phase is estimated from the known links, as both time
+    conventions are in use. If they show no sign, as without a common clock, the gain is 0. With fewer than ``TELLING``
+    links a receiver the sign is -1. NaN before ``fit``.
 
     Raises:
-        ValueError: The labels are no channels, or an array has another number of elements than they.
+        ValueError: The labels are no channels, or their number of elements is not the array's.
 
     Source: Friis, A note on a simple transmission formula, 1946.
     """
@@ -36,10 +36,10 @@ class Friis(Model):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits sign and gains.
+        """Fits the sign and the gains.
 
         Raises:
-            ValueError: A receiver has no links to learn from.
+            ValueError: A receiver has no training or validation links.
         """
         known = known_links(links)
         index = torch.cat(known)
@@ -48,8 +48,8 @@ class Friis(Model):
         sign = phase_sign(labels, waves, query.receivers)
         self.sign.fill_(sign or -1)
         self.gains.zero_()
-        is_told = sign != 0 or len(index) < TELLING * len(known)
-        for receiver, own in enumerate(known if is_told else ()):
+        has_gain = sign != 0 or len(index) < TELLING * len(known)
+        for receiver, own in enumerate(known if has_gain else ()):
             self.gains[receiver] = fit_gain(links.labels[own], self._waves(links.query[own])).to(self.gains)
 
     def forward(self, batch: Batch) -> Prediction:
@@ -57,6 +57,6 @@ class Friis(Model):
         return Prediction(self.gains[batch.query.receivers][:, None, None] * waves, {})
 
     def _waves(self, query: Query) -> Complex[Tensor, "b e s"]:
-        """What each element hears of the direct wave at a gain of 1."""
+        """The direct wave at each element, with a gain of 1."""
         waves = direct_waves(self.scene, query, self.scene.task.frequencies, int(self.sign))
         return direct_gains(self.scene, query)[:, None, None] * waves

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -11,31 +12,44 @@ from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.deformation import Deformation, Residuals
-from gaigs.directions import Directions
-from gaigs.gaussians import SH_DC, Gaussians
-from gaigs.geometry import magnitudes, semi_axes, spherical_harmonics
+from gaigs.gaussians import SH_DC, Gaussians, Placed
+from gaigs.geometry import Directions, magnitudes, semi_axes, spherical_harmonics
 from gaigs.model import Model, Prediction, build_trend
-from gaigs.placement import Placed, Placement
+from gaigs.placement import Placement
 from gaigs.pooling import Pooling
-from gaigs.projection import Projection, Splats
-from gaigs.propagation import carriers
+from gaigs.pooling.paths import PathPooling, ReceivedPaths
+from gaigs.projection import Projection
 from gaigs.query import Batch, Query
 from gaigs.rasterizer import Rasterizer
 from gaigs.registry import call, is_built, name_of, register, registry
-from gaigs.scene import Scene
+from gaigs.scene import Scene, carriers
 
-BESIDE = 0.05
-"""Nearer to a Gaussian's centre than this a transmitter sees it in less and less of a direction [m]."""
+
+class Excited(NamedTuple):
+    """The Gaussians as places excite them.
+
+    Attributes:
+        placed: Before the deformation.
+        residuals: Changes by the deformation.
+        semi_axes: Changed semi-axes, a column for each axis (1 or places, n, 3, 3) [m].
+    """
+
+    placed: Placed
+    residuals: Residuals
+    semi_axes: Float[Tensor, "places n 3 3"]
 
 
 @register("model", "gaigs")
 class GaussianSplatting(Model):
     """Placement -> tokens -> residuals -> Gaussians as the query excites them -> splats -> map -> value.
 
+    Where the pooling takes paths, there are no splats and no map.
+
     Args:
         scene: Receivers and task.
         placement, tokenizer, deformation, projection, rasterizer, pooling: Registered components: each the name, the
             configuration (a mapping with ``name`` and options), or the object itself. Pooling None is the label's own.
+            Projection and rasterizer are None where the pooling takes paths.
         gaussians: Options of ``gaigs.gaussians.Gaussians`` [m]; None for none, where the placement brings its own.
         trend: Model whose value the pooled map is added to, likewise; None for none.
 
@@ -64,8 +78,8 @@ class GaussianSplatting(Model):
         placement: str | Mapping | Placement = "free",
         tokenizer: str | Mapping | nn.Module = "multiview",
         deformation: str | Mapping | Deformation = "two_branch",
-        projection: str | Mapping | Projection = "mercator",
-        rasterizer: str | Mapping | Rasterizer = "fastest",
+        projection: str | Mapping | Projection | None = "mercator",
+        rasterizer: str | Mapping | Rasterizer | None = "fastest",
         pooling: str | Mapping | Pooling | None = None,
         gaussians: Mapping | None = MappingProxyType({}),
         trend: str | Mapping | Model | None = None,
@@ -82,75 +96,74 @@ class GaussianSplatting(Model):
                 )
             self.register_buffer("level", torch.zeros(()))  # of the untrained map, in the label's unit
         self.pooling = registry("pooling").build(self.own_pooling(scene) if pooling is None else pooling, scene=scene)
-        grid = self.pooling.grid or scene.task.directions
-        if grid is None:
-            raise ValueError(
-                f"labels of task {scene.task.name!r} have no directions, so the pooling must have a grid of its own, "
-                f"and {name_of(self.pooling)} has none; take the task's own pooling"
-            )
-        carrier = torch.tensor([1e9])  # whichever
-        nothing = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), carrier)
-        gives = tuple(self.pooling(torch.zeros(1, self.pooling.channels, *grid.shape), nothing).shape[1:])
-        if gives != scene.task.shape:
-            raise ValueError(
-                f"the pooling must give labels of task {scene.task.name!r}, {scene.task.shape}, and "
-                f"{name_of(self.pooling)} gives {gives}; take the task's own pooling"
-            )
-        self.projection = registry("projection").build(projection, pixel=grid.pitch)
-        self.rasterizer = registry("rasterizer").build(rasterizer)
-        self.draws_map = getattr(self.rasterizer, "draws_map", True)
-        plane = name_of(self.projection)
-        if not self.draws_map and (self.pooling.takes is None or plane != "direction_cosine"):
-            raise ValueError(
-                f"rasterizer {name_of(self.rasterizer)!r} draws no map; it takes projection=direction_cosine and a "
-                f"pooling for it (array_response, mean_power or element_sum), got {plane} and {name_of(self.pooling)}"
-            )
-        if self.draws_map and grid.elevations.min() < 0 and not self.projection.sees_below:
-            raise ValueError(
-                f"the map's grid reaches below the array's plane, which {plane} folds onto what is above; take "
-                "mercator or equirectangular"
-            )
+        self.projection = self.rasterizer = None
         zone = self.pooling.zone
-        if self.pooling.grid is None:
-            zone = grid.elevations.min().item(), grid.elevations.max().item()
-        channels = self.pooling.channels if self.draws_map else 2  # real and imaginary part of an amplitude
+        if self.takes_paths:
+            if projection is not None or rasterizer is not None:
+                raise ValueError(
+                    f"pooling {name_of(self.pooling)!r} takes paths, so there is nothing to project and rasterize\n"
+                    "leave out both (~projection ~rasterizer, None in Python), or take a pooling of maps, such as "
+                    "array_response, mean_power or element_sum"
+                )
+            self._check_gives(_no_paths(scene))
+        else:
+            if projection is None or rasterizer is None:
+                raise ValueError(
+                    f"pooling {name_of(self.pooling)!r} takes a map, which needs a projection and a rasterizer\n"
+                    "set projection=mercator rasterizer=fastest, or take a pooling of paths: path_spectrum, path_rssi "
+                    "or path_csi"
+                )
+            grid = self.pooling.grid or scene.task.directions
+            if grid is None:
+                raise ValueError(
+                    f"labels of task {scene.task.name!r} have no directions, so the pooling must have a grid of its "
+                    f"own, and {name_of(self.pooling)} has none; take the task's own pooling"
+                )
+            self._check_gives(torch.zeros(1, self.pooling.channels, *grid.shape))
+            self.projection = registry("projection").build(projection, pixel=grid.pitch)
+            self.rasterizer = registry("rasterizer").build(rasterizer)
+            self.projection.check_sees(grid)
+            if self.pooling.grid is None:
+                zone = grid.elevations.min().item(), grid.elevations.max().item()
+        channels = self.pooling.channels
         self.placement = registry("placement").build(placement, scene=scene, channels=channels)
+        own = name_of(self.placement)
         if self.placement.model not in (None, self.name):
             raise ValueError(
-                f"placement {name_of(self.placement)!r} makes another predictor, whose results have a name of their "
-                f"own; set model={self.placement.model}"
+                f"placement {own!r} makes another predictor, whose results go by its name; set "
+                f"model={self.placement.model}"
             )
-        if self.own_placement not in (None, name_of(self.placement)):
+        if self.own_placement not in (None, own):
             raise ValueError(
-                f"model {self.name!r} takes placement={self.own_placement}, got {name_of(self.placement)}; take "
-                f"+experiment={self.name}, which has all its parts"
-            )
-        if gaussians is None and not self.placement.has_own:
-            raise ValueError(
-                f"placement {name_of(self.placement)!r} places free Gaussians alone; set gaussians=lattice"
+                f"model {self.name!r} takes placement={self.own_placement}, got {own}; take +experiment={self.name}, "
+                "which has all its parts"
             )
         self.gaussians = None
         if gaussians is not None:
             self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels)
             if self.placement.has_own and self.gaussians.degree:
                 raise ValueError(
-                    f"Gaussians beside those of placement {name_of(self.placement)!r} must have gaussians.degree=0, "
-                    f"got {self.gaussians.degree}"
+                    f"Gaussians beside those of placement {own!r} must have gaussians.degree=0, got "
+                    f"{self.gaussians.degree}"
                 )
+        elif not self.placement.has_own:
+            raise ValueError(f"placement {own!r} places free Gaussians alone; set gaussians=lattice")
         kind = deformation
         if not is_built(deformation):
-            name = deformation if isinstance(deformation, str) else deformation["name"]
-            kind = registry("deformation").get(name)
-        reads_tokens = kind.reads_tokens
-        self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene) if reads_tokens else None
-        context = {"scene": scene, "channels": channels}
-        if reads_tokens:
-            parts = self.tokenizer
+            kind = registry("deformation").get(deformation if isinstance(deformation, str) else deformation["name"])
+        self.tokenizer, context = None, {"scene": scene, "channels": channels}
+        if kind.reads_tokens:
+            parts = self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
             context["tokenizer_widths"] = parts.scene_width, parts.gaussian_width, parts.transmitter_width
         self.deformation = registry("deformation").build(deformation, **context)
 
+    @property
+    def takes_paths(self) -> bool:
+        """True if the pooling sums paths, and no map is drawn."""
+        return isinstance(self.pooling, PathPooling)
+
     @staticmethod
-    def own_pooling(scene: Scene) -> str | dict:
+    def own_pooling(scene: Scene) -> str:
         """The pooling that suits the scene's labels."""
         if scene.task.directions is not None:
             return "spectrum"
@@ -191,34 +204,40 @@ class GaussianSplatting(Model):
                 "angles and phases of Gaussians need the digits of float32; set trainer.precision to 32-true or 64-true"
             )
         query = batch.query
-        # What a place excites is the same for all who hear it, unless a part looks at the receiver.
-        places, which = query.unique(with_receivers=self._sees_receivers)
-        _, residuals, _ = excited = self._excite(places)
+        # Receivers share what a place excites, unless a part looks at the receiver.
+        parts = self.placement, self.tokenizer, self.deformation
+        places, which = query.unique(with_receivers=any(getattr(part, "sees_receivers", False) for part in parts))
+        excited = self.excite(places)
         links, values = [], []
         for receiver in query.receivers.unique().tolist() or [0]:  # no links have a label's shape too
             links.append((query.receivers == receiver).nonzero()[:, 0])
-            own = query[links[-1]]
-            if self.draws_map:
-                maps = [
-                    self.rasterizer(*arguments)[0]
-                    for arguments in self._arguments(*excited, which[links[-1]], receiver, batch.directions)
-                ]
-                value = self.pooling(torch.cat(maps), own, batch.directions)
+            own, rows = query[links[-1]], which[links[-1]]
+            if self.takes_paths:
+                received = self.paths(excited, rows, receiver, own)
             else:
-                heard = self._sum(*excited, which[links[-1]], receiver, own)
-                value = self.pooling.hear(heard, own, batch.directions)
-            if self.pooling.grid is None and batch.directions is not None:
+                calls = self._splats(excited, rows, receiver, batch.directions)
+                received = torch.cat([self.rasterizer(*arguments)[0] for arguments in calls])
+            value = self.pooling(received, own, batch.directions)
+            if not self.takes_paths and self.pooling.grid is None and batch.directions is not None:
                 value = value.reshape(len(own), *batch.directions.shape)  # a list of rays was rendered as one row
             values.append(value)
-        value = self._on_trend(torch.cat(values)[torch.cat(links).argsort()], batch)
+        value = self.on_trend(torch.cat(values)[torch.cat(links).argsort()], batch)
         penalties = {}
-        if residuals.delta_opacities is not None:
-            penalties["opacity"] = residuals.delta_opacities.square().mean()
-        penalties |= self.placement.penalties()
-        return Prediction(value, penalties)
+        if excited.residuals.delta_opacities is not None:
+            penalties["opacity"] = excited.residuals.delta_opacities.square().mean()
+        return Prediction(value, penalties | self.placement.penalties())
 
-    def _on_trend(self, value: Tensor, batch: Batch) -> Tensor:
+    def on_trend(self, value: Tensor, batch: Batch) -> Tensor:
+        """The pooled value on top of the trend."""
         return value if self.trend is None else self.trend(batch).value + value - self.level
+
+    @property
+    def learning_rates(self) -> dict[str, float]:
+        return {**Gaussians.learning_rates, **self.placement.learning_rates, **super().learning_rates}
+
+    @property
+    def penalty_weights(self) -> dict[str, float]:
+        return {"opacity": 0.01, **self.placement.penalty_weights}  # the paper's alpha, as released
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {}
@@ -235,19 +254,19 @@ class GaussianSplatting(Model):
         return self.gaussians
 
     def facts(self) -> dict[str, object]:
-        """The rasterizer that the last map was rendered with."""
-        return {"rasterizer": self.rasterizer.used}
+        """The rasterizer that drew the last map, where there is one."""
+        return {} if self.rasterizer is None else {"rasterizer": self.rasterizer.used}
 
     def rendering(self, batch: Batch) -> Callable[[], object]:
-        """The rasterizer alone, for the links to the first link's receiver; of ``aperture`` with the projection."""
+        """The rasterizer alone, or the sum over paths, for the links to the first link's receiver."""
         receiver = int(batch.query.receivers[0])
         query = batch.query[(batch.query.receivers == receiver).nonzero()[:, 0]]
         with torch.no_grad():
             which = torch.arange(len(query), device=query.transmitters.device)
-            excited = self._excite(query)
-            if not self.draws_map:
-                return lambda: self._sum(*excited, which, receiver, query)
-            calls = self._arguments(*excited, which, receiver, batch.directions)
+            excited = self.excite(query)
+            if self.takes_paths:
+                return lambda: self.pooling.sum_paths(self.paths(excited, which, receiver, query))
+            calls = self._splats(excited, which, receiver, batch.directions)
         return lambda: [self.rasterizer(*arguments) for arguments in calls]
 
     def export(self, folder: Path) -> None:
@@ -255,13 +274,8 @@ class GaussianSplatting(Model):
         if self.gaussians is not None:
             self.gaussians.save_ply(folder / "gaussians.ply")
 
-    @property
-    def _sees_receivers(self) -> bool:
-        parts = self.placement, self.tokenizer, self.deformation
-        return any(getattr(part, "sees_receivers", False) for part in parts)
-
-    def _excite(self, query: Query) -> tuple[Placed, Residuals, Float[Tensor, "places n 3 3"]]:
-        """The Gaussians for each query, what it changes in them, and their semi-axes then (1 or b, n, 3, 3) [m]."""
+    def excite(self, query: Query) -> Excited:
+        """The Gaussians as each row of a query excites them."""
         placed = self.placement(self.gaussians, query)
         if placed.opacities is None:
             own = self.gaussians
@@ -271,7 +285,7 @@ class GaussianSplatting(Model):
                 opacities=own.opacities,
                 signal=_towards(own.bands, query.transmitters[:, None] - placed.means),
             )
-        # The network says how a place responds to a transmitter; where the Gaussians go is learnt from the image alone.
+        # The network learns how a place responds to a transmitter. No gradient of it moves the Gaussians.
         seen = Placed(*(None if part is None else part.detach() for part in placed))
         tokens = None if self.tokenizer is None else self.tokenizer(seen, seen.opacities, query)
         residuals = self.deformation(tokens, seen, query)
@@ -280,74 +294,65 @@ class GaussianSplatting(Model):
             quats = quats + residuals.delta_quats
         if residuals.delta_scales is not None:
             scales = scales + residuals.delta_scales
-        return placed, residuals, semi_axes(quats, scales)
+        return Excited(placed, residuals, semi_axes(quats, scales))
 
-    def _arguments(
-        self,
-        placed: Placed,
-        residuals: Residuals,
-        axes: Float[Tensor, "places n 3 3"],
-        which: Int[Tensor, "b"],
-        receiver: int,
-        directions: Directions | None,
-    ) -> list[tuple]:
-        """A map rasterizer's arguments: the Gaussians as some queries excite them, on the receiver's plane.
+    def paths(self, excited: Excited, which: Int[Tensor, " b"], receiver: int, query: Query) -> ReceivedPaths:
+        """The paths of some queries to one receiver.
 
-        One call does for all where the Gaussians stand still, else there is one for each query.
+        Args:
+            excited: The Gaussians of all places.
+            which: Place of each query.
+            receiver: Index of the receiver.
+            query: The queries.
         """
-        if self.pooling.grid is not None or directions is None:
-            directions = self.pooling.grid or self.scene.task.directions
-        plane = self.projection.plane(directions.to(placed.means.device).to(placed.means.dtype))
-        # Where nobody asks, it does not matter where Gaussians stand that follow the query.
-        rows = [which] if len(placed.means) == 1 or not len(which) else which.split(1)
-        calls = []
-        for row in rows:
-            if not len(placed.means):
-                n = placed.means.shape[1]
-                placed = placed._replace(means=placed.means.new_zeros(1, n, 3))
-                axes = placed.means.new_ones(1, n, 3, 3)
-            stands = placed.means if len(placed.means) == 1 else placed.means[row]
-            splats = self._splats(stands, axes, row, receiver)
-            signal, opacities, attenuations = self._strengths(placed, residuals, row)
-            calls.append((splats, signal, opacities, attenuations, plane))
-        return calls
-
-    def _sum(
-        self,
-        placed: Placed,
-        residuals: Residuals,
-        axes: Float[Tensor, "places n 3 3"],
-        which: Int[Tensor, "b"],
-        receiver: int,
-        query: Query,
-    ) -> Tensor:
-        """What the receiver's elements hear, summed without a map."""
-        stands = placed.means.expand(len(which), -1, -1) if len(placed.means) == 1 else placed.means[which]
-        signal, opacities, _ = self._strengths(placed, residuals, which)
+        placed = excited.placed
+        means, axes = (part if len(part) == 1 else part[which] for part in (placed.means, excited.semi_axes))
+        signal, opacities, _ = self._strengths(excited, which)
         amplitudes = torch.complex(signal[..., 0], signal[..., 1]) * opacities
-        n = amplitudes.shape[1]
-        lengths = amplitudes.real.new_zeros(len(which), n) if placed.lengths is None else placed.lengths[which]
-        antenna, frequencies = self.scene.receivers[receiver], self._carriers(query)
-        if self.pooling.takes == "fields":
-            pose = antenna.pose.to(stands)
-            axes = pose.rotation.mT @ (axes if len(axes) == 1 else axes[which])
-            offsets = self.scene.task.frequencies.to(frequencies)[None] - frequencies[:, None]
-            heard = pose.local(stands), axes, amplitudes, lengths, antenna.array, frequencies, offsets
-            return self.rasterizer.fields(*heard)
-        splats = self._splats(stands, axes, which, receiver)
-        coherences = lengths.new_ones(n) if placed.coherences is None else placed.coherences
-        heard = splats, amplitudes, lengths, coherences, placed.bandwidth, antenna.array, frequencies
-        return self.rasterizer.lags(*heard)
+        b, n = amplitudes.shape
+        return ReceivedPaths(
+            means.expand(b, -1, -1),
+            axes,
+            amplitudes,
+            amplitudes.real.new_zeros(b, n) if placed.lengths is None else placed.lengths[which],
+            amplitudes.real.new_ones(n) if placed.coherences is None else placed.coherences,
+            placed.bandwidth,
+            self.scene.receivers[receiver],
+            self.carriers(query),
+        )
 
-    def _carriers(self, query: Query) -> Float[Tensor, "b"]:
+    def carriers(self, query: Query) -> Float[Tensor, " b"]:
         """The links' frequencies [Hz]; single antennas hear powers alike at any, so they need none."""
         is_known = query.frequencies is not None or len(self.scene.frequencies) or self.scene.task.dtype.is_complex
         if not is_known and all(len(receiver.array) == 1 for receiver in self.scene.receivers):
             return query.transmitters.new_ones(len(query))
         return carriers(self.scene, query)
 
-    def _strengths(self, placed: Placed, residuals: Residuals, which: Int[Tensor, "b"]) -> tuple:
+    def _splats(
+        self, excited: Excited, which: Int[Tensor, " b"], receiver: int, directions: Directions | None
+    ) -> list[tuple]:
+        """The rasterizer's arguments: the Gaussians of some queries on the receiver's plane.
+
+        One call does for all where the Gaussians stand still, else there is one for each query.
+        """
+        placed, axes = excited.placed, excited.semi_axes
+        if self.pooling.grid is not None or directions is None:
+            directions = self.pooling.grid or self.scene.task.directions
+        plane = self.projection.plane(directions.to(placed.means.device).to(placed.means.dtype))
+        means = placed.means
+        if not len(means):  # no query: Gaussians that follow it may stand anywhere
+            means, axes = means.new_zeros(1, means.shape[1], 3), means.new_ones(1, means.shape[1], 3, 3)
+        calls = []
+        for row in [which] if len(means) == 1 else which.split(1):
+            stands = means[0] if len(means) == 1 else means[row][0]
+            own_axes = axes if len(axes) == 1 else axes[row]
+            splats = self.projection.project(stands, own_axes, self.scene.receivers[receiver].pose)
+            calls.append((splats, *self._strengths(excited, row), plane))
+        return calls
+
+    def _strengths(self, excited: Excited, which: Int[Tensor, " b"]) -> tuple:
         """Signal (b, n, c), opacities (b, n) and attenuations of some queries."""
+        placed, residuals = excited.placed, excited.residuals
         signal, opacities = placed.signal, placed.opacities
         if signal.ndim == 4:  # another for each query
             signal = signal[which]
@@ -367,22 +372,33 @@ class GaussianSplatting(Model):
             )
         return signal.expand(len(which), -1, -1), opacities.expand(len(which), -1), attenuations
 
-    def _splats(
-        self, means: Tensor, axes: Float[Tensor, "places n 3 3"], which: Int[Tensor, "b"], receiver: int
-    ) -> Splats:
-        """Some queries' Gaussians on the receiver's plane."""
-        axes, pose = axes if len(axes) == 1 else axes[which], self.scene.receivers[receiver].pose
-        return self.projection.project(means if not self.draws_map else means[0], axes, pose)
+    def _check_gives(self, received: Tensor | ReceivedPaths) -> None:
+        """Raises a ``ValueError`` where the pooling gives no label of the task from a single map or set of paths."""
+        query = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), torch.tensor([1e9]))  # any carrier
+        gives, task = tuple(self.pooling(received, query).shape[1:]), self.scene.task
+        if gives != task.shape:
+            raise ValueError(
+                f"the pooling must give labels of task {task.name!r}, {task.shape}, and {name_of(self.pooling)} gives "
+                f"{gives}; take the task's own pooling"
+            )
+
+
+def _no_paths(scene: Scene) -> ReceivedPaths:
+    """One set of zero paths."""
+    zeros = torch.zeros
+    amplitudes = zeros(1, 0, dtype=torch.complex64)
+    paths = zeros(1, 0, 3), zeros(1, 0, 3, 3), amplitudes, zeros(1, 0), zeros(0), None
+    return ReceivedPaths(*paths, scene.receivers[0], torch.tensor([1e9]))
 
 
 def _towards(bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]) -> Float[Tensor, "*b n c 1"]:
-    """What Gaussians send for transmitters so far away from them [m], before the factor of the constant harmonic.
+    """Signal of Gaussians for transmitters so far away from them [m], before the factor of the constant harmonic.
 
     Without harmonics it is the same for all transmitters.
     """
     if bands.shape[-1] == 1:
         return bands
-    # On a centre there is no direction: towards it the harmonics fade, and gradients stay moderate.
-    seen = -offsets / offsets.norm(dim=-1, keepdim=True).clamp(min=BESIDE)
+    # On a centre there is no direction. Nearer than 0.05 m the harmonics fade, so that gradients stay moderate.
+    seen = -offsets / offsets.norm(dim=-1, keepdim=True).clamp(min=0.05)
     harmonics = spherical_harmonics(seen, math.isqrt(bands.shape[-1]) - 1)
     return (bands * harmonics[:, :, None]).sum(-1, keepdim=True) / SH_DC

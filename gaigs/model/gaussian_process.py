@@ -1,52 +1,49 @@
-"""Kriging: a Gaussian process of what a trend leaves over, the strongest simple predictor from places."""
+"""Gaussian process regression over a trend (kriging): the strongest simple predictor from positions."""
 
 import math
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.kriging.fit import LIMIT, PART, Hyperparameters, damping, likeliest, norms, numbers_of, weigh
-from gaigs.kriging.links import at_directions, coordinates, distances, known_links
+from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, label_numbers
+from gaigs.kriging.kernel import LIMIT, cholesky_factor, kernel, kriging_weights
+from gaigs.kriging.links import PART, at_directions, coordinates, distances, known_links
 from gaigs.model import Model, Prediction, build_trend
 from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.scene import Scene
 
 NEIGHBOURS = 300
-"""Known links looked at in each prediction where there are more than ``LIMIT``: with this kernel, those near a place
-hide those behind them."""
+"""Known links that enter each prediction of local kriging: with this kernel near links screen those behind them."""
 
 
 @register("model", "gaussian_process")
 class GaussianProcess(Model):
     """label = trend + z + noise, z a Gaussian process over places with the Matern-1/2 kernel exp(-d / l).
 
-    d is the distance of transmitters; where the training links have several carriers, that in place and frequency,
-    d² = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are processes of their own with one
-    kernel.
+    d is the distance of transmitters. Where the training links have several carriers it is the distance in place and
+    frequency, d² = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are processes of their own with
+    one kernel.
 
-    Length l [m], the noise's variance over the signal's, and s [m] are those with which the validation links are
-    likeliest, each given the training links around it: the validation is held out as the test is, and how well a label
-    is told from others depends on how far these are. With fewer than ``FEWEST`` of them, training links are held out
-    one by one, each with all that share its place. The three are shared by all receivers; the signal's variance is each
-    receiver's likeliest.
+    Length l [m], nugget (variance of the noise over that of the signal) and s [m] maximise the likelihood of the
+    validation links given the training links around them. With fewer than ``kriging.fit.FEWEST`` of them, training
+    links are held out one by one, each with all that share its place. All receivers share the three. The signal's
+    variance is each receiver's most likely one.
 
-    A receiver with more than ``LIMIT`` known links is predicted from the ``NEIGHBOURS`` nearest to each query instead
-    of from all (local kriging).
+    A receiver with more than ``LIMIT`` known links is predicted from the ``NEIGHBOURS`` nearest to each query (local
+    kriging). Residuals of channels are limited to ``kriging.fit.LOUDEST`` times the receiver's median channel.
 
-    What the trend leaves over of a channel counts as no larger than ``LOUDEST`` times the receiver's median channel.
-
-    It is a look-up, which keeps the links, and is not stored in a checkpoint.
+    It is a look-up: it keeps the links, and is not stored in a checkpoint.
 
     Args:
-        trend: Configuration of the model that is fitted first, whose residuals the process describes; None: each
+        trend: Configuration of the model that is fitted first; the process describes its residuals. None: each
             receiver's mean label.
 
     Raises:
-        ValueError: The trend is a model that is trained.
+        ValueError: The trend is a trained model.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7 and 5.4.2.
     """
@@ -56,38 +53,36 @@ class GaussianProcess(Model):
         built = build_trend({"name": "mean"} if trend is None else trend, scene)
         if any(True for _ in built.parameters()):
             raise ValueError(
-                f"model.trend must be a model that is fitted at once, and {trend['name']} is trained; take mean, "
-                "path_loss or friis"
+                f"model.trend must be a model without training, got {trend['name']}; choose mean, path_loss or friis"
             )
-        self.trends = (built,)  # in a tuple, so that its state is no state of this look-up
+        self.trends = (built,)  # in a tuple: its state is no state of this look-up
         self.links, self.known, self.solved, self.factors = None, None, None, None
-        self.process = Hyperparameters(math.nan, math.nan, None)
+        self.process = Hyperparameters()
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits the trend, chooses length, noise and scale, and factorises the kernel's matrices.
+        """Fits trend and hyperparameters, and factorises the covariances.
 
         Raises:
-            ValueError: A receiver has no links to learn from.
+            ValueError: A receiver has no training or validation links.
         """
         self.links, self.known = links, known_links(links)
         self.trends[0].fit(links)
         self.factors = None
         if self.scene.task.dtype.is_complex:
             index = torch.cat(self.known)
-            sizes = torch.cat([norms(part) for _, part in self._residuals(index)])
-            usual = torch.cat([norms(links.labels[part]) for part in index.split(PART)])
-            factors = damping(sizes, usual, links.query.receivers[index])
+            residuals = torch.cat([part for _, part in self._residuals(index)])
+            factors = damping(residuals, links.labels[index], links.query.receivers[index])
             self.factors = torch.ones(len(links)).index_copy(0, index, factors)
-        numbers = numbers_of(self.scene)
+        numbers = label_numbers(self.scene)
         residuals = lambda index: torch.cat(
             [part.reshape(len(part), -1)[:, numbers] for _, part in self._residuals(index)]
         )
-        self.process, _ = likeliest(self.scene, links, self.known, residuals)
+        self.process, _ = fit_hyperparameters(self.scene, links, residuals)
         self.solved = [self._solve(index) for index in self.known]
 
     def facts(self) -> dict[str, object]:
-        """Length [m], the noise's variance over the signal's, and where there are several carriers their scale [m]."""
+        """``length_m``, ``nugget``, and with several carriers ``frequency_scale_m``."""
         return self.process.facts()
 
     def forward(self, batch: Batch) -> Prediction:
@@ -96,35 +91,28 @@ class GaussianProcess(Model):
         added = torch.zeros_like(trend)
         for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver
-            added[own] = self._krige(query[own], receiver)
+            added[own] = self._kriged(query[own], receiver)
         return Prediction(at_directions(trend + added, batch, self.scene), {})
 
-    # --- the process given its hyperparameters ---
+    def _places(self, query: Query) -> Tensor:
+        return coordinates(self.scene, query, self.process.scale)
 
-    def _covariances(self, a: Query, b: Query) -> Float[Tensor, "a b"]:
-        """Over the signal's variance."""
-        asked, known = (coordinates(self.scene, query, self.process.scale) for query in (a, b))
-        return distances(asked, known).div_(-self.process.length).exp_()
+    def _solve(self, index: Int[Tensor, " k"]) -> tuple[Tensor | None, Tensor | None]:
+        """The smaller of a receiver's residuals over their covariances, and the covariances' Cholesky factor.
 
-    def _solve(self, index: Int[Tensor, "k"]) -> tuple[Tensor | None, Tensor | None]:
-        """What predictions from some known links take: their residuals over the covariances, or the latter's factor.
-
-        Of the two the smaller; neither where there are too many links.
+        Both are None where local kriging predicts.
         """
         if len(index) > LIMIT:
             return None, None
-        query = self.links.query[index]
-        covariances = self._covariances(query, query)
-        covariances.diagonal().add_(self.process.noise)
-        factor = torch.linalg.cholesky(covariances)
+        factor = cholesky_factor(self._places(self.links.query[index]), self.process.length, self.process.nugget)
         if math.prod(self.scene.task.shape) >= len(index):
             return None, factor
         residuals = torch.cat([part for _, part in self._residuals(index)]).reshape(len(index), -1)
         wide = torch.promote_types(residuals.dtype, torch.float64)
         return torch.cholesky_solve(residuals.to(wide), factor.to(wide)), None
 
-    def _residuals(self, index: Int[Tensor, "k"]) -> Iterator[tuple[slice, Tensor]]:
-        """Labels of some links less their trend, so many at a time, and which these are."""
+    def _residuals(self, index: Int[Tensor, " k"]) -> Iterator[tuple[slice, Tensor]]:
+        """Labels of some links less their trend, ``PART`` links at a time, with their positions in the index."""
         for start in range(0, len(index), PART):
             some = index[start : start + PART]
             trend = self.trends[0](Batch(self.links.query[some], self.scene.task.directions)).value
@@ -133,19 +121,19 @@ class GaussianProcess(Model):
                 residuals = residuals * self.factors[some, None, None]
             yield slice(start, start + len(some)), residuals
 
-    def _krige(self, query: Query, receiver: int) -> Tensor:
-        """What the process adds to the trend (b, *shape)."""
+    def _kriged(self, query: Query, receiver: int) -> Tensor:
+        """Residuals (b, *shape) that the process predicts."""
         index, (solution, factor) = self.known[receiver], self.solved[receiver]
+        asked, known = self._places(query), self._places(self.links.query[index])
+        length, nugget, _ = self.process
         if solution is not None:
-            values = self._covariances(query, self.links.query[index]).to(solution) @ solution
+            values = kernel(asked, known, length).to(solution) @ solution
             return values.reshape(len(query), *self.scene.task.shape).to(self.scene.task.dtype)
         if factor is not None:
-            weights = torch.cholesky_solve(self._covariances(query, self.links.query[index]).T, factor).T
+            weights = torch.cholesky_solve(kernel(asked, known, length).T, factor).T
         else:
-            length, noise, scale = self.process
-            asked, known = (coordinates(self.scene, part, scale) for part in (query, self.links.query[index]))
             near = distances(asked, known).topk(NEIGHBOURS, largest=False).indices
-            own, _ = weigh(asked, known[near], length, noise)
+            own, _ = kriging_weights(asked, known[near], length, nugget)
             used, column = near.unique(return_inverse=True)
             weights = own.new_zeros(len(query), len(used)).scatter(1, column, own)
             index = index[used]

@@ -1,4 +1,4 @@
-"""Inverse-distance weighting of the nearest training links: what a look-up scores."""
+"""Inverse-distance weighting of the nearest known links: the simplest look-up."""
 
 import math
 
@@ -13,27 +13,21 @@ from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.scene import Scene
 
-TRIED = 256
-"""Known links, evenly spread, whose labels are predicted from the others to choose the scale of frequencies."""
-
-SCALES = 16
-"""Scales of frequencies that are tried, in even ratios."""
-
 
 @register("model", "knn")
 class KNearestNeighbours(Model):
-    """The mean of the k training labels nearest to the transmitter, weighted by 1 / distance^power.
+    """The mean of the k known labels nearest to the transmitter, weighted by 1 / distance^power.
 
-    Links that stand as near as the k-th count too, so it does not matter in which order they come. It keeps the whole
-    training set, one byte a pixel where the labels are images.
+    Links as near as the k-th count too, so that the order of links does not matter. The look-up keeps all links, one
+    byte a pixel where the labels are images.
 
     Where the training links have several carriers, the distance is that in place and frequency,
-    d² = |dx|² + (s d ln f)². ``fit`` takes the scale s [m] with which the known links are predicted best from those
-    at other places.
+    d² = |dx|² + (s d ln f)². ``fit`` takes the scale s [m] with the least squared error of known links that are
+    predicted from those at other places.
 
     Args:
-        k: Neighbours; as many as there are, if fewer.
-        power: Of the distance; 0 weighs all neighbours alike.
+        k: Number of neighbours; with fewer known links, all of them.
+        power: Exponent of the distance; 0 weights all neighbours equally.
 
     Raises:
         ValueError: ``k`` or ``power`` is out of range.
@@ -48,60 +42,59 @@ class KNearestNeighbours(Model):
         if not 0 <= power < math.inf:
             raise ValueError(f"model.power must be 0 or more, and finite, got {power}")
         self.k, self.power = k, power
-        self.links, self.known, self.scale = None, None, None
+        self.links, self.known, self.scale = None, None, math.nan
 
     def fit(self, links: Links) -> None:
         """Keeps the links, and chooses the scale of frequencies.
 
         Raises:
-            ValueError: A receiver has no links to learn from.
+            ValueError: A receiver has no training or validation links.
         """
-        self.links, self.known, self.scale = links, known_links(links), None
+        self.links, self.known, self.scale = links, known_links(links), math.nan
         if self.scene.has_band:
             low, high = scale_bounds(self.scene)
-            scales = torch.logspace(math.log10(low), math.log10(high), SCALES, dtype=torch.float64).tolist()
+            scales = torch.logspace(math.log10(low), math.log10(high), 16, dtype=torch.float64).tolist()
             self.scale = min(scales, key=self._leave_one_out)
 
     def facts(self) -> dict[str, object]:
-        """The scale of frequencies, where there are several [m]."""
-        return {} if self.scale is None else {"frequency_scale_m": self.scale}
+        """``frequency_scale_m``, where there are several carriers."""
+        return {} if math.isnan(self.scale) else {"frequency_scale_m": self.scale}
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
-        labels = self.links.labels[self.known[0][:0]]  # none, of the right shape
-        labels = labels.new_empty(len(query), *labels.shape[1:])
+        labels = torch.empty(len(query), *self.scene.task.shape, dtype=self.scene.task.dtype)
         for receiver in query.receivers.unique():
             own = query.receivers == receiver
             apart = self._distances(query[own], self.known[receiver], self.scale)
             labels[own] = self._look_up(apart, self.known[receiver])
         return Prediction(at_directions(labels, batch, self.scene), {})
 
-    def _distances(self, query: Query, index: Int[Tensor, "k"], scale: float | None) -> Float[Tensor, "b k"]:
-        """From links to some known ones [m]."""
+    def _distances(self, query: Query, index: Int[Tensor, " k"], scale: float) -> Float[Tensor, "b k"]:
+        """Distances of links to some known ones [m]."""
         asked, known = (coordinates(self.scene, part, scale) for part in (query, self.links.query[index]))
         return distances(asked, known)
 
-    def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, "k"]) -> Tensor:
-        """Labels from those of known links, by their distances; infinite ones are left out."""
+    def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
+        """Labels from those of known links and their distances; links at an infinite distance are left out."""
         farthest = apart.topk(min(self.k, len(index)), largest=False).values[:, -1:]
         near = (apart <= farthest) & apart.isfinite()
-        # A transmitter that stands where one was measured, to a micrometre, gets that label.
+        # A transmitter within a micrometre of a measured one gets that label.
         apart = apart.clamp_min(1e-6)
-        weights = near * (apart.amin(1, keepdim=True) / apart) ** self.power  # relative: none is infinite
+        weights = near * (apart.amin(1, keepdim=True) / apart) ** self.power  # ratios stay finite
         weights = weights / weights.sum(1, keepdim=True)
         used = near.any(0)
         labels = self.links.labels[index[used]]
         return torch.tensordot(weights[:, used].to(labels), labels, 1)
 
     def _leave_one_out(self, scale: float) -> float:
-        """Mean squared error of known links that are predicted from those at other places, as links of the test are."""
+        """Mean squared error of known links that are predicted from those at other places, as test links are."""
         errors, count = 0.0, 0
         for index in self.known:
-            for part in evenly(index, max(1, TRIED // len(self.known))).split(32):
+            for part in evenly(index, max(1, 256 // len(self.known))).split(32):
                 asked, known = self.links.query[part], self.links.query[index]
                 here = (asked.transmitters[:, None] == known.transmitters).all(-1)
                 apart = self._distances(asked, index, scale).masked_fill(here, math.inf)
-                found = apart.isfinite().any(1)  # it may be the only place
+                found = apart.isfinite().any(1)  # a place may be the only one
                 part = part[found]
                 error = self._look_up(apart[found], index) - self.links.labels[part]
                 errors += error.abs().double().square().sum().item()

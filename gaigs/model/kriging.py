@@ -1,6 +1,6 @@
-"""Kriging of a trained model: what it leaves over at the known links is predicted by a Gaussian process over places."""
+"""A trained model with kriging: a Gaussian process over places predicts its residuals."""
 
-import functools
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,111 +12,117 @@ from torch import Tensor, nn
 
 from gaigs.data import Links, Split
 from gaigs.gaussians import Gaussians
-from gaigs.kriging.fit import LIMIT, PART, Hyperparameters, damping, likeliest, norms, numbers_of
-from gaigs.kriging.links import at_directions, coordinates, distances, evenly, known_links
-from gaigs.model import Model, Prediction
+from gaigs.kriging.field import Field
+from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, label_numbers
+from gaigs.kriging.kernel import LIMIT
+from gaigs.kriging.links import PART, coordinates, thinned
+from gaigs.model import Model, Prediction, call_optional
+from gaigs.placement.learnt_room import LearntRoom
 from gaigs.query import Batch
-from gaigs.registry import register, registry
-from gaigs.report.shapes import LearntRoom
+from gaigs.registry import name_of, register, registry
 from gaigs.scene import Scene
 
-SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
-"""Shares of the trained model that are tried; of equally likely ones the first is taken."""
+log = logging.getLogger(__name__)
 
 WEIGHTS = (1.0, 0.75, 0.5, 0.25, 0.0)
-"""Weights of the kriged value beside the trained model's that are tried; of equally good ones the first is taken."""
-
-ASKED = 1000
-"""By how many held-out links length and noise are chosen once the share is: a trained model leaves little over that
-places tell, and by few links that seems to be what their chance is."""
-
-LEFT, MOST = 5e-4, 256
-"""Share of the residuals' energy that their principal components may leave out, and how many there are at most: SSIM
-sees little beyond, but ten times as much it does."""
-
-BATCH = 64
-"""Links predicted at a time."""
-
-EXACT = 512
-"""Up to so many links or numbers of a label the components are exact; of more, by random projections."""
+"""Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
 
 
 @register("model", "kriging")
 class Kriging(Model):
-    """weight (share trend + (1 - share) fallback + z) + (1 - weight) trend, z the kriged residual.
+    """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend, z the kriged residual.
 
-    The trend is a trained model, the fallback one that is fitted at once. z is the mean of a Gaussian process over
-    places with the Matern-1/2 kernel, as in ``gaigs.model.gaussian_process``. Share, length and noise are those with
-    which the validation links are likeliest, each given the training links around it. So at a share of 0 it is that
-    process, and far from all known links it is trend and fallback alone. Likelihood is no score: the weight is that of
-    ``WEIGHTS`` with which the validation links, predicted from the training links, score best. Residuals of channels
-    are damped as in ``gaigs.model.gaussian_process``.
+    The trend is a trained model. The fallback is a model that is fitted at once. z is the mean of a Gaussian process
+    over places, as in ``gaigs.model.gaussian_process``, residuals of channels limited as there. Far from all known
+    links z is 0. With a trend weight of 0 and a weight of 1 this is that process.
 
-    A checkpoint holds it whole, in a compact form: residuals as a few principal components. Of a receiver with more
-    than ``LIMIT`` known links an even part is looked at.
+    Trend weight, length and nugget maximise the likelihood of the validation links given the training links around
+    them. The weight is the one with which the validation links, predicted from the training links, score best: the
+    likelihood alone would trust kriging too far where cubes of space are held out.
 
-    It is made from a trained model by ``kriging=true``, and is not trained itself.
+    A checkpoint holds it whole, the residuals as a few principal components. Of a receiver with more than ``LIMIT``
+    known links an even part is used.
+
+    A run makes it by ``kriging=true``.
 
     Args:
         trend: The trained model, or its configuration where a state is to be loaded.
-        fallback: Configuration of the model that takes what the share leaves; None: each receiver's mean label.
+        fallback: Configuration of the model that takes the rest of the trend weight; None: each receiver's mean label.
 
     Raises:
-        ValueError: There is no trend, or the fallback has to be trained or needs its data.
+        ValueError: The trend has no training, or the fallback is trained or needs its data.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7 and 5.4.2.
     """
 
-    def __init__(self, scene: Scene, trend: dict | Model | None = None, fallback: dict | None = None):
+    def __init__(self, scene: Scene, trend: dict | Model, fallback: dict | None = None):
         super().__init__(scene)
-        if trend is None:
-            raise ValueError(
-                "model 'kriging' needs a trained model, of whose labels it predicts what is left over; choose that "
-                "model, and set kriging=true"
-            )
         self.trend = trend if isinstance(trend, Model) else registry("model").build(trend, scene=scene)
+        if not any(parameter.requires_grad for parameter in self.trend.parameters()):
+            raise ValueError(f"kriging needs a trained model, got {name_of(self.trend)}; leave kriging out")
         self.fallback_options = {"name": "mean"} if fallback is None else fallback
         self.fallback = registry("model").build(self.fallback_options, scene=scene)
         if not self.fallback.state_dict() or [*self.fallback.parameters()]:
             raise ValueError(
-                f"the fallback of kriging must be fitted at once and stored in a checkpoint, and "
-                f"{self.fallback_options['name']} is not; take mean, path_loss or friis as the trend of "
-                "gaussian_process in task.baselines"
+                "kriging_fallback must be a model without training that a checkpoint can hold, got "
+                f"{self.fallback_options['name']}; choose mean, path_loss or friis"
             )
         self.chunk, self.trained_by = self.trend.chunk, self.trend.trained_by
-        for name in ("share", "weight", "length", "noise", "scale"):
-            value = 1.0 if name in ("share", "weight") else math.nan
-            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
+        self.learning_rates, self.penalty_weights = self.trend.learning_rates, self.trend.penalty_weights
+        self.register_buffer("trend_weight", torch.tensor(1.0, dtype=torch.float64))
+        self.register_buffer("weight", torch.tensor(1.0, dtype=torch.float64))
+        self.register_buffer("hyperparameters", torch.full((3,), math.nan, dtype=torch.float64))
         self.fields = nn.ModuleList(Field(scene) for _ in scene.receivers)
 
     # --- fitting ---
 
     @torch.no_grad()
-    def fit(self, links: Links) -> None:
-        """Kriges what the trend leaves over, which must be trained.
+    def fit(self, links: Links) -> "Kriging":
+        """Kriges the residuals of the trend, which must be trained.
+
+        Returns:
+            The validation model: the same weights and hyperparameters on the training links alone, to be scored on the
+            validation links.
 
         Raises:
-            ValueError: A receiver has no links to learn from.
+            ValueError: A receiver has no training or validation links.
         """
-        links = thinned(links)
+        links = thinned(links, LIMIT)
+        split = links.split
         values = predicted(self.trend, links, known(links))
-        self.choose(links, values)
-        self.solve(links, values)
+        self.fallback.fit(links)
+        self._fit_trend_weight(links, values)
+        self._solve(links, values)
+        training = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
+        validation_model = Kriging(self.scene, self.trend, self.fallback_options)
+        validation_model.trend_weight.copy_(self.trend_weight)
+        validation_model.hyperparameters.copy_(self.hyperparameters)
+        validation_model.fallback.fit(training)
+        validation_model._solve(training, values[: len(split.train)])
+        validation_model.to(self.weight.device)
+        if len(split.validation):
+            labels, trend = links.labels[split.validation], values[len(split.train) :]
+            kriged = predicted(validation_model, links, split.validation)
+            task, sign = links.task, 1 if links.task.higher_is_better else -1
+            score = lambda weight: task.scores(labels, trend + weight * (kriged - trend))[task.monitor].mean().item()
+            best = max(WEIGHTS, key=lambda weight: sign * score(weight))
+            self.weight.fill_(best)
+            validation_model.weight.fill_(best)
+        log.info(
+            "kriging: weight %g, trend weight %g of %s, length %.3g m, nugget %.3g, %d components",
+            *(self.weight, self.trend_weight, name_of(self.trend), *self.hyperparameters[:2]),
+            max(len(field.components) for field in self.fields),
+        )
+        return validation_model
 
-    @torch.no_grad()
-    def choose(self, links: Links, values: Tensor) -> float:
-        """Fits the fallback, and takes the likeliest share, length and noise.
+    def _fit_trend_weight(self, links: Links, values: Float[Tensor, " k *shape"]) -> None:
+        """Fits the trend weight and the hyperparameters.
 
         Args:
             links: At most ``LIMIT`` known ones of each receiver.
-            values: What the trend predicts for the links of ``known``, in their order (k, *shape).
-
-        Returns:
-            Root mean square of what the trend leaves over at training links, over that at validation links; much below
-            1 where it has learnt its places by heart. NaN where nothing validates.
+            values: The trend's predictions of the ``known`` links, in their order.
         """
-        self.fallback.fit(links)
-        numbers = numbers_of(self.scene)
+        numbers = label_numbers(self.scene)
         thin = lambda labels: labels.reshape(len(labels), -1)[:, numbers]
         index = known(links)
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
@@ -127,102 +133,52 @@ class Kriging(Model):
             apart.append(thin(values[part] - fallback))
         over, apart = torch.cat(over), torch.cat(apart)
 
-        def likeliest_of(share: float, **options: int) -> tuple[Hyperparameters, float]:
-            left = over - share * apart
+        def fitted(trend_weight: float, **options: int) -> tuple[Hyperparameters, float]:
+            left = over - trend_weight * apart
             if left.is_complex():
-                sizes = norms(left), norms(thin(links.labels[index]))
-                left = left * damping(*sizes, links.query.receivers[index])[:, None]
-            return likeliest(self.scene, links, known_links(links), lambda some: left[rows[some]], **options)
+                left = left * damping(left, thin(links.labels[index]), links.query.receivers[index])[:, None]
+            return fit_hyperparameters(self.scene, links, lambda some: left[rows[some]], **options)
 
-        found = {share: likeliest_of(share) for share in SHARES}
-        share = min(SHARES, key=lambda share: found[share][1])
-        process, _ = likeliest_of(share, most=ASKED) if share else found[share]
-        self._set(share, process)
-        left = (over - apart).abs().square().mean(1)
-        train, validation = left.tensor_split([len(links.split.train)])
-        return (train.mean() / validation.mean()).sqrt().item()
+        found = {trend_weight: fitted(trend_weight) for trend_weight in WEIGHTS}
+        best = min(WEIGHTS, key=lambda trend_weight: found[trend_weight][1])
+        # Residuals of a good trend correlate weakly with position: few links would overfit.
+        process, _ = fitted(best, most=1000) if best else found[best]
+        self.trend_weight.fill_(best)
+        self.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
 
-    @torch.no_grad()
-    def solve(self, links: Links, values: Tensor) -> None:
-        """Takes what is left over at the known links; arguments as for ``choose``, which comes first."""
-        index, share = known(links), self.share.item()
-        own = links.query.receivers[index]
+    def _solve(self, links: Links, values: Float[Tensor, " k *shape"]) -> None:
+        """Kriges the residuals of the known links; arguments as for ``_fit_trend_weight``."""
+        index, trend_weight = known(links), self.trend_weight.item()
+        receivers = links.query.receivers[index]
         for receiver, field in enumerate(self.fields):
-            rows = (own == receiver).nonzero()[:, 0]
+            rows = (receivers == receiver).nonzero()[:, 0]
             residuals = torch.empty(len(rows), *self.scene.task.shape, dtype=self.scene.task.dtype)
             for part in torch.arange(len(rows)).split(PART):
                 some = index[rows[part]]
-                fallback = predicted(self.fallback, links, some)
-                residuals[part] = links.labels[some] - share * values[rows[part]] - (1 - share) * fallback
+                rest = (1 - trend_weight) * predicted(self.fallback, links, some)
+                residuals[part] = links.labels[some] - trend_weight * values[rows[part]] - rest
             if residuals.is_complex():
-                sizes = norms(residuals), norms(links.labels[index[rows]])
-                residuals = residuals * damping(*sizes, own[rows])[:, None, None]
-            places = coordinates(self.scene, links.query[index[rows]], self.process.scale)
-            field.solve(places, residuals, self.process)
-
-    def without_validation(self, links: Links, values: Tensor) -> "Kriging":
-        """The same of the training links alone, to be scored on the validation links; arguments as for ``choose``.
-
-        Share, length and noise are this model's.
-        """
-        split = links.split
-        unseen = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
-        twin = Kriging(self.scene, self.trend, self.fallback_options)
-        twin._set(self.share.item(), self.process)
-        twin.fallback.fit(unseen)
-        twin.solve(unseen, values[: len(split.train)])
-        return twin.to(self.share.device)
-
-    @torch.no_grad()
-    def weigh(self, links: Links, values: Tensor, blind: "Kriging") -> None:
-        """Takes the weight with which the validation links score best, and gives it to ``blind`` too.
-
-        Args:
-            links, values: As for ``choose``.
-            blind: What ``without_validation`` gives.
-        """
-        task, index = links.task, links.split.validation
-        if not len(index):
-            return
-        labels, trend, kriged = links.labels[index], values[len(links.split.train) :], predicted(blind, links, index)
-        score = lambda weight: task.scores(labels, trend + weight * (kriged - trend))[task.monitor].mean().item()
-        sign = 1 if task.higher_is_better else -1
-        best = max(WEIGHTS, key=lambda weight: sign * score(weight))
-        self.weight.fill_(best)
-        blind.weight.fill_(best)
-
-    @property
-    def process(self) -> Hyperparameters:
-        """Length, noise and scale."""
-        scale = self.scale.item() if self.scene.has_band else None
-        return Hyperparameters(self.length.item(), self.noise.item(), scale)
-
-    def _set(self, share: float, process: Hyperparameters) -> None:
-        self.share.fill_(share)
-        self.length.fill_(process.length)
-        self.noise.fill_(process.noise)
-        self.scale.fill_(math.nan if process.scale is None else process.scale)
+                residuals = residuals * damping(residuals, links.labels[index[rows]], receivers[rows])[:, None, None]
+            process = Hyperparameters(*self.hyperparameters.tolist())
+            field.solve(coordinates(self.scene, links.query[index[rows]], process.scale), residuals, process)
 
     # --- prediction ---
 
     def forward(self, batch: Batch) -> Prediction:
-        query, share, weight, value = batch.query, self.share.item(), self.weight.item(), 0
-        trend = self.trend(batch).value if share > 0 or weight < 1 else None
-        if weight == 0:
-            return Prediction(trend, {})
-        if share > 0:
-            value = share * trend
-        if share < 1:
-            value = value + (1 - share) * self.fallback(batch).value
-        places = coordinates(self.scene, query, self.scale if self.scene.has_band else None)
-        added = torch.zeros_like(value)
+        query, trend_weight, weight = batch.query, self.trend_weight.item(), self.weight.item()
+        length, _, scale = self.hyperparameters
+        # A part without weight is not evaluated: that would cost its time, and a NaN of it would count.
+        trend = self.trend(batch).value if trend_weight > 0 or weight < 1 else None
+        value = 0 if trend_weight == 0 else trend_weight * trend
+        if trend_weight < 1:
+            value = value + (1 - trend_weight) * self.fallback(batch).value
+        places = coordinates(self.scene, query, scale)
         for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver
-            added[own] = self.fields[receiver](places[own], self.length, batch)
-        value = value + added
+            value[own] = value[own] + self.fields[receiver](places[own], length, batch)
         return Prediction(value if weight == 1 else trend + weight * (value - trend), {})
 
-    # --- what a run reports of it: the trend's ---
+    # --- reports of a run: those of the trend ---
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         return self.trend.parameter_groups()
@@ -232,117 +188,28 @@ class Kriging(Model):
         return self.trend.primitives
 
     def facts(self) -> dict[str, object]:
-        """The trend's, and as ``kriging`` share, length, noise, scale, and how much is kept."""
-        kept = {
-            "links": sum(len(field.places) for field in self.fields),
-            "components": max(len(field.components) for field in self.fields),
-        }
-        chosen = {"weight": self.weight.item(), "share": self.share.item()}
-        return self.trend.facts() | {"kriging": chosen | self.process.facts() | kept}
+        """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
+        facts = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
+        facts |= Hyperparameters(*self.hyperparameters.tolist()).facts()
+        facts["links"] = sum(len(field.places) for field in self.fields)
+        facts["components"] = max(len(field.components) for field in self.fields)
+        return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
-        return self.trend.rendering(batch)
+        return call_optional(self.trend, "rendering", batch)
 
     def learnt_room(self, links: Links) -> LearntRoom | None:
-        return self.trend.learnt_room(links)
+        return call_optional(self.trend, "learnt_room", links)
 
     def export(self, folder: Path) -> None:
-        self.trend.export(folder)
+        call_optional(self.trend, "export", folder)
 
 
-class Field(nn.Module):
-    """What is added at one receiver.
-
-    With k known links and residuals of q principal components: places (k, d) [m], see ``coordinates``; weights (k, q),
-    the components' scores over the covariances of the links; components (q, *shape) in half precision, of complex ones
-    real and imaginary part last. Sizes are those of the data, and are taken over from a state that is loaded.
-
-    Args:
-        scene: Receivers and task.
-    """
-
-    def __init__(self, scene: Scene):
-        super().__init__()
-        task = scene.task
-        self.scene = scene
-        parts = (2,) if task.dtype.is_complex else ()
-        self.register_buffer("places", torch.zeros(0, 3 + scene.has_band, dtype=torch.float64))
-        self.register_buffer("weights", torch.zeros(0, 0, dtype=task.dtype))
-        self.register_buffer("components", torch.zeros(0, *task.shape, *parts, dtype=torch.float16))
-        self.register_buffer("widened", torch.zeros(0, *task.shape, dtype=task.dtype), persistent=False)
-
-    def solve(self, places: Float[Tensor, "k d"], residuals: Tensor, process: Hyperparameters) -> None:
-        """Takes residuals (k, *shape) at their places."""
-        components = principal(residuals.flatten(1) if residuals.ndim > 1 else residuals[:, None])
-        if components.is_complex():
-            components = torch.view_as_real(components)
-        shape = (len(components), *self.components.shape[1:])
-        # Laid out as a state that is loaded: else products would be rounded otherwise.
-        laid_out = functools.partial(torch.clone, memory_format=torch.contiguous_format)
-        self.components = laid_out(components.reshape(shape).to(self.components))
-        self._widen()
-        # Scores of the components as they are rounded, so that one for the next makes up for it.
-        kept = self.widened.cpu().reshape(len(components), -1)
-        residuals = residuals.reshape(len(residuals), -1)
-        wide = torch.promote_types(kept.dtype, torch.float64)
-        gram, cross = (kept @ kept.mH).to(wide), (residuals @ kept.mH).to(wide)
-        scores = torch.linalg.solve(gram, cross, left=False)
-        covariances = distances(places, places).div_(-process.length).exp_()
-        covariances.diagonal().add_(process.noise)
-        factor = torch.linalg.cholesky(covariances)
-        self.weights = laid_out(torch.cholesky_solve(scores, factor.to(wide)).to(self.weights))
-        self.places = laid_out(places.to(self.places))
-
-    def forward(self, places: Float[Tensor, "b d"], length: Tensor, batch: Batch) -> Tensor:
-        """What is added at some places, in the directions that a batch asks for."""
-        covariances = distances(places, self.places).div_(-length).exp_()
-        components = at_directions(self.widened, batch, self.scene)
-        return torch.tensordot(covariances.to(self.weights) @ self.weights, components, 1)
-
-    def _widen(self) -> None:
-        """The components in the task's precision, in which products are fast."""
-        components = self.components.float()
-        self.widened = torch.view_as_complex(components) if self.weights.is_complex() else components
-
-    def _load_from_state_dict(self, state_dict, prefix, *args):
-        for name in ("places", "weights", "components"):
-            stored = state_dict.get(f"{prefix}{name}")
-            if stored is not None:
-                own = getattr(self, name)
-                setattr(self, name, own.new_empty(stored.shape))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        self._widen()
-
-
-def principal(residuals: Float[Tensor, "k m"]) -> Float[Tensor, "q m"]:
-    """The first principal components, as few as leave out at most ``LEFT`` of the energy; the largest number of each
-    is 1."""
-    if min(residuals.shape) <= EXACT:
-        _, values, components = torch.linalg.svd(residuals, full_matrices=False)
-    else:
-        with torch.random.fork_rng(devices=[]):  # a run that is resumed must go on as if it had not stopped
-            torch.manual_seed(0)
-            _, values, columns = torch.svd_lowrank(residuals, q=MOST + 16)
-        components = columns.mH
-    energy = residuals.abs().square().sum()
-    left = energy - values.square().cumsum(0)
-    components = components[: min(int((left > LEFT * energy).sum()) + 1, MOST)]
-    return components / components.abs().amax(1, keepdim=True)
-
-
-def known(links: Links) -> Int[Tensor, "k"]:
+def known(links: Links) -> Int[Tensor, " k"]:
     """Training and validation links, in this order."""
     return torch.cat((links.split.train, links.split.validation))
 
 
-def predicted(model: Model, links: Links, index: Int[Tensor, "k"]) -> Float[Tensor, "k *shape"]:
-    """What a model says of some links, on the CPU."""
-    return torch.cat([model.predict(links.query[part], batch_size=BATCH).cpu() for part in index.split(BATCH)])
-
-
-def thinned(links: Links) -> Links:
-    """The same with at most ``LIMIT`` known links of each receiver, evenly spread over them."""
-    chosen = torch.cat([evenly(index, LIMIT) for index in known_links(links)])
-    train, validation, test = links.split.parts().values()
-    parts = (part[torch.isin(part, chosen)] for part in (train, validation))
-    return replace(links, split=Split(links.split.name, *parts, test))
+def predicted(model: Model, links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k *shape"]:
+    """Predictions of a model for some links, on the CPU."""
+    return torch.cat([values.cpu() for values in model.predict_batches(links.query[index], batch_size=64)])

@@ -1,4 +1,4 @@
-"""The mean of the training labels: what any model must beat."""
+"""The mean of the known labels: the weakest baseline."""
 
 import torch
 
@@ -12,7 +12,7 @@ from gaigs.scene import Scene
 
 @register("model", "mean")
 class Mean(Model):
-    """Predicts each receiver's mean training label, wherever the transmitter stands; NaN until it is fitted."""
+    """Predicts each receiver's mean label for any transmitter; NaN before ``fit``."""
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
@@ -20,10 +20,10 @@ class Mean(Model):
         self.register_buffer("means", torch.full(shape, torch.nan, dtype=scene.task.dtype))
 
     def fit(self, links: Links) -> None:
-        """Takes the means.
+        """Computes the means.
 
         Raises:
-            ValueError: A receiver has no links to learn from.
+            ValueError: A receiver has no training or validation links.
         """
         for receiver, index in enumerate(known_links(links)):
             wide = torch.promote_types(self.scene.task.dtype, torch.float64)

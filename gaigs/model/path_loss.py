@@ -1,4 +1,4 @@
-"""Log-distance path loss: the signal strength that distance alone explains."""
+"""Log-distance path loss: signal strength as a function of distance alone."""
 
 import torch
 from jaxtyping import Float, Int
@@ -11,22 +11,14 @@ from gaigs.query import Batch
 from gaigs.registry import register
 from gaigs.scene import Scene
 
-NEAR = 0.1
-"""Smaller distances count as this one [m]: within about a wavelength the field does not follow the law, and at 0 it
-has no value."""
-
-SPREAD = 1.01
-"""Ratio of the largest to the smallest distance below which the slope is not determined: one unit of the exponent then
-changes the labels by less than 0.05 dB."""
-
 
 @register("model", "path_loss")
 class PathLoss(Model):
-    """T - 10 gamma log10(distance / 1 m) for each receiver, by least squares; NaN until it is fitted.
+    """T - 10 gamma log10(distance / 1 m) for each receiver, by least squares; NaN before ``fit``.
 
-    It is meant for RSSI [dBm], and takes any task of one real number a link. Exponents are kept as fitted, negative
-    ones too, which say that distance explains nothing there. Where all links of a receiver are equally long, gamma is
-    2, that of free space, and only T is fitted.
+    It is meant for RSSI [dBm], and accepts any task of one real number a link. Negative exponents are kept: there
+    distance explains nothing. If all links of a receiver are equally long, gamma is 2 as in free space, and only T is
+    fitted. Distances below 0.1 m count as 0.1 m: within about a wavelength the field does not follow the law.
 
     Raises:
         ValueError: A label is more than one real number.
@@ -38,7 +30,7 @@ class PathLoss(Model):
         super().__init__(scene)
         if scene.task.shape or scene.task.dtype.is_complex:
             raise ValueError(
-                f"model path_loss must have one real number a link as label, got {scene.task.quantity} of shape "
+                f"model path_loss needs one real number a link as label, got {scene.task.quantity} of shape "
                 f"{scene.task.shape}; choose model=mean or model=knn"
             )
         self.register_buffer("levels", torch.full((len(scene.receivers),), torch.nan))  # T [dBm]
@@ -48,14 +40,15 @@ class PathLoss(Model):
         """Fits level and exponent of each receiver.
 
         Raises:
-            ValueError: A receiver has no links to learn from.
+            ValueError: A receiver has no training or validation links.
         """
         for receiver, index in enumerate(known_links(links)):
             labels = links.labels[index].double()
             decades = self._decades(links.query.transmitters[index].double(), links.query.receivers[index])
             centred = decades - decades.mean()
             exponent = torch.tensor(2.0)
-            if 10 ** (decades.max() - decades.min()) >= SPREAD:
+            # Below a ratio of 1.01 one unit of the exponent changes the labels by less than 0.05 dB.
+            if 10 ** (decades.max() - decades.min()) >= 1.01:
                 exponent = -(centred @ labels) / (10 * centred.square().sum())
             self.exponents[receiver] = exponent
             self.levels[receiver] = labels.mean() + 10 * exponent * decades.mean()
@@ -65,6 +58,6 @@ class PathLoss(Model):
         decades = self._decades(batch.query.transmitters, receivers)
         return Prediction(self.levels[receivers] - 10 * self.exponents[receivers] * decades, {})
 
-    def _decades(self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, "b"]) -> Float[Tensor, "b"]:
-        """Logarithm of the distances [m] to base 10."""
-        return (transmitters - self.scene.positions(transmitters)[receivers]).norm(dim=-1).clamp_min(NEAR).log10()
+    def _decades(self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, " b"]) -> Float[Tensor, " b"]:
+        """log10 of the distances in [m]."""
+        return (transmitters - self.scene.positions(transmitters)[receivers]).norm(dim=-1).clamp_min(0.1).log10()

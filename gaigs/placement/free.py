@@ -1,7 +1,7 @@
-"""The paper's placement: each Gaussian stands where it was learnt to stand, for every transmitter."""
+"""The paper's placement: Gaussians at their learnt positions, for every transmitter."""
 
-from gaigs.gaussians import Gaussians
-from gaigs.placement import Placed, Placement
+from gaigs.gaussians import Gaussians, Placed
+from gaigs.placement import Placement
 from gaigs.query import Query
 from gaigs.registry import register
 
@@ -14,5 +14,5 @@ class Free(Placement):
     """
 
     def forward(self, gaussians: Gaussians, query: Query) -> Placed:
-        """Where the Gaussians stand, whoever sends."""
+        """The means, for any query."""
         return Placed(gaussians.means[None])

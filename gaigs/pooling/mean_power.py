@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.directions import Directions
+from gaigs.geometry import Directions
 from gaigs.pooling import Pooling, sphere
 from gaigs.query import Query
 from gaigs.registry import register
@@ -28,22 +28,18 @@ class MeanPower(Pooling):
         ValueError: An option is out of range.
     """
 
-    takes = "lags"
-
     def __init__(self, grid: Sequence[int] = (4, 8), channels: int = 2, floor_db: float = -60.0):
         super().__init__()
         if channels not in (1, 2):
             raise ValueError(f"pooling 'mean_power' renders 1 real or 2 complex channels, got channels={channels}")
-        if not -300 <= floor_db <= 0:
-            raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
         self.channels = channels
-        self.floor = 10 ** (floor_db / 20)
+        self.floor = noise_amplitude(floor_db)
         self.grid = sphere("pooling.grid", grid)
         self.register_buffer("weights", self.grid.solid_angles, persistent=False)
 
     def forward(
         self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
-    ) -> Float[Tensor, "b"]:
+    ) -> Float[Tensor, " b"]:
         """Level relative to the model's trend [dB]; float32 where the map is of half precision.
 
         Raises:
@@ -55,14 +51,18 @@ class MeanPower(Pooling):
                 f"{tuple(image.shape[2:])}; build it with the map's own grid"
             )
         image = image.to(torch.promote_types(image.dtype, torch.float32))
-        # Squares of what is scaled by the largest neither overflow nor underflow.
+        # Scaled by the largest, squares neither overflow nor underflow.
         largest = image.detach().abs().amax((1, 2, 3)).clamp(min=self.floor)
         power = (image / largest[:, None, None, None]).square().sum(1).mul(self.weights).sum((1, 2))
         return 20 * largest.log10() + 10 * (power + (self.floor / largest).square()).log10()
 
-    def hear(
-        self, heard: Complex[Tensor, "b l"], query: Query, directions: Directions | None = None
-    ) -> Float[Tensor, "b"]:
-        """Level of the power at an element, lag 0, relative to the model's trend [dB]."""
-        power = heard[:, heard.shape[1] // 2].real
-        return 10 * (power + self.floor**2).log10()
+
+def noise_amplitude(floor_db: float) -> float:
+    """Amplitude of a receiver's noise from its level [dB].
+
+    Raises:
+        ValueError: The level is not between -300 and 0 dB.
+    """
+    if not -300 <= floor_db <= 0:
+        raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
+    return 10 ** (floor_db / 20)

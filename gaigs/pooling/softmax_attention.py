@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs.directions import Directions
+from gaigs.geometry import Directions
 from gaigs.pooling import Pooling, sphere
 from gaigs.query import Query
 from gaigs.registry import register
@@ -67,7 +67,7 @@ class SoftmaxAttention(Pooling):
 
     def forward(
         self, image: Float[Tensor, "b 1 rows columns"], query: Query, directions: Directions | None = None
-    ) -> Float[Tensor, "b"]:
+    ) -> Float[Tensor, " b"]:
         """Level relative to the model's trend [dB]; float32 where the map is of half precision."""
         bels = image.to(torch.promote_types(image.dtype, torch.float32)).flatten(1)
         # The paper subtracts the mean, and later the maximum, in which the mean cancels. Subtracting the maximum alone

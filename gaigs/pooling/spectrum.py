@@ -4,15 +4,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.directions import Directions
-from gaigs.geometry import magnitudes
+from gaigs.geometry import Directions, magnitudes
 from gaigs.pooling import Pooling
 from gaigs.query import Query
 from gaigs.registry import register
 
 
 @register("pooling", "spectrum")
-class Spectrum(Pooling):
+class SpectrumPooling(Pooling):
     """|C_0|, or |C_0 + j C_1|: channels are signed, so that paths can cancel.
 
     Args:

@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gaigs.directions import Directions, Grid
-from gaigs.geometry import Pose, semi_axes
+from gaigs.geometry import Directions, Grid, Pose, semi_axes
 from gaigs.registry import is_built, name_of, registry
 
 NEAR = 1e-6
-"""A Gaussian nearer to the receiver than this sits on it [m]: float32 tells no direction between two positions of some
-metres so close together, and footprints, which grow as 1 / distance², have a finite determinant down to here."""
+"""A Gaussian nearer to the receiver than this sits on it [m]. Float32 resolves no direction between positions so close
+together, and down to here the determinant of a footprint is finite."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +22,7 @@ class Splats:
     """Gaussians on the perception plane of one receiver.
 
     Attributes:
-        means2d: Centres (n, 2) as (u, v); (b, n, 2) where they follow the transmitter, which ``aperture`` alone takes.
+        means2d: Centres (n, 2) as (u, v); (b, n, 2) where they differ from query to query, as those of paths.
         factors: p, q and r of the lower triangular factor [[p, 0], [q, r]] of each covariance, p and r above 0
             (1 or b, n, 3); one for all transmitters where nothing deforms the Gaussians.
         depths: Distance to the receiver, as many as centres [m].
@@ -37,7 +36,7 @@ class Splats:
 
     @property
     def covariances2d(self) -> Float[Tensor, "b n 2 2"]:
-        """The factor times its transpose, which has fewer digits for what is long and thin."""
+        """The factor times its transpose, with fewer digits for long and thin splats."""
         p, q, r = self.factors.unbind(-1)
         return torch.stack((p * p, p * q, p * q, q * q + r * r), -1).unflatten(-1, (2, 2))
 
@@ -75,7 +74,7 @@ class Projection(ABC):
     """
 
     sees_below = True
-    """Whether a direction below the array's plane has a place of its own."""
+    """True if a direction below the array's plane has a place of its own."""
 
     def __init__(self, pixel: float):
         if not pixel > 0:
@@ -95,6 +94,14 @@ class Projection(ABC):
     def period(self) -> float | None:
         """u repeats after this; None: it does not."""
 
+    def check_sees(self, directions: Directions) -> None:
+        """Raises a ``ValueError`` where directions below the array's plane would fall on those above."""
+        if not self.sees_below and directions.elevations.min() < 0:
+            raise ValueError(
+                f"the grid reaches below the array's plane, which {name_of(self)} folds onto the half above; take "
+                "mercator or equirectangular"
+            )
+
     def plane(self, directions: Directions) -> Plane:
         """Plane coordinates of a label's pixel centres; a list of rays becomes a single row."""
         vectors = directions.vectors()
@@ -112,7 +119,7 @@ class Projection(ABC):
         receiver = receiver.to(means)
         points = receiver.local(means)
         depths = points.norm(dim=-1)
-        visible = ~(depths < NEAR)  # a centre that is NaN is no reason to hide it
+        visible = ~(depths < NEAR)  # NaN stays visible
         # A Gaussian on the receiver has no direction: a stand-in keeps values and gradients finite, `visible` hides it.
         points = torch.where(visible[..., None], points, points.new_tensor([1.0, 0.0, 0.0]))
         across, along = (self.jacobian(points) @ receiver.rotation.mT @ semi_axes).unbind(-2)
@@ -129,7 +136,7 @@ def project(
     projection: str | Mapping | Projection = "mercator",
     pixel: float | None = None,
 ) -> tuple[Splats, Plane]:
-    """Quaternions are (w, x, y, z) of any length, in the world frame: Gaussians as a receiver sees them, in 2-D.
+    """Gaussians as a receiver sees them, in 2-D. Quaternions are (w, x, y, z) of any length.
 
     Args:
         means: Centres, world frame (n, 3) [m].
@@ -139,7 +146,7 @@ def project(
         grid: Directions of the pixels in the receiver's frame [rad], ``gaigs.Grid`` or ``gaigs.Rays``.
         projection: Name, configuration or object.
         pixel: Edge of the pixel by whose variance footprints are widened [rad]; None is the grid's pitch, which rays
-            have none of. Not looked at where the projection is an object.
+            have none of. Ignored where the projection is an object.
 
     Returns:
         The splats, and where the pixels lie on the plane; differentiable in means, quaternions and scales. Each input
@@ -172,11 +179,7 @@ def project(
         raise ValueError(f"elevations must lie within 1.5708 rad, got {most:g}; gaigs.Grid.degrees takes degrees")
     chosen = registry("projection").build(projection, pixel=pixel)
     grid = grid.to(means)
-    if not chosen.sees_below and grid.elevations.min() < 0:
-        raise ValueError(
-            f"the grid reaches below the receiver's plane, which {name_of(chosen)} folds onto what is above; take "
-            "mercator or equirectangular"
-        )
+    chosen.check_sees(grid)
     axes = semi_axes(quats, scales)
     pose = getattr(receiver, "pose", receiver)
     return chosen.project(means, axes if axes.ndim == 4 else axes[None], pose), chosen.plane(grid)
@@ -192,7 +195,7 @@ def factor(
 
     Args:
         across, along: Footprints of the semi-axes in u and v, k = 3.
-        variance: Above 0, added to both of the ellipse's.
+        variance: Added to both variances of the ellipse, above 0.
     """
     p = (across.square().sum(-1) + variance).sqrt()
     unit = across / p[..., None]

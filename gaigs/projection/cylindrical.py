@@ -1,4 +1,4 @@
-"""What the projections whose u is the azimuth share."""
+"""Base of projections whose u is the azimuth."""
 
 import math
 
@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.directions import Directions, Grid
-from gaigs.geometry import to_spherical
+from gaigs.geometry import Directions, Grid, to_spherical
 from gaigs.projection import Plane, Projection
 
 

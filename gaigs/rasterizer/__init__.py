@@ -1,4 +1,4 @@
-"""Rasterizers composite splats front to back into a map over directions, or sum up what an array hears of them."""
+"""Rasterizers composite splats front to back into a map over directions."""
 
 from collections.abc import Mapping
 from typing import Protocol
@@ -6,10 +6,9 @@ from typing import Protocol
 from jaxtyping import Float
 from torch import Tensor, cat
 
-from gaigs.directions import Directions, Rays
-from gaigs.geometry import Pose
+from gaigs.geometry import Directions, Pose, Rays
 from gaigs.projection import Plane, Projection, Splats, project
-from gaigs.registry import name_of, registry
+from gaigs.registry import registry
 
 ALPHA_MIN = 1 / 255
 """A splat acts on a pixel where its opacity a G is at least this, the field's customary bound (one grey level)."""
@@ -24,7 +23,7 @@ OPAQUE = -(2.0**18)
 too, and products with it stay finite."""
 
 STEEPEST = 1e-30
-"""The gradient by an attenuation below this is that at this, as its own would overflow float32."""
+"""Attenuation below which the gradient is that at this value, as its own would overflow float32."""
 
 
 class Rasterizer(Protocol):
@@ -40,15 +39,9 @@ class Rasterizer(Protocol):
     not ``visible`` do nothing. Every input but depths is differentiable: means2d, factors, signal, opacities,
     attenuations. A signal may have any number of channels.
 
-    A rasterizer with ``draws_map = False`` is not called. It has two methods instead, with complex amplitudes (b, n)
-    and path lengths (b, n) [m]; ``aperture`` says their arguments. ``fields`` is what each element of an array hears of
-    Gaussians at each frequency (b, e, s), ``lags`` the mean covariance of elements at each of ``array.lags`` (b, l), of
-    splats of the plane of direction cosines. ``Pooling.takes`` says which of them is asked for.
-
     Attributes:
-        used: What drew the last map, as a run's metrics have it: the name, and the device where there is a choice.
-            None where that shows with the first map only.
-        draws_map: Whether it is called for maps; may be left out, and then it is.
+        used: Rasterizer of the last map, for a run's metrics: the name, and the device where there is a choice. None
+            before the first map where it depends on the map.
 
     Source: GAI-GS, "Mapping, Projection and Render Module"; the area over which d_j acts is ours (docs/methods.md).
     """
@@ -81,17 +74,17 @@ def rasterize(
     rasterizer: str | Mapping | Rasterizer = "fastest",
     pixel: float | None = None,
 ) -> tuple[Float[Tensor, "*b c rows columns"], Float[Tensor, "*b rows columns"]]:
-    """Quaternions are (w, x, y, z) of any length, in the world frame: the map that Gaussians make at a receiver.
+    """The map that Gaussians make at a receiver. Quaternions are (w, x, y, z) of any length, in the world frame.
 
     Gaussians are composited front to back by their distance to the receiver; ``Rasterizer`` has the equation.
 
     Args:
         means: Centres, world frame (n, 3) [m].
-        quats: Orientations, the columns of whose rotation matrices are the Gaussians' axes in the world frame (n, 4).
+        quats: Orientations (n, 4). Columns of their rotation matrices are the Gaussians' axes in the world frame.
         scales: Standard deviations along these axes (n, 3) [m].
         opacities: In [0, 1] (n,).
-        signal: What each Gaussian sends, any number of real channels (n, c); of a complex one real and imaginary part.
-        attenuations: What each lets through of what is behind it, in [0, 1] (n,); None for all.
+        signal: Of each Gaussian, any number of real channels (n, c); a complex channel is two, real and imaginary part.
+        attenuations: Share of the field from behind that each lets through, in [0, 1] (n,); None for all of it.
         receiver: A ``gaigs.Pose``, or a ``gaigs.Receiver``, whose pose counts.
         grid: Directions of the pixels in the receiver's frame [rad]: ``gaigs.Grid``, or ``gaigs.Rays``.
         projection, rasterizer: Names, configurations or objects.
@@ -104,7 +97,7 @@ def rasterize(
         ``torch`` agree to 2e-6 of the map's maximum in float32.
 
     Raises:
-        ValueError: Shapes or dtypes do not fit, a name is unknown, or the rasterizer draws no map.
+        ValueError: Shapes or dtypes do not fit, or a name is unknown.
 
     Source: GAI-GS, "Projection and Render Module"; Zwicker et al., EWA Splatting, 2002.
 
@@ -140,8 +133,6 @@ def rasterize(
     if len(sizes) > 2:
         raise ValueError(f"inputs must have one number of transmitters, got {', '.join(map(str, sorted(sizes - {1})))}")
     chosen = registry("rasterizer").build(rasterizer)
-    if not getattr(chosen, "draws_map", True):
-        raise ValueError(f"rasterizer {name_of(chosen)!r} draws no map; take fastest, opencl or torch")
     is_batch = any(values.ndim > len(shape) for values, shape in inputs.values())
     b = max(sizes)
     batched = lambda values, ndim: values.expand(b, *values.shape[-ndim:])

@@ -1,4 +1,4 @@
-"""OpenCL devices: which there are, which is taken, and whether it can build kernels."""
+"""OpenCL devices: the list, the default, and a check that kernels build."""
 
 import functools
 import os
@@ -6,7 +6,7 @@ import os
 import pyopencl as cl
 
 PROBE = "kernel void probe(global int *value) { value[0] = 1; }"
-"""The least that a device must be able to build."""
+"""A minimal program to build."""
 
 
 def devices() -> list[str]:
@@ -19,7 +19,7 @@ def devices() -> list[str]:
 
 
 def default_device() -> str:
-    """The one of ``devices`` that is taken where none is asked for.
+    """The default of ``devices``.
 
     Raises:
         RuntimeError: There is no OpenCL driver, or it is broken.
@@ -29,7 +29,7 @@ def default_device() -> str:
 
 
 def _devices() -> list[cl.Device]:
-    """The devices of all drivers; one that is broken hurts only where it is the only one."""
+    """The devices of all drivers. A broken driver is an error only where no other lists a device."""
     found, causes = [], []
     try:
         for platform in cl.get_platforms():
@@ -52,7 +52,7 @@ def name_of(device: cl.Device) -> str:
 
 
 def open_queue(name: str | None) -> cl.CommandQueue:
-    """The queue of a device, the same for all who ask.
+    """The queue of a device, made once.
 
     Args:
         name: Part of a name that ``devices`` lists; None takes what GAIGS_OPENCL_DEVICE says, and without it the first
@@ -92,7 +92,7 @@ def _choose(name: str | None) -> cl.Device:
 
 @functools.cache
 def find_fault(queue: cl.CommandQueue) -> str | None:
-    """Why a device cannot build kernels, in its driver's words; None where it can.
+    """Cause in the driver's words why a device cannot build kernels; None if it can.
 
     A driver may list a processor that its compiler does not know.
     """

@@ -1,4 +1,4 @@
-"""The fastest rasterizer there is for the tensors at hand."""
+"""The fastest rasterizer that takes the tensors."""
 
 import logging
 
@@ -13,12 +13,12 @@ log = logging.getLogger(__name__)
 
 @register("rasterizer", "fastest")
 class FastestRasterizer:
-    """``opencl`` for what it takes where a driver is installed that builds kernels, else ``torch``; the log says which.
+    """``opencl`` for float32 on the CPU where a driver builds kernels, else ``torch``; the log says which.
 
     The two agree to 2e-6 of the image's maximum, so a checkpoint may be rendered by either.
 
     Attributes:
-        used: Which of the two the last call took, as a run's metrics have it; None before the first.
+        used: Rasterizer of the last call, for a run's metrics; None before the first.
     """
 
     used: str | None = None
@@ -29,7 +29,7 @@ class FastestRasterizer:
             self.opencl = registry("rasterizer").build({"name": "opencl"})
         except (ImportError, RuntimeError) as error:
             self.opencl = None
-            log.info("rasterizer: torch, as opencl is not to be had here (%s)", error)
+            log.info("rasterizer: torch, as opencl does not work here (%s)", error)
         else:
             log.info("rasterizer: opencl for float32 on the CPU, torch for all else")
 

@@ -13,27 +13,23 @@ from torch import Tensor
 
 from gaigs.projection import Plane, Splats
 from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
-from gaigs.rasterizer.devices import cause_of, default_device, devices, find_fault, name_of, open_queue
+from gaigs.rasterizer.devices import cause_of, find_fault, name_of, open_queue
 from gaigs.registry import register
 
-__all__ = ["OpenCLRasterizer", "default_device", "devices"]
-
 ROWS, COLUMNS = 16, 8
-"""Edges of a tile in pixels; the kernels say the same."""
+"""Edges of a tile in pixels, as in the kernels."""
 
 WORD, BLOCK, CHUNK, GEOMETRY, MOMENTS = 32, 16, 32, 8, 5
-"""Splats a word of bits, words a block, entries a checkpoint, and lengths of rows in buffers; the kernels say the
-same."""
+"""Splats a word of bits, words a block, entries a checkpoint, and lengths of rows in buffers, as in the kernels."""
 
 GROUP = 8
-"""Transmitters that one work-item composites at most, where they share footprints; more would leave the nearest
-cache."""
+"""Most transmitters of one work-item, where they share footprints; more would leave the nearest cache."""
 
 CHANNELS = 8
-"""Channels that are composited at a time: the registers hold a row of each. More of them come in chunks."""
+"""Channels composited at a time: the registers hold a row of each."""
 
 SPLATS = 2**24
-"""As many splats are too many: an entry of a list has 24 bits for the splat."""
+"""Number of splats that is too large: an entry of a list has 24 bits for the splat."""
 
 
 @register("rasterizer", "opencl")
@@ -66,7 +62,7 @@ class OpenCLRasterizer:
 
     @property
     def used(self) -> str:
-        """What a run's metrics call it: its name and its device."""
+        """Name and device, for a run's metrics."""
         return f"opencl on {name_of(open_queue(self.device).device)}"
 
     def takes(
@@ -77,7 +73,7 @@ class OpenCLRasterizer:
         attenuations: Float[Tensor, "b n"] | None,
         plane: Plane,
     ) -> bool:
-        """Whether dtype, device and number of what it is given suit it; where they do not, ``torch`` takes them."""
+        """True if dtypes, devices and counts suit; otherwise ``torch`` takes them."""
         floats = splats.means2d, splats.factors, splats.depths, signal, opacities, attenuations, plane.u, plane.v
         suits = (x is None or (x.dtype == torch.float32 and x.device.type == "cpu") for x in floats)
         return all(suits) and signal.shape[2] >= 1 and signal.shape[1] < SPLATS
@@ -98,8 +94,10 @@ class OpenCLRasterizer:
             RuntimeError: The device cannot build the kernels.
         """
         _check(splats, signal, opacities, attenuations, plane)
-        call = functools.partial(_Composite.apply, open_queue(self.device), splats, plane, torch.is_grad_enabled())
-        # What autograd differentiates has to be an argument of its own; `_Render` finds it in the splats.
+        call = functools.partial(
+            _CompositeByKernels.apply, open_queue(self.device), splats, plane, torch.is_grad_enabled()
+        )
+        # Autograd differentiates by arguments only; `_Render` finds the same tensors in the splats.
         chunks = [
             call(splats.means2d, splats.factors, part, opacities, attenuations) for part in signal.split(CHANNELS, 2)
         ]
@@ -135,7 +133,7 @@ def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel
 
 
 def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane) -> None:
-    """Kernels trust what they are given."""
+    """Raises where tensors do not fit: kernels check nothing."""
     b, n, c = signal.shape
     height, width = plane.shape
     tensors = {
@@ -167,7 +165,7 @@ def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tens
         raise ValueError(f"rasterizer 'opencl' takes fewer than 2^24 splats, got {n}; use rasterizer=torch")
 
 
-class _Composite(torch.autograd.Function):
+class _CompositeByKernels(torch.autograd.Function):
     @staticmethod
     def forward(ctx, queue, splats, plane, grad_enabled, means, factors, signal, opacities, attenuations):
         ctx.render = _Render(queue, splats, signal, opacities, attenuations, plane)

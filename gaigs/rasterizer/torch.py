@@ -11,7 +11,7 @@ from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
 from gaigs.registry import register
 
 TILE = 16
-"""Edge of a tile in pixels."""
+"""Edge of a tile [pixels]."""
 
 CHUNK = 2**20
 """(transmitter, splat, pixel) triples worked on at a time: 4 MiB an array of float32, which a core's cache holds."""
@@ -67,7 +67,7 @@ class _Tiles:
             return
 
         # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box has these halves.
-        # Comparisons with NaN keep the splat, for what is broken must show.
+        # Comparisons with NaN keep the splat, so that NaN shows in the map.
         reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()
         p, q, r = factors.unbind(-1)
         halves = (reach[..., None] * torch.stack((p, torch.hypot(q, r)), -1)).amax(0)
@@ -76,7 +76,7 @@ class _Tiles:
             coordinate = coordinate.flatten(1)
             low, high = coordinate.amin(1, keepdim=True), coordinate.amax(1, keepdim=True)
             offset = _nearest(means[:, axis], (low + high) / 2, period).abs()
-            # A few roundings' slack: whoever is listed in vain is sorted out pixel by pixel.
+            # A few roundings' slack: splats listed in vain are dropped pixel by pixel.
             touches = touches & ~(offset > (halves[:, axis] + (high - low) / 2) * (1 + 1e-5) + 1e-6)
         self.chunks = self._chunks(touches, len(opacities))
 
@@ -124,7 +124,7 @@ class _Tiles:
 
 
 def _split(period: float, dtype: torch.dtype) -> tuple[float, float]:
-    """A period rounded to a dtype, and what that leaves over."""
+    """A period rounded to a dtype, and the remainder."""
     rounded = torch.tensor(period, dtype=dtype).item()
     return rounded, period - rounded
 
@@ -160,7 +160,7 @@ class _Weights:
 def _whiten(du: Tensor, dv: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
     """(s, y) = L^-1 (du, dv), in which the footprint is exp(-(s² + y²) / 2).
 
-    Of all forms of the exponent this one loses the fewest digits where a splat is long and thin.
+    This form of the exponent loses the fewest digits where a splat is long and thin.
     """
     p, q, r = (part[..., None, None] for part in factors.unbind(-1))
     s = du / p
@@ -223,7 +223,7 @@ class _Composite(torch.autograd.Function):
             flow = blend.mul_(d)
             behind = flow.flip(-2).cumsum(-2).flip(-2).sub_(flow)
             behind += (w.left * left_gradient[:, chosen])[..., None, :]
-            # The opacity's own gradient, 0 where the splat does nothing or is clamped.
+            # Gradient by the opacity itself, 0 where the splat does nothing or is clamped.
             d_alpha = (d.mul_(w.transmittance) - behind / (1 - w.alpha)).mul_(w.live & (w.alpha < ALPHA_MAX))
             d_opacity = (d_alpha * w.footprint).sum(-1)
             d_exponent = d_alpha.mul_(w.alpha)

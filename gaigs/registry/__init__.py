@@ -1,6 +1,6 @@
 """Components by name: the built-in ones, those of installed packages and those in ./plugins of the working directory.
 
-Names are found without importing anybody's code; what a name stands for is imported when it is asked for.
+Names are found without an import; a component is imported when it is built.
 """
 
 import contextlib
@@ -16,8 +16,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, NoneType, UnionType
 
-from omegaconf import OmegaConf
-
 from gaigs.registry.holders import GIVEN, MISSING, Holder, find_holders, is_plain, sources
 from gaigs.registry.holders import digests as digests
 
@@ -25,7 +23,7 @@ KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
     "model", "training", "benchmark",
 )  # fmt: skip
-"""In the order of a prediction's parts, and then what measures them; each is a folder of gaigs and of conf."""
+"""Kinds of components; each is a folder of gaigs and of conf."""
 
 PLAIN = {
     int: (numbers.Integral, "a whole number"),
@@ -37,16 +35,14 @@ PLAIN = {
     **dict.fromkeys((list, tuple, Sequence), (list | tuple, "a list")),
     **dict.fromkeys((dict, Mapping), (Mapping, "a mapping")),
 }
-"""Annotations that options are checked against: what suits them, and what errors call it. Numbers are no bool."""
+"""Annotations that options are checked against: accepted types, and the words of errors. A bool is no number."""
 
 LARGEST = 2**63 - 1
-"""Whole numbers beyond it suit no option: torch takes 64 bits. Other numbers are finite."""
+"""Largest whole number of an option: torch takes 64 bits. Other numbers must be finite."""
 
 
 class Registry:
     """The components of one kind, by name.
-
-    ``gaigs.registries`` has one for each kind, by its name.
 
     Args:
         kind: One of ``KINDS``: a folder of gaigs, a group of choices, and the entry-point group ``gaigs.<kind>``.
@@ -63,16 +59,16 @@ class Registry:
         self._registered: dict[str, Callable] = {}
 
     def names(self) -> list[str]:
-        """Every name that can be asked for, sorted."""
+        """All names, sorted."""
         holders, _ = find_holders(self.kind)
         return sorted({holder.name for holder in holders} | self._registered.keys())
 
     def register(self, name: str) -> Callable:
-        """The decorator that ``gaigs.register`` gives for this kind.
+        """The decorator of ``gaigs.register`` for this kind.
 
         Raises:
-            TypeError: The name is no string, or the component cannot be called.
-            ValueError: The name is taken by another component.
+            TypeError: The name is not a string, or the component not callable.
+            ValueError: Another component has the name.
         """
         check_type(f"the name of a {self.kind} to register", name, str)
 
@@ -91,17 +87,17 @@ class Registry:
         return decorate
 
     def get(self, name: str) -> Callable:
-        """The class or function of that name; of all modules only the one that holds it is imported.
+        """The class or function of that name; only its module is imported.
 
         Raises:
-            ValueError: Nobody holds the name, or two do.
+            ValueError: No component has the name, or two have it.
             ImportError: The module cannot be imported.
         """
         holders, unreadable = find_holders(self.kind, name)
         component = self._registered.get(name)
         claims = [holder.where for holder in holders]
         if component is not None and not any(holder.owns(component) for holder in holders):
-            claims.insert(0, _origin(component))  # registered by code that no file of ours declares, e.g. a notebook
+            claims.insert(0, _origin(component))  # registered without a file, e.g. in a notebook
         if len(claims) > 1:
             raise self._taken(name, *claims[:2])
         if holders:
@@ -113,9 +109,9 @@ class Registry:
         raise ValueError(f"unknown {self.kind} {suggest(name, names)}; there are: {_listed(names)}{causes}")
 
     def options(self, name: str) -> dict:
-        """The arguments that a component takes from a configuration, with their defaults; ``???`` must be given.
+        """The options of a component with their defaults; ``???`` stands for a mandatory one.
 
-        Those whose default a configuration cannot hold are left out, and of files so are inherited ones.
+        Options whose default a configuration cannot hold are left out, and so are inherited ones of files.
         """
         holders, _ = find_holders(self.kind, name)
         if holders:
@@ -129,22 +125,23 @@ class Registry:
         return options
 
     def build(self, config: str | Mapping | object, **context):
-        """The component that a configuration names, made with its options.
+        """Makes the component of a configuration.
 
         Args:
-            config: The name, or a mapping with the key ``name``, whose other keys are options of the component. A
-                component that is built already is given back.
-            context: What the caller knows and no configuration says, e.g. ``scene``; passed where the component has a
-                parameter of that name.
+            config: The name, or a mapping with the key ``name`` and the component's options. A component that is built
+                already is returned.
+            context: Arguments of the caller, e.g. ``scene``; passed if the component has a parameter of that name.
 
         Raises:
-            TypeError: The configuration is none of these.
+            TypeError: The configuration has another type.
             ValueError: The name is missing, unknown or taken twice; an option is missing or unknown.
             ImportError: The component cannot be imported.
         """
         if is_built(config):
             return config
-        options = {"name": config} if isinstance(config, str) else _plain(config, self.kind)
+        if not isinstance(config, str | Mapping):
+            raise TypeError(f"a {self.kind} configuration must be a mapping with the key 'name', got {config!r}")
+        options = {"name": config} if isinstance(config, str) else dict(config)
         if "name" not in options:
             raise ValueError(
                 f"a {self.kind} configuration needs the key 'name', got {options}; there are: {_listed(self.names())}"
@@ -155,7 +152,7 @@ class Registry:
 
     def _load(self, holder: Holder) -> Callable:
         if holder.root is not None:
-            # A package in ./plugins may need another one there, as installed ones may need each other.
+            # A package in ./plugins may import another one there.
             roots = {str(root): None for root in (holder.root, *sources(Path.cwd() / "plugins"))}
             sys.path += [root for root in roots if root not in sys.path]  # last: nothing shadows what is installed
         name, _, attribute = holder.target.partition(":")
@@ -166,10 +163,10 @@ class Registry:
             if attribute:
                 return _noting(self.kind, holder.name, functools.reduce(getattr, attribute.strip().split("."), module))
             return self._registered[holder.name]
-        except KeyboardInterrupt as error:  # Ctrl-C, or of the module's own
+        except KeyboardInterrupt as error:  # Ctrl-C, or raised by the module
             error.args = error.args or (f"stopped while {self.kind} {holder.name!r} of {holder.where} was loaded",)
             raise
-        except BaseException as error:  # whatever a stranger's module raises, or its end: say whose it is, and why
+        except BaseException as error:  # any error or exit of a plug-in's module
             cause = f"{type(error).__name__}: {error}"
             raise ImportError(f"{self.kind} {holder.name!r} of {holder.where} cannot be loaded: {cause}") from error
 
@@ -193,14 +190,14 @@ def registry(kind: str) -> Registry:
 
 
 def register(kind: str, name: str, /) -> Callable:
-    """Decorator that gives a class or function a name among the components of a kind.
+    """Decorator that registers a class or function under a name of a kind.
 
-    Kind and name are string literals and the component stands at the top level of its file, because names are read
-    from the source before anything is imported.
+    Kind and name are string literals, and the component is at the top level of its file: names are read from the source
+    before an import.
 
     Raises:
-        TypeError: The name is no string, or the component cannot be called.
-        ValueError: There is no such kind, or the name is taken by another component.
+        TypeError: The name is not a string, or the component not callable.
+        ValueError: The kind is unknown, or another component has the name.
 
     Example:
         >>> @gaigs.register("split", "every_third")
@@ -215,20 +212,20 @@ def register(kind: str, name: str, /) -> Callable:
 
 
 def is_built(config: object) -> bool:
-    """Whether what stands for a component is the component itself, and neither its name nor its configuration."""
+    """True for a component itself, in contrast to its name or configuration."""
     return not isinstance(config, str | bytes | Mapping | Sequence | NoneType | numbers.Number | type)
 
 
 def name_of(component: object) -> str:
-    """What errors call a component: its registered name, or its class's."""
+    """The registered name of a component, or its class's, for errors."""
     return getattr(component, "configuration", {}).get("name", type(component).__name__)
 
 
 def configuration_of(component: object) -> dict:
-    """The configuration that makes a component anew: ``build`` takes it.
+    """The configuration of a component, an argument of ``Registry.build``.
 
     Raises:
-        ValueError: The component, or a part of it, has no registered name, or was made with what no file can hold.
+        ValueError: The component or a part has no registered name, or an argument that no file can hold.
     """
     if not hasattr(component, "configuration"):
         raise ValueError(
@@ -241,11 +238,11 @@ def storable(value: object, where: str):
     """A value in plain dictionaries, lists, numbers and strings.
 
     Args:
-        value: Of those, or of registered components, paths, and numbers of numpy or torch.
-        where: What errors call it.
+        value: These, registered components, paths, and numbers of numpy or torch.
+        where: Its name in errors.
 
     Raises:
-        ValueError: It is, or holds, something else.
+        ValueError: The value has, or holds, another type.
     """
     if isinstance(value, Mapping):
         return {key: storable(entry, f"{where}, {key}") for key, entry in value.items()}
@@ -265,7 +262,7 @@ def storable(value: object, where: str):
 
 
 def _noting(kind: str, name: str, component: Callable) -> Callable:
-    """A class whose instances note as ``configuration`` what they were made with; functions as they are."""
+    """Makes the instances of a class note their arguments as ``configuration``; functions are returned unchanged."""
     make = getattr(component, "__init__", None)
     if not isinstance(component, type) or getattr(make, "notes", None) is component:
         return component
@@ -276,7 +273,7 @@ def _noting(kind: str, name: str, component: Callable) -> Callable:
     @functools.wraps(make)
     def noting(self, *args, **kwargs) -> None:
         make(self, *args, **kwargs)
-        if type(self) is component:  # and no subclass, which has a name of its own, or none
+        if type(self) is component:  # a subclass has a name of its own, or none
             bound = signature.bind(self, *args, **kwargs)
             bound.apply_defaults()
             options = {}
@@ -289,7 +286,7 @@ def _noting(kind: str, name: str, component: Callable) -> Callable:
                     case _:
                         options[key] = value
             options = {key: value for key, value in options.items() if key not in given}
-            with contextlib.suppress(AttributeError):  # of a tuple, say, which holds nothing else
+            with contextlib.suppress(AttributeError):  # e.g. of a tuple
                 object.__setattr__(self, "configuration", {**options, "name": name})
 
     noting.notes = component
@@ -298,24 +295,24 @@ def _noting(kind: str, name: str, component: Callable) -> Callable:
 
 
 def call(what: str, function: Callable, options: Mapping, /, **context):
-    """The result of a function or class that takes the options of a configuration.
+    """Calls a function or class with the options of a configuration.
 
     Args:
-        what: Whose options they are, as errors call it.
+        what: Name of the options' owner in errors.
         function: Its parameters are the options.
-        options: By name.
-        context: What the caller knows and no configuration says; passed where the function has such a parameter.
+        options: Values by name.
+        context: Arguments of the caller; passed if the function has such a parameter.
 
     Raises:
-        TypeError: The options are no mapping, or one is not what its parameter is annotated as, see ``check_type``.
-        ValueError: An option is missing or unknown; or with such options the function overflows, wants more memory than
-            there is, ends the process or, where it is of torch or Lightning, fails at all.
+        TypeError: The options are not a mapping, or one does not suit its annotation, see ``check_type``.
+        ValueError: An option is missing or unknown; or the function overflows, runs out of memory, ends the process or,
+            if it is of torch or Lightning, fails.
     """
     if not isinstance(options, Mapping):
         raise TypeError(f"{what} must be a mapping of options, got {options!r}")
     parameters = _signature(function).parameters.values()
     named = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
-    # (*args, **kwargs) is what a torch module without a constructor of its own seems to take: it takes nothing.
+    # A torch module without a constructor has the signature (*args, **kwargs), and takes nothing.
     variable = {p.kind for p in parameters} & {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
     takes_all = variable == {inspect.Parameter.VAR_KEYWORD}
     has = [key for key in named if key not in context]
@@ -333,21 +330,25 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
     try:
         return function(**arguments)
     except (Exception, SystemExit) as error:
-        # What says nothing of the options, and neither do these packages.
+        # Messages that name no option; errors of torch and Lightning name none either.
         is_bare = isinstance(error, ArithmeticError | MemoryError | SystemExit)
         is_bare = is_bare or (isinstance(error, RuntimeError) and "tried to allocate" in str(error))
         if not is_bare and function.__module__.partition(".")[0] not in ("lightning", "torch"):
             raise
-        raise ValueError(f"{what} cannot be made with {dict(options)}: {type(error).__name__}: {error}") from error
+        text = str(error)
+        suspects = [key for key, own in options.items() if key in text or (isinstance(own, str) and own in text)]
+        keys = _listed(f"{key}={options[key]}" for key in suspects) if suspects else _listed(options)
+        cause = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"{what} cannot be made ({cause})\ncheck its options: {keys}") from error
 
 
 def check_type(what: str, value: object, annotation: object) -> None:
-    """Sees to it that a value is what an annotation in ``PLAIN``, or a union of such, says; others say nothing.
+    """Checks a value against an annotation in ``PLAIN`` or a union of them; other annotations are not checked.
 
-    In a union with other classes, their objects suit, too.
+    In a union with other classes, their objects are accepted, too.
 
     Raises:
-        TypeError: It is not.
+        TypeError: The value does not suit.
     """
     is_union = typing.get_origin(annotation) in (typing.Union, UnionType)
     allowed = typing.get_args(annotation) if is_union else (annotation,)
@@ -360,7 +361,7 @@ def check_type(what: str, value: object, annotation: object) -> None:
     elif not all(is_plain):
         if not isinstance(value, float):
             return
-        allowed = kinds = [float]  # whatever it may be, it is finite
+        allowed = kinds = [float]  # a number must be finite whatever the annotation
     if fitting := [whole for whole, kind in zip(allowed, kinds, strict=True) if _suits(value, kind)]:
         return _check_entries(what, value, typing.get_args(fitting[0]))
     words = " or ".join(PLAIN[kind][1] for kind in kinds)
@@ -373,7 +374,7 @@ def check_type(what: str, value: object, annotation: object) -> None:
 
 
 def _suits(value: object, kind: type) -> bool:
-    """Whether a value is of a type of ``PLAIN``, whatever its entries."""
+    """True if a value has a type of ``PLAIN``; entries are not checked."""
     if kind in (int, float) and isinstance(value, numbers.Integral):
         return not isinstance(value, bool) and abs(int(value)) <= LARGEST
     return isinstance(value, PLAIN[kind][0]) and (kind is not float or math.isfinite(value))
@@ -396,26 +397,12 @@ def _check_entries(what: str, value: object, kinds: tuple) -> None:
 def _signature(function: Callable) -> inspect.Signature:
     try:
         return inspect.signature(function, eval_str=True)
-    except Exception:  # whatever an annotation in quotes raises, e.g. a name that only type checkers import
+    except Exception:  # any error of an annotation in quotes, e.g. a name that only type checkers import
         return inspect.signature(function)
 
 
-def _plain(config: Mapping, kind: str) -> dict:
-    """A configuration as plain dicts, lists and scalars, its interpolations resolved."""
-    if OmegaConf.is_config(config):
-        missing = OmegaConf.missing_keys(config)
-        if missing:
-            raise ValueError(
-                f"a {kind} configuration needs values for {_listed(sorted(missing))}, which stand at '???'"
-            )
-        config = OmegaConf.to_container(config, resolve=True)
-    if not isinstance(config, Mapping):
-        raise TypeError(f"a {kind} configuration must be a mapping with the key 'name', got {config!r}")
-    return {k: OmegaConf.to_container(v, resolve=True) if OmegaConf.is_config(v) else v for k, v in config.items()}
-
-
 def suggest(word: str, known: Iterable[str]) -> str:
-    """A word in quotes, and the known one that it may stand for."""
+    """A word in quotes, with the most similar known word."""
     near = difflib.get_close_matches(str(word), known, n=1)
     return f"{word!r} (did you mean {near[0]!r}?)" if near else repr(word)
 

@@ -1,4 +1,4 @@
-"""Who holds the names of a kind, found without importing anybody's code."""
+"""The owners of registered names, found without an import."""
 
 import ast
 import functools
@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
-"""Of gaigs."""
+"""Folder of gaigs."""
 
 GIVEN = {
     "split": ("links",),
@@ -27,22 +27,22 @@ GIVEN = {
     "model": ("scene",),
     "training": ("model", "loss", "identity", "seed"),
 }
-"""Arguments that gaigs itself hands to the components of a kind; all others are options."""
+"""Arguments that gaigs passes to the components of a kind; all others are options."""
 
 MISSING = "???"
-"""What stands for an option that must be given."""
+"""Placeholder of a mandatory option."""
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds a name, known before any of their code runs.
+    """The owner of a name.
 
     Attributes:
         name: The registered name.
-        where: The file or distribution, as errors call it.
-        target: ``module``, which registers the component by decorator, or ``module:attribute``, which is the component.
-        file: The module's file, where the name was read from it.
-        root: Folder that must be on ``sys.path`` for the import, where it may not be yet.
+        where: File or distribution, for errors.
+        target: ``module`` that registers the component by decorator, or ``module:attribute``.
+        file: File of the module if the name was read from it.
+        root: Folder that the import needs on ``sys.path``; None if it is there.
     """
 
     name: str
@@ -57,13 +57,13 @@ class Holder:
         return re.split("[.:]", self.target)[0]
 
     def owns(self, component: object) -> bool:
-        """Whether a component comes from the holder's file or, for an entry point, from the package it points into."""
+        """True if a component comes from the holder's file or, for an entry point, from its package."""
         module = getattr(component, "__module__", "")
         return module == self.target if self.file else module.split(".")[0] == self.package
 
     @property
     def folder(self) -> Path | None:
-        """Of the top-level package of an entry point, which is not imported; None where it is not there."""
+        """Folder of an entry point's top-level package, which is not imported; None if it does not exist."""
         if self.root is not None:
             return self.root / self.package
         spec = find_spec(self.package)  # imports nothing, as the name has no dots
@@ -71,9 +71,9 @@ class Holder:
         return next(map(Path, places), None)
 
     def options(self, kind: str) -> dict:
-        """The arguments that the component takes from a configuration, with their defaults, as its source has them.
+        """The options of the component with their defaults, read from its source.
 
-        Those that it inherits, and those whose default is no literal, are left out.
+        Inherited options, and those whose default is no literal, are left out.
         """
         if self.file is not None:
             stat = self.file.stat()
@@ -89,10 +89,10 @@ class Holder:
 
 
 def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
-    """Who holds the names of a kind, or one name: gaigs itself first, then installed packages, then ./plugins.
+    """The holders of a kind's names, or of one name: gaigs, then installed packages, then ./plugins.
 
     Returns:
-        The holders, and the files that cannot be read, each with the cause.
+        The holders, and the unreadable files, each with the cause.
     """
     cwd = Path.cwd()
     built_in, unreadable = _scan(kind, PACKAGE / kind, f"gaigs.{kind}")
@@ -100,7 +100,7 @@ def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list
     installed = [Holder(p.name, f"distribution {p.dist.name} {p.dist.version}", p.value) for p in points]
     dropped, causes = _scan(kind, cwd / "plugins", "plugins", root=cwd)
     targets = {(holder.name, holder.target) for holder in installed}
-    # A package in ./plugins that is installed as well is no rival of itself.
+    # A package in ./plugins may be installed as well.
     holders = built_in + installed + [holder for holder in dropped if (holder.name, holder.target) not in targets]
     return [holder for holder in holders if name in (None, holder.name)], unreadable + causes
 
@@ -119,7 +119,7 @@ def _installed(group: str, _: tuple) -> metadata.EntryPoints:
 def digests(names: Container[str]) -> dict[str, str]:
     """Digests of the sources of plug-ins that hold some of these names, by kind and name.
 
-    They are of the file in ./plugins, or of the whole package, and of what these import of other plug-ins there.
+    A digest covers the file in ./plugins or the package, and other plug-ins there that it imports.
     """
     found = {}
     for kind in GIVEN.keys() | {"task", "data", "rasterizer", "benchmark"}:
@@ -146,7 +146,7 @@ def _with_imports(place: Path) -> set[Path]:
         for file in files - found:
             try:
                 tree = ast.parse(file.read_bytes())
-            except (SyntaxError, ValueError):  # of a file that nobody imports
+            except (SyntaxError, ValueError):  # a file that is not imported
                 continue
             for node in ast.walk(tree):
                 names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
@@ -170,7 +170,13 @@ def _scan(kind: str, folder: Path, package: str, root: Path | None = None) -> tu
                 holders += [Holder(name, where, target, root=source) for name, target in _entry_points(kind, file)]
             else:
                 holders += [Holder(name, where, module, file, root) for name in _decorated(kind, file)]
-        except (SyntaxError, ValueError, OSError, RecursionError, MemoryError) as error:  # the last ones of the parser
+        except (
+            SyntaxError,
+            ValueError,
+            OSError,
+            RecursionError,
+            MemoryError,
+        ) as error:  # of the parser, too
             unreadable.append(f"{where}: {str(error) or type(error).__name__}")
     return holders, unreadable
 
@@ -188,12 +194,12 @@ def _files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
 
 
 def _source(project: Path) -> Path:
-    """Where an installable project's packages lie: in src where there is one, else beside the pyproject.toml."""
+    """The folder of an installable project's packages: ``src`` if it exists, else that of the pyproject.toml."""
     return project / "src" if (project / "src").is_dir() else project
 
 
 def sources(folder: Path) -> list[Path]:
-    """Where the packages of all installable projects in a folder lie."""
+    """The package folders of all installable projects in a folder."""
     return [_source(file.parent) for file in sorted(folder.glob("[!_.]*/pyproject.toml"))]
 
 
@@ -201,7 +207,7 @@ def _entry_points(kind: str, file: Path) -> Iterable[tuple[str, str]]:
     """Names and targets that a pyproject.toml declares.
 
     Raises:
-        ValueError: It is no TOML, or declares something else in their place.
+        ValueError: The file is no TOML, or an entry has another type.
     """
     points = tomllib.loads(file.read_text(encoding="utf-8"))
     for key in ("project", "entry-points", f"gaigs.{kind}"):
@@ -220,9 +226,9 @@ def _decorated(kind: str, file: Path) -> list[str]:
     return [name for own, name, _ in _claims(file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size) if own == kind]
 
 
-@functools.cache  # a file is asked for the names of each kind
+@functools.cache  # called for each kind
 def _claims(file: Path, *_state: int) -> list[tuple[str, str, ast.stmt]]:
-    """Kinds and names that the decorators of a file claim, as it stands now, and what they decorate."""
+    """Kinds and names in the decorators of a file, and the decorated statements."""
     found = []
     for node in ast.parse(file.read_bytes(), file.name).body:
         for decorator in getattr(node, "decorator_list", ()):
@@ -260,7 +266,7 @@ def _options(kind: str, node: ast.stmt) -> dict:
 
 
 def is_plain(value: object) -> bool:
-    """Whether a configuration can hold a default as it is."""
+    """True if a configuration can hold a value."""
     if isinstance(value, dict):
         return all(isinstance(key, str) and is_plain(entry) for key, entry in value.items())
     if isinstance(value, list | tuple):

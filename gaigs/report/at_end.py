@@ -1,4 +1,4 @@
-"""The report of a multirun, written once its jobs have ended: an experiment asks for it by ``hydra.callbacks``."""
+"""The report at the end of a multirun, requested by an experiment under ``hydra.callbacks``."""
 
 import sys
 from pathlib import Path
@@ -7,11 +7,11 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 folders: list[Path] = []
-"""Multiruns of this process of which a report is asked for."""
+"""Multiruns of this process that need a report."""
 
 
 class AtEnd(Callback):
-    """Asks for the report of a multirun. Hydra tells of its end only where no job has failed, so ``main`` writes it."""
+    """Requests the report of a multirun. ``main`` writes it, as Hydra calls no callback after a failed job."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         """Remembers the folder."""
@@ -19,7 +19,7 @@ class AtEnd(Callback):
 
 
 def write() -> None:
-    """Writes the reports that are asked for, and prints their tables."""
+    """Writes the requested reports and prints their tables."""
     while folders:
         folder = folders.pop()
         from rich.console import Console
@@ -28,7 +28,7 @@ def write() -> None:
 
         try:
             Console().print(report(folder))
-        except Exception as error:  # the jobs have ended well: nothing may make that look as if they had not
+        except Exception as error:  # a failed report must not look like a failed job
             print(f"gaigs: no report: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr)
         else:
             print(f"report: {folder}; python -m gaigs.report {folder} writes it anew")

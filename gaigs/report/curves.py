@@ -1,4 +1,4 @@
-"""Curves: how a score is distributed over the test set, how the losses fell, and what an error costs in time."""
+"""Curves: distributions of scores, losses and scores over a training, scores against times."""
 
 import csv
 import math
@@ -19,11 +19,11 @@ from numpy import ndarray
 from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE
 
 LABEL = 48
-"""Characters for which an axis of a figure of one column has room; a longer label is broken into lines."""
+"""Most characters of a line of an axis label, in a figure of one column."""
 
 
 def cdf(
-    values: Mapping[str, Float[ndarray, "t"]],
+    values: Mapping[str, Float[ndarray, " t"]],
     quantity: str,
     samples: str,
     split: str,
@@ -33,10 +33,10 @@ def cdf(
 
     Args:
         values: Of every test sample by model, the run's own model first.
-        quantity: What the values are, with their unit.
-        samples: What there is a share of.
+        quantity: Name of the values, with their unit.
+        samples: Name of the samples.
         split: Name of the split.
-        limits: Ends of the axis of values; None for one that the data choose.
+        limits: Ends of the axis of values; None for those of the data.
     """
     with rc_context(STYLE):
         ncols = 3 if max(map(len, values)) <= 12 else 2  # letters that fit a third of a column
@@ -57,12 +57,12 @@ def cdf(
 
 
 def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
-    """Steps and values of every quantity in files of Lightning's CSVLogger, whose rows leave out what they lack.
+    """Steps and values of every quantity in files of Lightning's CSVLogger; empty cells are left out.
 
-    A run that is killed may leave an empty file, or one whose last row is cut: that is left out, and done anew behind.
+    A killed run may leave an empty file or a cut last row. Both are skipped; the next start has logged them again.
 
     Args:
-        paths: One file for each time the run was started; a later file counts from its first step on.
+        paths: One file for each start of the run; a later file replaces earlier ones from its first step on.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -89,8 +89,7 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
 
 
 class Validated(NamedTuple):
-    """A validation of a training: after which step, after how many seconds (NaN where the log does not say), and the
-    mean score."""
+    """A validation of a training: its step, its time since the start [s], NaN if unknown, and the mean score."""
 
     step: int
     seconds: float
@@ -98,12 +97,7 @@ class Validated(NamedTuple):
 
 
 def read_validations(folder: Path, score: str) -> list[Validated]:
-    """The validations that a run's log tells of, in their order; none of a run without a training.
-
-    Args:
-        folder: Of the run.
-        score: Name of the score.
-    """
+    """The validations in the log of a run's folder, by the name of a score; empty for a run without a training."""
     logs = sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime)
     curves = read_curves(logs)
     seconds = dict(zip(*curves.get("seconds", ((), ())), strict=True))
@@ -119,7 +113,7 @@ def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:
             ``validation/...`` the scores; other names are left out.
 
     Raises:
-        ValueError: No name begins so.
+        ValueError: There is neither ``train/...`` nor ``validation/...``.
     """
     panels = {
         group: {name.removeprefix(f"{group}/"): curve for name, curve in curves.items() if name.startswith(f"{group}/")}
@@ -143,19 +137,19 @@ def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:
 
 def speed_against_error(
     names: Sequence[str],
-    scores: Float[ndarray, "runs"],
-    times: Mapping[str, Float[ndarray, "runs"]],
+    scores: Float[ndarray, " runs"],
+    times: Mapping[str, Float[ndarray, " runs"]],
     score_label: str,
     baselines: Mapping[str, float],
 ) -> Figure:
     """Score of each run against what it costs, one panel a kind of time.
 
     Args:
-        names: What to call each run; the key below the panels.
+        names: Of the runs, for the key below the panels.
         scores: Score of each run.
         times: Times of each run by axis label; NaN where unknown.
-        score_label: What the score is, with its unit.
-        baselines: Scores of the baselines, drawn as lines over all times.
+        score_label: Name of the score, with its unit.
+        baselines: Scores of the baselines, drawn as horizontal lines.
     """
     with rc_context(STYLE):
         key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page
@@ -189,10 +183,10 @@ def learning_curves(
 
     Args:
         curves: Times [s] and scores by name.
-        score_label: What the score is.
-        baselines: Scores of the baselines, drawn as lines over all times.
-        higher_is_better: Whether the score is a similarity. Errors have a logarithmic axis, so that a system that
-            starts far off leaves room for the good ones.
+        score_label: Name of the score.
+        baselines: Scores of the baselines, drawn as horizontal lines.
+        higher_is_better: True for a similarity. Errors have a logarithmic axis, so that large ones at the start leave
+            space for small ones.
     """
     with rc_context(STYLE):
         key_rows = (len(curves) + len(baselines) + 3) // 4
@@ -213,7 +207,7 @@ def learning_curves(
 
 
 def _draw_smoothed(ax: Axes, steps, values, **line) -> None:
-    """A running mean over a fiftieth of the points, above the points themselves."""
+    """A running mean over a fiftieth of the points, drawn over the points."""
     window = max(1, len(values) // 50)
     if window > 1:
         ax.plot(steps, values, color=line["color"], alpha=0.2, linewidth=0.5)

@@ -1,8 +1,7 @@
-"""The room from above and from the side: transmitters, receivers, walls, the Gaussians, and what was learnt of it."""
-
-from typing import NamedTuple
+"""The room from above and from the side: transmitters, receivers, walls, Gaussians, and learnt planes and paths."""
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
@@ -13,117 +12,87 @@ from matplotlib.image import AxesImage
 from matplotlib.patheffects import Normal, Stroke
 from numpy import ndarray
 
-from gaigs.report.shapes import LearntRoom, Matter, Path, Plane
+from gaigs.data import Links
+from gaigs.gaussians import SH_DC, Gaussians
+from gaigs.placement.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
 from gaigs.report.style import BLUE, GREEN, ORANGE, STYLE
 
 DRAWN = 600
 """Most Gaussians that are drawn; more would hide each other."""
 
-FACING = 0.77
-"""A plane is drawn in a view where the cosine of its normal with the line of sight is below this: one that faces the
-reader would cover the room, and the other view has it. Above 1 / sqrt(2), so that none is left out."""
-
 SHOWN = 0.001
-"""Share of the power from which on a plane is drawn."""
-
-LABEL = (0.14, 0.04)
-"""Room that the label of a plane takes, in widths of the view and of its larger edge."""
-
-PIXELS = 300
-"""Of the obstacles' image, along its longer edge."""
-
-FAINT_DB = 1.0
-"""Loss at which the obstacles' colours end at the least, so that next to none does not look like much [dB]."""
+"""Least share of the power of a plane that is drawn."""
 
 VIEWS = ((1, 2), (2, 1))
-"""Which axis points up in plan and side view, and along which one looks."""
+"""Upward axis and line of sight of plan and side view."""
 
 
-class Cloud(NamedTuple):
-    """Gaussians as a figure needs them.
-
-    Attributes:
-        means: Centres, world frame [m].
-        covariances: World frame [m²].
-        strengths: |signal| times opacity.
-    """
-
-    means: Float[ndarray, "n 3"]
-    covariances: Float[ndarray, "n 3 3"]
-    strengths: Float[ndarray, "n"]
-
-
-def room(
-    train: Float[ndarray, "train 3"],
-    test: Float[ndarray, "test 3"],
-    receivers: Float[ndarray, "receivers 3"],
-    rotations: Float[ndarray, "arrays 3 3"],
-    edges: Float[ndarray, "k 2 3"],
-    cloud: Cloud | None = None,
-    learnt: LearntRoom | None = None,
-) -> Figure:
+@torch.no_grad()
+def room(links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | None = None) -> Figure:
     """Plan (x, y) and side view (x, z) of the room, to one scale.
 
-    Of the Gaussians the strongest are drawn, each as its ellipse of one standard deviation, the strongest on top. The
-    box shown holds transmitters, receivers and walls, and the middle 80 % of these Gaussians along each axis. Learnt
-    planes are the wider the more power comes by way of them; one that is seen nearly from the front is left to the
-    other view. What obstacles take from a straight path along the line of sight is shown in colour.
+    Of the Gaussians the strongest by |signal| times opacity are drawn, each as its ellipse of one standard deviation,
+    the strongest on top. The box shown holds transmitters, receivers and walls, and the middle 80 % of these Gaussians
+    along each axis. Line widths of learnt planes grow with their share of the power. A plane seen nearly from the front
+    is left to the other view. Colour shows the loss by obstacles along the line of sight.
 
     Args:
-        train, test: Transmitters [m].
-        receivers: Positions [m].
-        rotations: Columns are the axes of the first receivers, drawn as arrows; empty where directions do not matter.
-        edges: Line segments of the room [m].
-        cloud: The Gaussians; None for a model without.
+        links: Transmitters, receivers and walls. Axes of the receivers are drawn where directions matter.
+        gaussians: None for a model without.
         learnt: Planes and obstacles; None for a model that learns none.
     """
+    train, test = (links.query.transmitters[part].numpy() for part in (links.split.train, links.split.test))
+    receivers, edges = _receivers(links), links.edges.numpy()
+    has_axes = all(len(one.array) > 1 or links.task.directions is not None for one in links.receivers)
     corners = [train, test, receivers, edges.reshape(-1, 3)]
-    if cloud is not None:
-        strongest = np.argsort(cloud.strengths)[-DRAWN:]
-        count, cloud = len(cloud.strengths), Cloud(*(values[strongest] for values in cloud))
-        corners.append(np.quantile(cloud.means, (0.1, 0.9), axis=0))
+    if gaussians is not None:
+        strengths = (gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)).cpu().numpy()
+        strongest = np.argsort(strengths)[-DRAWN:]
+        parts = gaussians.means.cpu().numpy(), gaussians.covariances.cpu().numpy(), strengths
+        means, covariances, strengths = (part[strongest] for part in parts)
+        corners.append(np.quantile(means, (0.1, 0.9), axis=0))
     if learnt is not None:
         corners += [plane.corners for plane in learnt.planes if plane.share >= SHOWN]
-    corners = np.concatenate(corners)
     with rc_context(STYLE):
-        figure, axes, arrow = _views(corners)
-        receiver = "receivers, axes of the array" if len(rotations) else "receivers"
-        images = []
+        figure, axes, arrow = _views(np.concatenate(corners))
+        obstacles = []
         for ax, (up, along) in zip(axes, VIEWS, strict=True):
             view = [0, up]
             if learnt is not None and learnt.matter is not None:
-                images.append(_draw_matter(ax, learnt.matter, up, along))
-            if cloud is not None:
-                gaussians = _draw_cloud(ax, cloud, view)
+                obstacles.append(_draw_matter(ax, learnt.matter, up, along))
+            if gaussians is not None:
+                ellipses = _draw_gaussians(ax, means[:, view], covariances[:, view][:, :, view], strengths)
             if learnt is not None:
                 _draw_planes(ax, learnt.planes, view, along)
             ax.add_collection(LineCollection(edges[..., view], colors="0.5", linewidths=0.8))
             ax.plot(*train[:, view].T, ".", color="0.2", markersize=2, label="transmitters, train")
             ax.plot(*test[:, view].T, ".", color=ORANGE, markersize=3, label="transmitters, test")
-            ax.plot(*receivers[:, view].T, "s", color=GREEN, markersize=5, markeredgecolor="white", label=receiver)
-            for position, rotation in zip(receivers, rotations, strict=False):
-                _draw_axes(ax, position[view], arrow * rotation[view])
-        if cloud is not None:
-            label = f"|signal| × opacity, {len(cloud.means):,} strongest of {count:,} Gaussians"
-            figure.colorbar(gaussians, ax=axes, label=label, aspect=30, shrink=0.7, extend="max")
-        if images:
-            highest = max(FAINT_DB, *(np.quantile(image.get_array().data, 0.99) for image in images))
-            for image in images:
+            _draw_receivers(ax, receivers[:, view], "receivers, axes of the array" if has_axes else "receivers")
+            for receiver in links.receivers if has_axes else ():
+                _draw_axes(ax, receiver.pose.position.numpy()[view], arrow * receiver.pose.rotation.numpy()[view])
+        bar = {"aspect": 30, "shrink": 0.7}
+        if gaussians is not None:
+            label = f"|signal| × opacity, {len(means):,} strongest of {len(gaussians.means):,} Gaussians"
+            figure.colorbar(ellipses, ax=axes, label=label, extend="max", **bar)
+        if obstacles:
+            # The scale spans at least 1 dB, so that a negligible loss is pale.
+            highest = max(1.0, *(np.quantile(image.get_array().data, 0.99) for image in obstacles))
+            for image in obstacles:
                 image.set_clim(0, highest)
             label = "loss by obstacles along the line of sight [dB]"
-            figure.colorbar(images[0], ax=axes, label=label, aspect=30, shrink=0.7, extend="max")
+            figure.colorbar(obstacles[0], ax=axes, label=label, extend="max", **bar)
         _legend(figure, axes[0])
     return figure
 
 
-def paths(learnt: LearntRoom, receivers: Float[ndarray, "receivers 3"], edges: Float[ndarray, "k 2 3"]) -> Figure:
+def paths(links: Links, learnt: LearntRoom) -> Figure:
     """The learnt paths of a transmitter, folded through the room, in plan (x, y) and side view (x, z).
 
     Args:
+        links: Receivers and walls.
         learnt: At least one path, all of one transmitter; and the planes, drawn faintly.
-        receivers: Positions [m].
-        edges: Line segments of the room [m].
     """
+    receivers, edges = _receivers(links), links.edges.numpy()
     points = [path.points for path in learnt.paths]
     corners = [receivers, edges.reshape(-1, 3), *points]
     corners += [plane.corners for plane in learnt.planes if plane.share >= SHOWN]
@@ -134,7 +103,7 @@ def paths(learnt: LearntRoom, receivers: Float[ndarray, "receivers 3"], edges: F
             _draw_planes(ax, learnt.planes, view, along)
             ax.add_collection(LineCollection(edges[..., view], colors="0.5", linewidths=0.8))
             lines = _draw_paths(ax, learnt.paths, view)
-            ax.plot(*receivers[:, view].T, "s", color=GREEN, markersize=5, markeredgecolor="white", label="receivers")
+            _draw_receivers(ax, receivers[:, view], "receivers")
             ax.plot(*points[0][0, view], "o", color=ORANGE, markeredgecolor="white", label="transmitter")
         x, y, z = points[0][0]
         axes[0].set_title(f"The {len(points)} strongest paths of a transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m")
@@ -144,13 +113,21 @@ def paths(learnt: LearntRoom, receivers: Float[ndarray, "receivers 3"], edges: F
     return figure
 
 
+def _receivers(links: Links) -> Float[ndarray, "receivers 3"]:
+    return np.stack([receiver.pose.position.numpy() for receiver in links.receivers])
+
+
+def _draw_receivers(ax: Axes, places: Float[ndarray, "receivers 2"], label: str) -> None:
+    ax.plot(*places.T, "s", color=GREEN, markersize=5, markeredgecolor="white", label=label)
+
+
 def _views(corners: Float[ndarray, "k 3"]) -> tuple[Figure, tuple[Axes, Axes], float]:
-    """Empty plan and side view that hold some points [m], and the length of an arrow that suits them [m]."""
+    """Empty plan and side view that contain some points [m], and the length of arrows in them [m]."""
     lower, upper = corners.min(0), corners.max(0)
     arrow = 0.1 * (upper - lower).max()
     lower, upper = lower - 1.2 * arrow, upper + 1.2 * arrow
     width, depth, height = upper - lower
-    inches = min(5.8 / width, 6.8 / (depth + height))  # what fits a page, for one metre
+    inches = min(5.8 / width, 6.8 / (depth + height))  # of one metre on the page
     figure = Figure(figsize=(width * inches + 1.3, (depth + height) * inches + 1.0), layout="compressed")
     plan, side = figure.subplots(2, 1, sharex=True, height_ratios=(depth, height))
     for ax, (up, _) in zip((plan, side), VIEWS, strict=True):
@@ -165,19 +142,21 @@ def _legend(figure: Figure, ax: Axes) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, markerscale=1.5)
 
 
-def _draw_cloud(ax: Axes, cloud: Cloud, view: list[int]) -> EllipseCollection:
-    variances, axes = np.linalg.eigh(cloud.covariances[:, view][:, :, view])  # ascending
+def _draw_gaussians(
+    ax: Axes, means: Float[ndarray, "n 2"], covariances: Float[ndarray, "n 2 2"], strengths: Float[ndarray, " n"]
+) -> EllipseCollection:
+    variances, axes = np.linalg.eigh(covariances)  # ascending
     minor, major = 2 * np.sqrt(variances.clip(0)).T  # rounding can leave a flat ellipse a variance below zero
     ellipses = EllipseCollection(
         major,
         minor,
         np.rad2deg(np.arctan2(axes[:, 1, 1], axes[:, 0, 1])),
         units="xy",
-        offsets=cloud.means[:, view],
+        offsets=means,
         offset_transform=ax.transData,
-        array=cloud.strengths,
+        array=strengths,
         cmap="Blues",
-        clim=(0, np.quantile(cloud.strengths, 0.98)),  # one outlier must not pale all others
+        clim=(0, np.quantile(strengths, 0.98)),  # one outlier must not pale all others
         alpha=0.6,
         edgecolors="white",
         linewidths=0.3,
@@ -185,9 +164,10 @@ def _draw_cloud(ax: Axes, cloud: Cloud, view: list[int]) -> EllipseCollection:
     return ax.add_collection(ellipses)
 
 
-def _draw_planes(ax: Axes, planes: list[Plane], view: list[int], along: int) -> None:
-    """Outlines, the wider the larger the share; edge on they are lines."""
-    shown = [plane for plane in planes if abs(plane.normal[along]) < FACING and plane.share >= SHOWN]
+def _draw_planes(ax: Axes, planes: list[LearntPlane], view: list[int], along: int) -> None:
+    """Outlines with their share of the power. A plane that faces the reader would cover the room and is left out."""
+    # The limit is above 1 / sqrt(2), so that each plane is in one view at least.
+    shown = [plane for plane in planes if abs(plane.normal[along]) < 0.77 and plane.share >= SHOWN]
     if not shown:
         return
     polygons = PolyCollection(
@@ -199,7 +179,7 @@ def _draw_planes(ax: Axes, planes: list[Plane], view: list[int], along: int) -> 
     )
     ax.add_collection(polygons)
     width, height = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
-    needed = np.array(LABEL) * (width, max(width, height))
+    needed = np.array((0.14 * width, 0.04 * max(width, height)))  # of a label
     taken = []
     for plane in shown:
         outward = plane.normal[view] / np.linalg.norm(plane.normal[view])
@@ -225,9 +205,9 @@ def _draw_planes(ax: Axes, planes: list[Plane], view: list[int], along: int) -> 
 
 
 def _draw_matter(ax: Axes, matter: Matter, up: int, along: int) -> AxesImage:
-    """What a path through all of it along the line of sight loses [dB]."""
+    """Loss of a path through all obstacles along the line of sight [dB]."""
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    pixel = max(right - left, top - bottom) / PIXELS
+    pixel = max(right - left, top - bottom) / 300
     x, y = np.arange(left + pixel / 2, right, pixel), np.arange(bottom + pixel / 2, top, pixel)
     columns = matter.densities * np.sqrt(2 * np.pi) * matter.widths[:, along]
     across, upwards = (
@@ -239,7 +219,7 @@ def _draw_matter(ax: Axes, matter: Matter, up: int, along: int) -> AxesImage:
     return ax.imshow(losses, origin="lower", extent=extent, cmap="Purples", alpha=0.8)
 
 
-def _draw_paths(ax: Axes, paths: list[Path], view: list[int]) -> LineCollection:
+def _draw_paths(ax: Axes, paths: list[LearntPath], view: list[int]) -> LineCollection:
     """The strongest on top."""
     ordered = sorted(paths, key=lambda path: path.power_db)
     powers = np.array([path.power_db for path in ordered])
@@ -247,7 +227,7 @@ def _draw_paths(ax: Axes, paths: list[Path], view: list[int]) -> LineCollection:
     lines = LineCollection(
         [path.points[:, view] for path in ordered],
         array=powers,
-        cmap=ListedColormap(colormaps["plasma_r"](np.linspace(0.12, 1, 256))),  # paler ones are no lines on white
+        cmap=ListedColormap(colormaps["plasma_r"](np.linspace(0.12, 1, 256))),  # paler colours vanish on white
         clim=(lowest, 0),
         linewidths=0.8 + 1.4 * (1 - powers / lowest),
     )
@@ -257,7 +237,7 @@ def _draw_paths(ax: Axes, paths: list[Path], view: list[int]) -> LineCollection:
 def _draw_axes(ax: Axes, position: Float[ndarray, "2"], axes: Float[ndarray, "2 3"]) -> None:
     lengths = np.hypot(*axes)
     for name, axis, length in zip("xyz", axes.T, lengths, strict=True):
-        if length > 0.3 * lengths.max():  # one that points at the reader would be a dot under the receiver
+        if length > 0.3 * lengths.max():  # an axis along the line of sight would be a dot
             ax.annotate(
                 name,
                 position,

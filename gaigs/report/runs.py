@@ -1,8 +1,7 @@
-"""The runs of a Hydra multirun, or of several, as they lie in its folder."""
+"""The runs in the folder of a Hydra multirun, or of several."""
 
 import json
 import re
-import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -15,24 +14,16 @@ from gaigs.configuration import differences
 from gaigs.registry import check_type
 from gaigs.report.table import metrics_of
 
-NEEDED = {"task": str, "split": str, "seed": int, "device": str} | dict.fromkeys(
-    ("train_seconds", "inference_ms", "render_ms", "num_gaussians", "num_parameters", "checkpoint_bytes"), float | None
-)
-"""What tables need of ``metrics.json``, beside scores; of costs there may be none."""
-
-FAILED = "gaigs: "
-"""How the line of a job's log begins that says why it failed."""
-
 
 class Run(NamedTuple):
     """One job of a multirun.
 
     Attributes:
         name: Its sub-folder.
-        overrides: What was changed on the command line, by key.
-        metrics: Contents of ``metrics.json``; None where the job failed, was stopped or is still at work.
-        failure: What the job said when it failed; None where it did not.
-        folder: Where it lies.
+        overrides: Values of the command line, by key.
+        metrics: Contents of ``metrics.json``; None where the job failed, was stopped or still runs.
+        failure: The error of a failed job; else None.
+        folder: Of the run.
     """
 
     name: str
@@ -43,41 +34,39 @@ class Run(NamedTuple):
 
 
 def as_baseline(name: str) -> str:
-    """What a reader calls a baseline where a system has the same name."""
+    """The name of a baseline for a reader where a system has the same name."""
     return f"{name} (baseline)"
 
 
 def train_seconds(metrics: Mapping) -> float | None:
-    """How long a run trained, and what its kriging took on top [s]; None of a look-up."""
+    """Duration of a run's training and kriging [s]; None for a look-up."""
     seconds = metrics.get("train_seconds")
     return None if seconds is None else seconds + metrics.get("kriging", {}).get("seconds", 0.0)
 
 
-class Spread(NamedTuple):
-    """A metric of several runs: mean, standard deviation of a sample, least value."""
-
-    mean: float
-    deviation: float
-    least: float
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Spread":
-        """That of two values or more."""
-        return cls(statistics.mean(values), statistics.stdev(values), min(values))
+def by_seed(runs: Sequence[Run]) -> list[list[Run]]:
+    """Groups of runs that differ in the override ``seed`` alone, in the order of their first runs."""
+    groups: dict[frozenset, list[Run]] = {}
+    for run in runs:
+        fixed = frozenset((key, value) for key, value in run.overrides.items() if key != "seed")
+        groups.setdefault(fixed, []).append(run)
+    return [*groups.values()]
 
 
 def read_metrics(file: Path) -> dict:
-    """What a run has left in its ``metrics.json``, with all that tables need.
+    """Contents of a run's ``metrics.json``, checked for what tables need.
 
     Raises:
-        ValueError: It is damaged, lacks something, or is of a task that is not installed here.
+        ValueError: It is damaged, lacks a key, or is of a task that is not installed here.
     """
+    costs = "train_seconds", "inference_ms", "render_ms", "num_gaussians", "num_parameters", "checkpoint_bytes"
+    needed = {"task": str, "split": str, "seed": int, "device": str} | dict.fromkeys(costs, float | None)
     try:
         metrics = json.loads(file.read_text())
         if not isinstance(metrics, dict):
             raise TypeError(f"it must be a mapping, got {metrics!r:.60}")
         first, *_ = metrics_of(metrics)
-        for key, kind in NEEDED.items():
+        for key, kind in needed.items():
             check_type(repr(key), metrics.get(key), kind)
         _check_scores("models", metrics.get("models"), first)
         if metrics.get("validation"):
@@ -86,14 +75,14 @@ def read_metrics(file: Path) -> dict:
             _check_scores(f"receiver {receiver}", models, first)
     except (AttributeError, TypeError, ValueError, RecursionError) as error:  # JSON and encodings raise a ValueError
         raise ValueError(
-            f"{file} must hold what a run writes, and does not: {error}; move the file elsewhere, and the run's "
-            "command writes it anew without another training"
+            f"cannot read {file}: {error}; move the file elsewhere, and the run's command writes it anew without "
+            "another training"
         ) from error
     return metrics
 
 
 def _check_scores(place: str, models: object, first: str) -> None:
-    """Sees to it that models have scores, all of them the one that runs are compared by."""
+    """Checks that models have scores, among them the one by which runs are compared."""
     if not isinstance(models, dict) or not models:
         raise TypeError(f"{place!r} must be the scores of models, got {models!r:.60}")
     for model, scores in models.items():
@@ -102,24 +91,17 @@ def _check_scores(place: str, models: object, first: str) -> None:
 
 
 def _read_yaml(file: Path, kind: type) -> object:
-    """What one of a job's configuration files holds.
-
-    Raises:
-        ValueError: It is damaged.
-    """
+    """Contents of one of a job's configuration files."""
     try:
         content = OmegaConf.to_container(OmegaConf.load(file), resolve=kind is dict)
-    except (OmegaConfBaseException, yaml.YAMLError, ValueError, OSError) as error:
-        raise ValueError(
-            f"{file} must be YAML that Hydra wrote, and is damaged: {' '.join(str(error).split())}"
-        ) from error
-    if not isinstance(content, kind):
-        raise ValueError(f"{file} must be YAML that Hydra wrote, a {kind.__name__}, got {content!r:.60}")
+        check_type("its content", content, kind)
+    except (OmegaConfBaseException, yaml.YAMLError, TypeError, ValueError, OSError) as error:
+        raise ValueError(f"cannot parse {file}, which Hydra wrote: {' '.join(str(error).split())}") from error
     return content
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """The runs at any depth of a folder, in the order of their names, the numbers in these by their size.
+    """The runs at any depth of a folder, sorted by name, with numbers in names by value.
 
     Raises:
         FileNotFoundError: The folder holds no run.
@@ -127,19 +109,14 @@ def read_runs(folder: Path) -> list[Run]:
     """
     runs = []
     for path in folder.glob("**/.hydra/overrides.yaml"):
-        run_config, started = path.parents[1] / "config.yaml", path.parent / "config.yaml"
-        if (
-            run_config.is_file()
-            and started.is_file()
-            and differences(_read_yaml(run_config, dict), _read_yaml(started, dict))
-        ):
+        own, started = path.parents[1], path.parent / "config.yaml"
+        metrics, stored = own / "metrics.json", own / "config.yaml"
+        if stored.is_file() and started.is_file() and differences(_read_yaml(stored, dict), _read_yaml(started, dict)):
             raise ValueError(
-                f"{run_config.parent} holds a run of another configuration than the one last started there, which was "
-                "refused, and Hydra has rewritten its overrides; start the multirun once more as it was at first"
+                f"{own} holds a run of another configuration than the one last started there, which was refused, and "
+                "Hydra has rewritten its overrides; start the multirun once more as it was at first"
             )
         overrides = (override.partition("=") for override in _read_yaml(path, list))
-        own = path.parents[1]
-        metrics = own / "metrics.json"
         runs.append(
             Run(
                 own.relative_to(folder).as_posix(),
@@ -154,14 +131,14 @@ def read_runs(folder: Path) -> list[Run]:
             f"{folder} must hold runs, each with its .hydra/overrides.yaml, found none; "
             "pass the folder that Hydra made for 'python -m gaigs --multirun ...'"
         )
-    # Text and numbers take turns, so that like is compared with like.
+    # Text and numbers alternate, so that equal types are compared.
     parts = lambda name: [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
     runs.sort(key=lambda run: parts(run.name))
     return runs
 
 
 def _failure(folder: Path) -> str | None:
-    """What a job said last, if that was why it failed."""
+    """The last line of a job's log, if it is the error by which the job ended."""
     logs = [log for log in folder.glob("*.log") if not log.name.startswith("train_ddp")]
     last = "".join(log.read_text(errors="replace") for log in logs).rstrip().rpartition("\n")[2]
-    return last.removeprefix(FAILED) if last.startswith(FAILED) else None
+    return last.removeprefix("gaigs: ") if last.startswith("gaigs: ") else None

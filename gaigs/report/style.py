@@ -1,6 +1,11 @@
-"""The look that all figures share: sizes for a printed page, colours that survive colour blindness and grey print."""
+"""The look of all figures: sizes for a printed page, colours for colour-blind readers and grey print."""
 
 import math
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from gaigs.io.files import atomic_write
 
 COLUMN, PAGE = 3.5, 7.16
 """Widths of one column and of a page of two columns [inch]."""
@@ -43,13 +48,14 @@ MARKERS = tuple(
 """Looks of the points of up to 25 runs."""
 
 
+def save(figure: Figure, file: Path) -> None:
+    """Writes a figure as PNG."""
+    with atomic_write(file) as part:
+        figure.savefig(part, dpi=DPI)
+
+
 def round_step(span: float, most: int) -> float:
-    """The smallest of 1, 2 or 5 times a power of ten of which at most so many cover a span above 0."""
+    """The smallest step, 1, 2 or 5 times a power of ten, of which at most ``most`` cover a span above 0."""
     least = span / most
     power = 10.0 ** math.floor(math.log10(least))
     return next((step * power for step in (1, 2, 5) if step * power >= least), 10 * power)
-
-
-def with_unit(quantity: str, unit: str) -> str:
-    """The label of an axis: the unit in brackets; a ratio has none."""
-    return f"{quantity} [{unit}]" if unit else quantity

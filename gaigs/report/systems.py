@@ -1,25 +1,25 @@
 """Runs of several models as one table in the form of the paper's: published figures beside ours, times and sizes."""
 
-import csv
 import math
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import yaml
-from rich.box import SIMPLE_HEAD
+from matplotlib.figure import Figure
 from rich.markup import escape
 from rich.table import Table
 
 from gaigs.configuration import conf_dir, plugin_conf_dirs
-from gaigs.io.files import atomic_write, write_text
+from gaigs.io.files import write_text
 from gaigs.registry import registry
 from gaigs.report.curves import learning_curves, read_validations
-from gaigs.report.runs import Run, Spread, as_baseline, train_seconds
-from gaigs.report.style import DPI
-from gaigs.report.table import latex, markdown, monitor_names, stacked, tex, written
+from gaigs.report.run_figures import figures_of
+from gaigs.report.runs import Run, as_baseline, by_seed, train_seconds
+from gaigs.report.style import save
+from gaigs.report.table import Spread, latex, markdown, monitor_names, terminal, tex, write_csv, written
 
 COSTS = {
     "train_seconds": "training [s]",
@@ -29,17 +29,17 @@ COSTS = {
     "num_gaussians": "Gaussians",
     "checkpoint_bytes": "checkpoint [MB]",
 }
-"""What a reader calls the costs of ``metrics.json``, in the order of the table."""
+"""Titles of the costs in ``metrics.json``, in the order of the table."""
 
 BRIEF = ("train_seconds", "inference_ms", "num_parameters")
-"""The costs for which a terminal has room."""
+"""Costs of the terminal's table."""
 
 
 class Published(NamedTuple):
-    """What publications report.
+    """Figures of publications.
 
     Attributes:
-        names: What readers call models, by registered name; in the order of the rows.
+        names: Names of models for a reader, by registered name; in the order of the rows.
         scores, costs: For each task columns with ``title``, ``source``, and ``figures`` by model.
     """
 
@@ -53,11 +53,11 @@ class System(NamedTuple):
 
     Attributes:
         model: Registered name.
-        name: What a reader calls it.
-        runs: Those that ended, one a seed; none of a baseline.
+        name: Name for a reader.
+        runs: Runs that ended, one a seed; empty for a baseline.
         values: Of each metric and cost, one a run; a baseline has one of each metric.
-        failures: Of each run that has not ended, its seed where several vary, and why.
-        varied: Whether more than model and seed tell its runs from others.
+        failures: Of each run that has not ended, its seed where several vary, and the cause.
+        varied: True if its runs differ from others in more than model and seed.
     """
 
     model: str
@@ -68,16 +68,8 @@ class System(NamedTuple):
     varied: bool = False
 
 
-class Column(NamedTuple):
-    """A column of numbers, one a row, None where there is none; ``higher_is_better`` is None where none is best."""
-
-    title: str
-    values: list[float | int | Spread | None]
-    higher_is_better: bool | None = None
-
-
 def read_published() -> Published:
-    """What ``published.yaml`` holds in the configuration folder of gaigs and in those of plug-ins.
+    """Contents of ``published.yaml`` in the configuration folder of gaigs and in those of plug-ins.
 
     Raises:
         ValueError: A file does not have the form of gaigs's own.
@@ -99,20 +91,16 @@ def read_published() -> Published:
 
 
 def find_systems(runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapping, names: Mapping) -> list[System]:
-    """Rows of the table. Runs that differ in the seed alone are one; baselines that are no system there stand last.
+    """Rows of the table. Runs that differ in the seed alone are one row. Baselines that are no system come last.
 
     Args:
         runs: Of the multirun.
         baselines: Rows of ``gaigs.report.multirun.ablation``.
-        shared: What the runs have in common.
-        names: What readers call models.
+        shared: Settings that the runs share.
+        names: Names of models for a reader.
     """
-    groups: dict[frozenset, list[Run]] = {}
-    for run in runs:
-        fixed = frozenset((key, value) for key, value in run.overrides.items() if key != "seed")
-        groups.setdefault(fixed, []).append(run)
     rows = []
-    for group in groups.values():
+    for group in by_seed(runs):
         overrides = group[0].overrides
         # A seed that was run twice, in two multiruns, counts once.
         ended = {run.metrics["seed"]: run for run in reversed(group) if run.metrics is not None}
@@ -124,12 +112,11 @@ def find_systems(runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapp
             for key, value in (next(iter(run.metrics["models"].values())) | _costs(run.metrics)).items():
                 if value is not None:
                     values.setdefault(key, []).append(value)
-        failures = [
-            f"{f'seed {seed}: ' if (seed := run.overrides.get('seed')) and len(group) > 1 else ''}"
-            f"{run.failure or 'unfinished'}"
-            for run in group
-            if run.metrics is None
-        ]
+        failures = []
+        for run in group:
+            if run.metrics is None:
+                seed = f"seed {run.overrides['seed']}: " if len(group) > 1 and run.overrides.get("seed") else ""
+                failures.append(f"{seed}{run.failure or 'unfinished'}")
         name = " ".join([names.get(model, model), *varied])
         rows.append(System(model, name, done, values, failures, bool(varied)))
     order = [*names]
@@ -146,7 +133,7 @@ def find_systems(runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapp
 
 
 def _costs(metrics: Mapping) -> dict[str, float | None]:
-    """Those of one run; no Gaussians are none."""
+    """Costs of one run; 0 Gaussians become None."""
     costs = {key: metrics.get(key) for key in COSTS} | {"train_seconds": train_seconds(metrics)}
     costs["num_gaussians"] = costs["num_gaussians"] or None
     if costs["checkpoint_bytes"] is not None:
@@ -154,143 +141,121 @@ def _costs(metrics: Mapping) -> dict[str, float | None]:
     return costs
 
 
-def _columns(rows: Sequence[System], titles: Mapping[str, str], better: Mapping[str, bool]) -> list[Column]:
-    """Ours, of metrics or of costs; one that no row has is left out."""
-    columns = []
-    for key, title in titles.items():
-        found = [row.values.get(key) for row in rows]
-        if any(found):
-            columns.append(Column(title, [values and _value(values) for values in found], better.get(key)))
-    return columns
+def _mean(value: float | Spread) -> float:
+    return value.mean if isinstance(value, Spread) else value
 
 
-def _value(values: list[float]) -> float | Spread:
-    return Spread.of(values) if len(values) > 1 else values[0]
+def _cells(systems: Sequence[System], published: Sequence[Mapping], titles: Mapping[str, str]) -> list[dict]:
+    """Rows by title: published figures, of systems that are not varied, then ours; empty columns are left out."""
+    rows = []
+    for system in systems:
+        figures = {f"published {column['title']}": column["figures"].get(system.model) for column in published}
+        if not system.runs or system.varied:
+            figures = dict.fromkeys(figures)
+        ours = {title: system.values.get(key, ()) for key, title in titles.items()}
+        rows.append(figures | {title: Spread.of(v) if len(v) > 1 else next(iter(v), None) for title, v in ours.items()})
+    return [
+        {title: value for title, value in row.items() if any(other[title] is not None for other in rows)}
+        for row in rows
+    ]
 
 
-def _published(rows: Sequence[System], columns: Sequence[Mapping]) -> list[Column]:
-    """Those of publications, of systems as they are, not of ones that were varied; a title stands for what it is of."""
-    found = []
-    for column in columns:
-        figures = [column["figures"].get(row.model) if row.runs and not row.varied else None for row in rows]
-        if any(figure is not None for figure in figures):
-            found.append(Column(f"published {column['title']}", figures))
-    return found
+def _texts(
+    systems: Sequence[System],
+    rows: Sequence[Mapping],
+    better: Mapping[str, bool],
+    bold: str,
+    quoted: Callable[[str], str] = str,
+    missing: str = "",
+) -> list[list[str]]:
+    """Lines of a table as text: name and numbers of each system, the best of a column in bold.
 
-
-def _texts(column: Column) -> list[tuple[str, bool]]:
-    """The cells of a column, and whether each is the best."""
-    means = [value.mean if isinstance(value, Spread) else value for value in column.values]
-    known = [mean for mean in means if mean is not None]
-    best = None
-    if column.higher_is_better is not None and len(known) > 1:
-        best = (max if column.higher_is_better else min)(known)
-    texts = []
-    for value, mean in zip(column.values, means, strict=True):
-        spread = f" ± {written(value.deviation)}" if isinstance(value, Spread) else ""
-        texts.append(("" if mean is None else f"{written(mean)}{spread}", mean is not None and mean == best))
-    return texts
-
-
-def _markdown(rows: Sequence[System], columns: Sequence[Column]) -> str:
-    cells = [[f"**{text}**" if best else text for text, best in _texts(column)] for column in columns]
-    lines = ([row.name, *texts] for row, *texts in zip(rows, *cells, strict=True))
-    return markdown([["system", *(column.title for column in columns)], *lines])
-
-
-def _tex(rows: Sequence[System], columns: Sequence[Column]) -> str:
-    cells = []
-    for column in columns:
-        texts = ((tex(text), best) for text, best in _texts(column))
-        cells.append([rf"\textbf{{{text}}}" if best else text or "--" for text, best in texts])
-    lines = ([tex(row.name), *texts] for row, *texts in zip(rows, *cells, strict=True))
-    return latex([["Method", *(tex(column.title) for column in columns)], *lines])
-
-
-def _csv(file: Path, rows: Sequence[System], columns: Sequence[Column]) -> None:
-    with atomic_write(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
-        writer = csv.writer(opened)
-        spread = [any(isinstance(value, Spread) for value in column.values) for column in columns]
-        head = ([c.title, f"{c.title}, sd"] if wide else [c.title] for c, wide in zip(columns, spread, strict=True))
-        writer.writerow(["system", "model", *(title for titles in head for title in titles)])
-        for number, row in enumerate(rows):
-            line = [row.name, row.model]
-            for column, wide in zip(columns, spread, strict=True):
-                value = column.values[number]
-                pair = (value.mean, value.deviation) if isinstance(value, Spread) else (value, None)
-                line += pair if wide else pair[:1]
-            writer.writerow(line)
+    Args:
+        systems: One a line.
+        rows: Their numbers by title.
+        better: By title, True if a higher number is better; columns that are not there have no best.
+        bold: Format of bold text.
+        quoted: Gives a text in the table's language.
+        missing: Text of a number that is not there.
+    """
+    best = {}
+    for title in better.keys() & rows[0].keys():
+        means = [_mean(row[title]) for row in rows if row[title] is not None]
+        best[title] = (max if better[title] else min)(means) if len(means) > 1 else None
+    lines = []
+    for system, row in zip(systems, rows, strict=True):
+        line = [quoted(system.name)]
+        for title, value in row.items():
+            text = missing if value is None else quoted(written(value))
+            is_best = value is not None and _mean(value) == best.get(title)
+            line.append(bold.format(text) if is_best else text)
+        lines.append(line)
+    return lines
 
 
 def write_systems(
     folder: Path, runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapping, known: Mapping
 ) -> Table | None:
-    """Writes ``systems.md``, ``systems.csv``, ``systems.tex`` and the figures that set the systems side by side.
+    """Writes ``systems.md``, ``systems.csv``, ``systems.tex`` and the figures that compare the systems.
 
     Args:
         folder: Gets the files.
         runs: Of the multirun.
         baselines: Rows of ``gaigs.report.multirun.ablation``.
-        shared: What the runs have in common.
+        shared: Settings that the runs share.
         known: Metrics of the task.
 
     Returns:
         A table for a terminal; None, and no files, where the runs that ended are not of several models.
     """
     published = read_published()
-    rows = find_systems(runs, baselines, shared, published.names)
-    done = [row for row in rows if row.runs]
-    if len({row.model for row in done}) < 2:
+    systems = find_systems(runs, baselines, shared, published.names)
+    done = [system for system in systems if system.runs]
+    if len({system.model for system in done}) < 2:
         return None
     task = done[0].runs[0].metrics["task"]
-    failed = [f"{row.name}: {failure}" for row in rows for failure in row.failures]
-    rows = [row for row in rows if row.values]
-    better = {name: metric.higher_is_better for name, metric in known.items()}
-    scores = _columns(rows, {name: metric.title for name, metric in known.items()}, better)
-    costs = _columns(rows, COSTS, {})
-    told, taken = (_published(rows, part.get(task, ())) for part in (published.scores, published.costs))
+    failed = [f"{system.name}: {failure}" for system in systems for failure in system.failures]
+    systems = [system for system in systems if system.values]
+    columns = [*published.scores.get(task, ()), *published.costs.get(task, ())]
+    better = {metric.title: metric.higher_is_better for metric in known.values()}
+    scores = _cells(systems, published.scores.get(task, ()), {name: metric.title for name, metric in known.items()})
+    costs = _cells(systems, published.costs.get(task, ()), COSTS)
 
-    _csv(folder / "systems.csv", rows, [*told, *scores, *taken, *costs])
-    tables = [told + scores, taken + costs]
+    lines = zip(systems, scores, costs, strict=True)
+    whole = [{"system": system.name, "model": system.model} | a | b for system, a, b in lines]
+    write_csv(folder / "systems.csv", whole, (", sd",))
     notes = [", ".join(f"{key}={value}" for key, value in shared.items())]
-    notes += [
-        f"- published {column['title']}: {column['source']}"
-        for part in (published.scores, published.costs)
-        for column in part.get(task, ())
-    ]
+    notes += [f"- published {column['title']}: {column['source']}" for column in columns]
     notes += [f"- without a result: {failure}" for failure in failed]
-    pages = [*(_markdown(rows, table) for table in tables), "\n".join(notes) + "\n"]
-    texts = {"systems.md": pages, "systems.tex": [_tex(rows, table) for table in tables]}
-    for name, parts in texts.items():
-        write_text(folder / name, "\n".join(parts))
+    pages = [markdown([["system", *rows[0]], *_texts(systems, rows, better, "**{}**")]) for rows in (scores, costs)]
+    write_text(folder / "systems.md", "\n".join([*pages, *notes]) + "\n")
+    pages = [
+        latex([["Method", *map(tex, rows[0])], *_texts(systems, rows, better, r"\textbf{{{}}}", tex, "--")])
+        for rows in (scores, costs)
+    ]
+    write_text(folder / "systems.tex", "\n".join(pages))
     for name, figure in _figures(done, task, known).items():
-        with atomic_write(folder / f"systems_{name}.png") as part:
-            figure.savefig(part, dpi=DPI)
+        save(figure, folder / f"systems_{name}.png")
 
-    brief = [column for column in scores if any(column.title == m.title for m in known.values() if m.is_brief)]
-    brief += [column for column in costs if column.title in {COSTS[key] for key in BRIEF}]
-    return _terminal(rows, told[-1:] + brief, failed)
-
-
-def _terminal(rows: Sequence[System], columns: Sequence[Column], failed: Sequence[str]) -> Table:
-    missing = "".join(f"{failure}\n" for failure in failed)
-    caption = f"{missing}all columns in systems.md"
-    table = Table(title="Systems", caption=escape(caption), box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("system", overflow="fold")
-    for column in columns:
-        table.add_column(stacked(column.title), justify="right")
-    cells = [[f"[bold]{text}[/bold]" if best else text for text, best in _texts(column)] for column in columns]
-    for row, *texts in zip(rows, *cells, strict=True):
-        table.add_row(escape(row.name), *texts, style=None if row.runs else "dim")
-    return table
+    brief = [title for title in scores[0] if title.startswith("published ")][-1:]
+    brief += [metric.title for metric in known.values() if metric.is_brief and metric.title in scores[0]]
+    brief += [COSTS[key] for key in BRIEF if COSTS[key] in costs[0]]
+    rows = [{title: (a | b)[title] for title in brief} for a, b in zip(scores, costs, strict=True)]
+    return terminal(
+        "Systems",
+        {"system": False} | dict.fromkeys(brief, True),
+        _texts(systems, rows, better, "[bold]{}[/bold]", escape),
+        "".join(f"{failure}\n" for failure in failed) + "all columns in systems.md",
+        [None if system.runs else "dim" for system in systems],
+    )
 
 
-def _are_of_the_same_links(files: Iterable[Path]) -> bool:
-    """Whether predictions are of the same test links, told by their labels; not where a file cannot be read."""
+def _have_same_labels(files: Iterable[Path]) -> bool:
+    """True if all files are predictions of the same test links, to judge by their labels, and can be read."""
     first = None
     for file in files:
         try:
-            with file.open("rb") as stream, np.load(stream) as run:  # numpy would not close what it cannot read
+            with file.open("rb") as stream, np.load(stream) as run:  # numpy would not close a damaged file
                 labels = run["labels"]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return False
@@ -300,25 +265,27 @@ def _are_of_the_same_links(files: Iterable[Path]) -> bool:
     return first is not None
 
 
-def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict:
-    """What the task draws of all systems' predictions, where these are of the same split; and how they were learnt."""
-    figures, kind = {}, registry("task").get(task)
+def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict[str, Figure]:
+    """The task's figures of several systems, if they share the test links, and the validation scores over time."""
     shared = set.intersection(*({run.metrics["seed"] for run in row.runs} for row in rows))
     firsts = {
         row.name: next((run for run in row.runs if run.metrics["seed"] == min(shared, default=None)), row.runs[0])
         for row in rows
     }
     splits = {run.metrics["split"] for run in firsts.values()}
+    if len(splits) > 1:
+        return {}
+    figures, kind = {}, registry("task").get(task)
     files = {name: run.folder / "predictions.npz" for name, run in firsts.items()}
     files = {name: file for name, file in files.items() if file.is_file()}
-    if len(splits) == 1 and _are_of_the_same_links(files.values()):
-        figures |= kind.compared(files, *splits)
+    if _have_same_labels(files.values()):
+        figures |= figures_of(kind).of_systems(kind, files, *splits)
     monitor, mean = monitor_names(task)
     curves = {}
     for name, run in firsts.items():
         if points := [(p.seconds, p.score) for p in read_validations(run.folder, monitor) if math.isfinite(p.seconds)]:
             curves[name] = tuple(zip(*points, strict=True))
-    if curves and mean is not None and len(splits) == 1:
+    if curves and mean is not None:
         own = {next(iter(firsts[name].metrics["models"])) for name in curves}
         own |= {f"{name}_trend" for name in own}  # a run's own model without its kriging
         validation = next((run.metrics["validation"] for run in firsts.values() if run.metrics.get("validation")), {})

@@ -1,15 +1,18 @@
-"""The scores of a run, beside those of its baselines on the same split."""
+"""Tables for terminals, Markdown, LaTeX and CSV; the scores of a run beside those of its baselines."""
 
-from collections.abc import Mapping, Sequence
+import csv
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
+from gaigs.io.files import atomic_write
 from gaigs.registry import registry
-
-FITTING = 5
-"""Most metrics that a terminal has room for; of more, only the brief ones are shown."""
 
 TEX = str.maketrans(
     {sign: f"\\{sign}" for sign in "&%_#${}"}
@@ -18,14 +21,27 @@ TEX = str.maketrans(
 )
 
 
+class Spread(NamedTuple):
+    """A number of several runs: mean, standard deviation of the sample, least value."""
+
+    mean: float
+    deviation: float
+    least: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Spread":
+        """The spread of two values or more."""
+        return cls(statistics.mean(values), statistics.stdev(values), min(values))
+
+
 def metrics_of(metrics: Mapping) -> dict:
-    """What a reader calls the metrics of a run, and which way they are better: those of its task, in their order.
+    """``Metric`` of each number of a run's table by name, in the order of its task.
 
     Args:
-        metrics: Contents of ``metrics.json``, of which ``task`` counts.
+        metrics: Contents of ``metrics.json``.
 
     Raises:
-        ValueError: They do not say the task, or it is not installed here.
+        ValueError: The key ``task`` is missing, or that task is not installed here.
     """
     if "task" not in metrics:
         raise ValueError(
@@ -36,15 +52,17 @@ def metrics_of(metrics: Mapping) -> dict:
 
 
 def monitor_names(task: str) -> tuple[str, str | None]:
-    """The score by which a task's best checkpoints are chosen, and which of its metrics is the mean of that, if any."""
+    """The score that picks a task's best checkpoints, and the metric that is its mean, if there is one."""
     kind = registry("task").get(task)
     known = kind.metrics()
     monitor = kind.monitor if isinstance(kind.monitor, str) else next(iter(known))  # a property of the instance
     return monitor, next((name for name in (f"{monitor}_mean", monitor) if name in known), None)
 
 
-def written(value: float | int | str | None) -> str:
-    """A value of a table as text; nothing where it is unknown."""
+def written(value: float | int | str | Spread | None) -> str:
+    """A value of a table as text; empty where it is unknown."""
+    if isinstance(value, Spread):
+        return f"{written(value.mean)} ± {written(value.deviation)}"
     if isinstance(value, float):
         return f"{value:.3f}" if abs(value) < 10 else f"{value:,.1f}"
     if isinstance(value, int):
@@ -52,13 +70,61 @@ def written(value: float | int | str | None) -> str:
     return value or ""
 
 
+def columns_of(rows: Iterable[Mapping]) -> list[str]:
+    """The keys of all rows, in the order of their first appearance."""
+    return list(dict.fromkeys(column for row in rows for column in row))
+
+
+def write_csv(file: Path, rows: Sequence[Mapping], spread: Sequence[str] = ()) -> None:
+    """Writes a line for each row; a column is there if a row has it.
+
+    Args:
+        file: To be written.
+        rows: Cells by column. A ``Spread`` takes several columns: the mean, and behind it deviation and least value.
+        spread: Ends of the names of deviation and, if it is wanted, least value.
+    """
+    wide = {column for row in rows for column, value in row.items() if isinstance(value, Spread)}
+    ends = lambda column: ["", *spread] if column in wide else [""]
+    columns = [f"{column}{end}" for column in columns_of(rows) for end in ends(column)]
+    with atomic_write(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
+        writer = csv.DictWriter(opened, columns)
+        writer.writeheader()
+        for row in rows:
+            cells = {column: value if isinstance(value, Spread) else (value,) for column, value in row.items()}
+            parts = {f"{c}{end}": v for c, values in cells.items() for end, v in zip(ends(c), values, strict=False)}
+            writer.writerow(parts)
+
+
+def terminal(
+    title: str, heads: Mapping[str, bool], lines: Sequence[Sequence[str]], caption: str, styles: Sequence = ()
+) -> Table:
+    """A table for a terminal.
+
+    Args:
+        title: Above the table.
+        heads: Of the columns, and True for columns of numbers; these are not broken into lines.
+        lines: Cells in Rich's markup.
+        caption: Below the table.
+        styles: Of the lines; empty for plain ones.
+    """
+    table = Table(title=escape(title), caption=escape(caption), box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for head, is_number in heads.items():
+        justify = "right" if is_number else "left"
+        table.add_column(
+            stacked(head) if is_number else escape(head), justify=justify, no_wrap=is_number, overflow="fold"
+        )
+    for line, style in zip(lines, styles or [None] * len(lines), strict=True):
+        table.add_row(*line, style=style)
+    return table
+
+
 def tex(text: str) -> str:
-    """A text as LaTeX sets it."""
+    """A text with LaTeX's special characters escaped."""
     return text.translate(TEX)
 
 
 def markdown(lines: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown, of which the first line is the head."""
+    """A table in Markdown; the first line is the head."""
     head, *rows = lines
     ruled = [head, ["---"] * len(head), *rows]
     return "".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |\n" for line in ruled)
@@ -72,7 +138,7 @@ def latex(lines: Sequence[Sequence[str]]) -> str:
 
 
 def stacked(title: str) -> str:
-    """The head of a column, a word a line, so that the column is no wider than its numbers need."""
+    """The head of a narrow column, a word a line."""
     return escape(title.replace(" ", "\n"))
 
 
@@ -81,13 +147,13 @@ def metrics_table(metrics: Mapping) -> Group:
 
     Args:
         metrics: Contents of ``metrics.json``: ``task``, ``split``, ``device``, of a run ``seed``, and ``models`` with
-            the test scores of each. Where links were held out, ``validation`` has the same models' scores on those, of
-            which the first metric is shown too; where there are several receivers, ``receivers`` has ``models`` for
-            each of them.
+            the test scores of each. ``validation`` has scores on the validation links, if there are any; the first
+            metric is shown. ``receivers`` has ``models`` for each of several receivers.
     """
     known, models, validation = metrics_of(metrics), metrics["models"], metrics.get("validation") or {}
     has = lambda name: all(name in scores for scores in models.values())
-    names = [name for name, metric in known.items() if has(name) and (metric.is_brief or len(known) <= FITTING)]
+    # A terminal has room for five metrics; of more, only the brief ones are shown.
+    names = [name for name, metric in known.items() if has(name) and (metric.is_brief or len(known) <= 5)]
     # A split's name may end with a seed of its own.
     run = f"run with seed {metrics['seed']} on" if "seed" in metrics else "evaluated on"
     caption = escape(f"split {metrics['split']}\n{run} {metrics['device']}")
@@ -107,7 +173,7 @@ def metrics_table(metrics: Mapping) -> Group:
 
 
 def _receivers_table(receivers: Mapping, known: dict) -> Table:
-    """Receivers down, models across, and of the metrics the first."""
+    """Receivers down, models across: the first metric."""
     name, metric = next(iter(known.items()))
     table = Table("receiver", title=f"{escape(metric.title)} at each receiver")
     for model in next(iter(receivers.values())):
@@ -125,11 +191,10 @@ def _cells(models: Mapping, name: str, higher_is_better: bool) -> dict[str, str]
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence on where the run's own model stands against the baselines.
+    """A sentence that compares the run's own model, the first of ``models``, with the baselines by the first metric.
 
     Args:
-        metrics: As for ``metrics_table``; the first of ``models`` is the run's own, the first of the task's metrics
-            counts.
+        metrics: As for ``metrics_table``.
     """
     (model, own), *others = metrics["models"].items()
     name, metric = next(iter(metrics_of(metrics).items()))

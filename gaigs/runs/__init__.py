@@ -1,50 +1,49 @@
-"""One run, from its configuration to its folder."""
+"""One run: its folder, its training, its evaluation."""
 
 import json
 import logging
 from pathlib import Path
 
-import lightning
-from rich.console import Console
-
-from gaigs import evaluation
 from gaigs.data import load
 from gaigs.io.files import write_text
+from gaigs.model import call_optional
 from gaigs.processes import is_first, limited_threads, only_run
+from gaigs.radio_maps import has_radio_map, radio_map
 from gaigs.registry import registry
-from gaigs.report.runs import read_metrics
-from gaigs.report.table import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store
-from gaigs.runs.training import count_gaussians, fit
 
 log = logging.getLogger(__name__)
 
 
 def run(config: dict, folder: Path) -> dict | None:
-    """Trains, tests, and writes the run folder; goes on where an earlier run of the same configuration stopped there.
+    """Trains, tests, and writes the run folder; resumes a run of the same configuration that was stopped there.
 
     Args:
         config: The resolved configuration.
-        folder: Gets ``config.yaml``, ``best.ckpt``, ``last.ckpt``, ``log/``, ``predictions.npz``, what the model
-            exports and the task keeps, ``figures/`` and, last of all, ``metrics.json``. Where that is already, nothing
-            is done anew. One run holds it at a time.
+        folder: Gets ``config.yaml``, ``best.ckpt``, ``last.ckpt``, ``log/``, ``predictions.npz``, the model's exports,
+            ``radio_map.npz`` where a label is one real number, ``figures/`` and at last ``metrics.json``. A finished
+            run is not repeated. One run holds the folder at a time.
 
     Returns:
         The contents of ``metrics.json``; None in all but the first of several processes.
 
     Raises:
-        TypeError: A value of the configuration that is not of its key's type.
-        ValueError: A configuration that does not fit the data, another run's folder, or a damaged file in this one.
-        FileNotFoundError: Data that are not there.
-        OSError: A file cannot be written, e.g. as the disk is full; nothing half-written is left of it.
-        KeyboardInterrupt: Ctrl-C, or ``gaigs.processes.Stopped`` for it and SIGTERM.
+        TypeError: A value of the configuration has the wrong type.
+        ValueError: The configuration does not fit the data, the folder holds another run, or a file in it is damaged.
+        FileNotFoundError: The data do not exist.
+        OSError: A file cannot be written, e.g. because the disk is full; no partial file is left.
+        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it and SIGTERM within the training.
     """
     with limited_threads(config["threads"]):
         if not is_first():
-            logging.getLogger("gaigs").setLevel(logging.WARNING)  # one of them tells it all
+            logging.getLogger("gaigs").setLevel(logging.WARNING)  # the first process logs for all
             train_and_test(config, folder)
             return None
         metrics = _in_folder(config, folder)
+    from rich.console import Console
+
+    from gaigs.report.table import metrics_table, verdict
+
     console = Console()
     console.print(metrics_table(metrics))
     console.print(verdict(metrics))
@@ -53,30 +52,37 @@ def run(config: dict, folder: Path) -> dict | None:
 
 
 def _in_folder(config: dict, folder: Path) -> dict:
-    """The contents of ``metrics.json``, whether it is there already or not."""
+    """The contents of ``metrics.json``, of a finished run or of this one."""
     folder.mkdir(parents=True, exist_ok=True)
     with only_run(folder):
         claim(folder, config)
         finished = folder / "metrics.json"
         if finished.is_file():
+            from gaigs.report.runs import read_metrics
+
             log.info("finished already: %s", finished)
-            metrics = read_metrics(finished)
-        else:
-            metrics = train_and_test(config, folder)
-            if not is_configuration(folder / "config.yaml"):  # the folder was removed, and loggers have made it anew
-                store(config, folder)
-            write_text(finished, json.dumps(metrics, indent=2) + "\n")
+            return read_metrics(finished)
+        metrics = train_and_test(config, folder)
+        if not is_configuration(folder / "config.yaml"):  # the folder was removed, and loggers have made it again
+            store(config, folder)
+        write_text(finished, json.dumps(metrics, indent=2) + "\n")
     return metrics
 
 
 def train_and_test(config: dict, folder: Path) -> dict | None:
-    """All of a run but the terminal's tables.
+    """A run without its folder's claim and the terminal's tables.
 
     Returns:
-        What stands in ``metrics.json``; None for what the model does not have, and in all but the first process.
+        The contents of ``metrics.json``; None in all but the first process.
     """
+    import lightning
+
     lightning.seed_everything(config["seed"], verbose=False)
     links = load(config["data"], config["split"], config["task"]["name"])
+    # Slow to import: errors in data come first.
+    from gaigs.runs import evaluation
+    from gaigs.runs.training import count_gaussians, fit
+
     task, name = links.task, config["model"]["name"]
     counts = {part_name: len(part) for part_name, part in links.split.parts().items()}
     if unused := len(links) - sum(counts.values()):
@@ -87,14 +93,14 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     box = " x ".join(f"{edge:.2f}" for edge in scene.upper - scene.lower)
     log.info("data: training transmitters within %s m%s", box, links.remarks and f"; {links.remarks}")
     loss = registry("loss").build(config["loss"], task=task)
-    baselines = evaluation.baseline_configurations(config["baselines"], name, scene)
+    baselines = evaluation.build_baselines(config["baselines"], name, scene)
     fitted = fit(None, loss, links, config, folder)
     if fitted is None:
         return None
     model, is_trained = fitted.models[name], bool(fitted.unseen)
     scores = evaluation.score(fitted.models, baselines, links, folder)
-    look_ups = baselines if is_trained else {name: config["model"], **baselines}
-    validation = evaluation.validate(fitted.unseen, look_ups, links)
+    own = {} if is_trained else {name: registry("model").build(config["model"], scene=scene)}
+    validation = evaluation.validate(fitted.unseen, {**own, **baselines}, links)
     metrics = {
         "task": task.name,
         "data": links.remarks,
@@ -113,10 +119,13 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "validation": {name: task.summarise(values) for name, values in validation.items()},
         "validation_score": validation[name][task.monitor].mean().item() if validation else None,
         "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
-    } | model.facts()
+    } | (call_optional(model, "facts") or {})
     if config["kriging"]:
         metrics["kriging"]["seconds"] = fitted.kriging_seconds
-    model.export(folder)
-    task.keep(folder, model)
-    evaluation.write_figures(folder, links, model.primitives, model.learnt_room(links))
+    call_optional(model, "export", folder)
+    if has_radio_map(task):
+        radio_map(model).save(folder / "radio_map.npz")
+    from gaigs.report.run_figures import write_figures  # matplotlib is slow to import
+
+    write_figures(folder, links, model)
     return metrics

@@ -1,4 +1,4 @@
-"""The run folder: who may use it, and what a training there goes on from."""
+"""The run folder: its claim by one configuration, and the checks before a training is resumed there."""
 
 import hashlib
 import json
@@ -11,62 +11,48 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from gaigs.configuration import differences
-from gaigs.data import Links, are_alike
+from gaigs.data import Links
+from gaigs.data.matching import are_alike
 from gaigs.io.files import atomic_write, write_text
 from gaigs.registry import digests
 from gaigs.version import __version__
 
-SOFTWARE = "software.json"
-"""What computed a run: see ``software``."""
-
-WRITTEN = ("config.yaml", SOFTWARE, "best.ckpt", "log", "predictions.npz", "gaussians.ply", "radio_map.npz", "figures")
-"""What a run writes into its folder before there is anything to go on from."""
-
 
 def claim(folder: Path, config: dict) -> None:
-    """Writes the configuration into a run folder, unless a run has left something there to go on from.
+    """Writes the configuration into a run folder, unless a run can be resumed there.
 
     Raises:
-        ValueError: It has, and it was a run of another configuration or of other software; or files of that name are
-            not a run's.
+        ValueError: The folder holds a run of another configuration or software, or files of something else.
     """
     file = folder / "config.yaml"
-    there = [name for name in (*WRITTEN, "last.ckpt", "metrics.json") if (folder / name).exists()]
+    names = ("config.yaml", "software.json", "best.ckpt", "log", "predictions.npz", "gaussians.ply", "radio_map.npz")
+    there = [name for name in (*names, "figures", "last.ckpt", "metrics.json") if (folder / name).exists()]
     if there and not is_configuration(file):
-        raise ValueError(
-            f"{folder} must be free or hold a run, and it holds {', '.join(there)} of something else; choose another "
-            "folder (hydra.run.dir=DIR)"
-        )
+        raise ValueError(f"{folder} holds {', '.join(there)} of something else\nchoose another hydra.run.dir")
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         store(config, folder)
         return
     check_software(folder, config)
     try:
         there = OmegaConf.to_container(OmegaConf.load(file))
-    except Exception as error:  # whatever a file meets that is YAML, but no configuration
-        raise ValueError(
-            f"{file} must be what a run wrote, and is damaged ({' '.join(str(error).split())}); take another copy of "
-            "it, or choose another folder (hydra.run.dir=DIR)"
-        ) from error
+    except Exception as error:  # any error of YAML or OmegaConf
+        raise ValueError(f"cannot parse {file}: {' '.join(str(error).split())}") from error
     differing = differences(there, config)
     if differing:
-        told = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
-        listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in told)
-        raise ValueError(
-            f"{folder} must be free or hold a run of the same configuration, but {listed}; choose another folder "
-            "(hydra.run.dir=DIR)"
-        )
+        keys = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
+        listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in keys)
+        raise ValueError(f"{folder} holds a run of another configuration: {listed}\nchoose another hydra.run.dir")
 
 
 def store(config: dict, folder: Path) -> None:
-    """Writes the configuration of a run into its folder, and what computes it."""
+    """Writes the configuration and the software of a run into its folder."""
     with atomic_write(folder / "config.yaml") as part:
         OmegaConf.save(OmegaConf.create(config), part)
-    write_text(folder / SOFTWARE, json.dumps(software(config), indent=2) + "\n")
+    write_text(folder / "software.json", json.dumps(software(config), indent=2) + "\n")
 
 
 def software(config: dict) -> dict[str, str]:
-    """What computes a run beside its configuration: the version of gaigs, digests of the sources of plug-ins."""
+    """The version of gaigs, and the digests of the plug-ins that a configuration uses."""
     return {"gaigs": __version__} | digests({*_names(config)})
 
 
@@ -79,14 +65,13 @@ def _names(part: object) -> Iterator[str]:
 
 
 def check_software(folder: Path, config: dict) -> None:
-    """Sees to it that a run goes on with the software that it began with, so that its numbers are of one make.
+    """Checks that a run is resumed by the software that began it; patch versions change no number.
 
     Raises:
-        ValueError: It was begun by another version, or the source of a plug-in has changed; patch versions change no
-            number.
+        ValueError: Another version began the run, or the source of a plug-in has changed.
     """
     try:
-        there = json.loads((folder / SOFTWARE).read_text(encoding="utf-8"))
+        there = json.loads((folder / "software.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         there = {}
     here = software(config)
@@ -94,19 +79,17 @@ def check_software(folder: Path, config: dict) -> None:
     began = str(there.get("gaigs", "0.1 or earlier"))
     if series(began) != series(here["gaigs"]):
         raise ValueError(
-            f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}, whose runs are others; choose another "
-            "folder (hydra.run.dir=DIR)"
+            f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}\nchoose another hydra.run.dir"
         )
     changed = sorted(key for key in here.keys() | there.keys() if key != "gaigs" and here.get(key) != there.get(key))
     if changed:
         raise ValueError(
-            f"{folder} must be of the same plug-ins, and the source of {', '.join(changed)} has changed since it was "
-            "begun; choose another folder (hydra.run.dir=DIR)"
+            f"the source of {', '.join(changed)} has changed since {folder} was begun\nchoose another hydra.run.dir"
         )
 
 
 def is_configuration(file: Path) -> bool:
-    """Whether a file is the configuration of a run."""
+    """True if a file is the configuration of a run."""
     try:
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
@@ -115,23 +98,23 @@ def is_configuration(file: Path) -> bool:
 
 
 def check_same_links(there: dict, here: dict, path: Path) -> None:
-    """Sees to it that a training goes on with the links it began with, so that none of the test has been trained on.
+    """Checks that a training is resumed with its own links, so that no test link has been trained on.
 
     Raises:
-        ValueError: The split or the links are others.
+        ValueError: The split or the links have changed.
     """
     parts = ("train", "validation", "test")
     same = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
     same = same and are_alike(there.get("scene"), here.get("scene"))
     if not same or there["links"] != here["links"]:
         raise ValueError(
-            f"{path} must be of these very data to go on, but they have another split, or other transmitters, "
-            "receivers, frequencies or labels now; choose another folder (hydra.run.dir=DIR)"
+            f"the data have changed since {path} was written: another split, or other transmitters, receivers, "
+            "frequencies or labels\nchoose another hydra.run.dir"
         )
 
 
 def fingerprint(links: Links) -> str:
-    """A digest of queries and receivers, and of labels that are in memory; images would have to be decoded for it."""
+    """A digest of queries, receivers, and labels in memory; labels in files would have to be decoded."""
     parts = [links.query.transmitters, links.query.receivers]
     for receiver in links.receivers:
         parts += [receiver.pose.position, receiver.pose.rotation, receiver.array.elements]

@@ -1,10 +1,11 @@
-"""Training of a model on links: fitted, descended, kriged."""
+"""Training of a model on links: fit, gradient descent, kriging."""
 
 import contextlib
 import logging
 import signal
 import tempfile
 import threading
+import time
 import warnings
 from pathlib import Path
 from typing import NamedTuple
@@ -12,61 +13,54 @@ from typing import NamedTuple
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from lightning.pytorch.utilities.seed import isolate_rng
 from torch import distributed
 
-from gaigs import checkpoint, evaluation
+from gaigs import checkpoint
 from gaigs.configuration import composed, preset
-from gaigs.data import Links, check_fit
+from gaigs.data import Links
+from gaigs.data.matching import check_fit
 from gaigs.loss import Loss
 from gaigs.model import Model
+from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
 from gaigs.registry import call, configuration_of, registry
+from gaigs.runs.evaluation import device_of, is_trained
 from gaigs.runs.folder import check_same_links, claim, fingerprint
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS, make_budget
-from gaigs.training.callbacks import DensityControl, Interrupted, KeepBest, KeepLast, ProgressLine
-from gaigs.training.kriging import check_kriging, krige
+from gaigs.training.checkpoints import Interrupted, KeepBest, KeepLast
+from gaigs.training.density_control import DensityControl
+from gaigs.training.progress import ProgressLine
 from gaigs.training.revision import Revision
 
 log = logging.getLogger(__name__)
 
-RESUMED = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "epoch", "global_step", "split", "links")
-"""What a training goes on from, beside the weights: the most in the words of Lightning."""
-
-
-LIMITS = {
-    "limit_train_batches": "trainer.max_steps ends a training",
-    "limit_val_batches": "all validation links decide on the best step",
-}
-"""Options of Lightning that would leave batches out, and why none may be."""
-
 
 def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Path | None = None, **options) -> Model:
-    """A model trained on links as the command line would train it, by the preset of the model and the links' task.
+    """Trains a model on links as the command line does, by the preset of the model and the links' task.
 
     Args:
-        model: Name of any registered model; or one that is made already, which is trained where it stands.
-        links: What to learn from; validation links choose the best step. Test links are not looked at.
-        overrides: Words of the command line, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
-        folder: Gets the configuration, the log and the checkpoints; the same call goes on there where an earlier one
-            was stopped. None leaves no files.
-        options: Values by their keys or names, as ``gaigs.compose`` takes them: ``max_steps=300, seed=0``.
+        model: Name of a registered model, or a model, which is trained in place.
+        links: Links to learn from; validation links choose the best step. Test links are not used.
+        overrides: Command-line words, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
+        folder: Gets the configuration, the log and the checkpoints; the same call resumes a stopped training there.
+            None: no files.
+        options: Values by their keys or names, as in ``gaigs.compose``: ``max_steps=300, seed=0``.
 
     Returns:
-        The model with the best validation score, in evaluation mode; of ``mirrored`` with kriging on top.
+        The model with the best validation score, in evaluation mode; with ``mirrored`` a kriged model.
 
     Raises:
-        TypeError: An option is of another type than it must be.
-        ValueError: A name is unknown, an option out of range, or model and links do not fit.
+        TypeError: An option has the wrong type.
+        ValueError: A name is unknown, an option is out of range, or model and links do not fit.
         KeyboardInterrupt: Ctrl-C.
 
     Example:
         >>> links = gaigs.links("synthetic", transmitters=40, order=0)
-        >>> model = gaigs.train("gaigs", links, max_steps=2, count=20, enable_progress_bar=False)
+        >>> model = gaigs.train("gaigs", links, max_steps=1, count=20, enable_progress_bar=False)
         >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape
         torch.Size([2, 90, 360])
     """
@@ -76,15 +70,15 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
     check_fit(links, own and own.scene)
     name = model if own is None else configuration_of(own)["name"]
     if experiments := [word for word in overrides if word.startswith("+experiment=")]:
-        raise ValueError(f"{experiments[0]} must be left out: train takes that of the model and the task by itself")
+        raise ValueError(f"leave out {experiments[0]}: train takes the experiment of the model and the task")
     words, parts = preset(name, links.task.name), {k: v for k, v in options.items() if hasattr(v, "configuration")}
     config = composed([*words, *overrides], options)
     if overrides or options:
         usual = composed(words, {})
         if config["data"] != usual["data"] or config["split"] != usual["split"]:
-            raise ValueError("data and split are the links' own; give their options to gaigs.links")
+            raise ValueError("train takes no options of data and split; pass them to gaigs.links")
         if own is not None and (config["model"] != usual["model"] or parts.keys() - {"loss"}):
-            raise ValueError("the model is made already; give the options of its parts where it is made")
+            raise ValueError("train takes no options of a model that is made already; pass them to its constructor")
     config |= {"data": {"name": "arrays"}, "split": {"name": links.split.name}, **links.origin}
     if own is not None:
         config["model"] = configuration_of(own)
@@ -103,14 +97,14 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
 
 
 class Fitted(NamedTuple):
-    """What ``fit`` gives.
+    """Result of ``fit``.
 
     Attributes:
-        models: By name: the model, and where it was kriged behind it the trained one alone, ``<name>_trend``.
-        unseen: The same without what validation links alone told; empty of a look-up.
-        start: Gaussians before the training.
-        seconds: Of training; None of a look-up.
-        kriging_seconds: None without kriging.
+        models: The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
+        unseen: The same, not fitted to validation links; empty for a model without a training.
+        start: Number of Gaussians before the training.
+        seconds: Duration of the training; None without one.
+        kriging_seconds: Duration of kriging; None without it.
     """
 
     models: dict[str, Model]
@@ -121,7 +115,7 @@ class Fitted(NamedTuple):
 
 
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
-    """Builds a model unless it is there already, fits it to links, and trains and kriges it where that is asked for.
+    """Builds a model unless one is given, fits it to links, trains it, and kriges its residuals if configured.
 
     Returns:
         None in all but the first of several processes.
@@ -129,30 +123,33 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     name = config["model"]["name"]
     if model is None:
         model = registry("model").build(config["model"], scene=links.scene)
-    check_kriging(config, model, links)
+    if isinstance(model, Kriging):
+        raise ValueError("model=kriging has no training of its own; choose a trained model, and set kriging=true")
+    kriged = Kriging(links.scene, model, config["kriging_fallback"]) if config["kriging"] else None
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
     model.fit(links)
     start = count_gaussians(model)
-    if not evaluation.is_trained(model):
+    if not is_trained(model):
         return Fitted({name: model}, {}, start)
     model, seconds = descend(model, loss, links, config, folder)
-    if not config["kriging"]:
-        return Fitted({name: model}, {name: model}, start, seconds) if is_first() else None
-    descend_fold = lambda model, part, folder: descend(model, loss, part, config, folder)
-    kriged = krige(model, links, config, folder, descend_fold)
-    if kriged is None:
+    if not is_first():
         return None
-    models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged.model, kriged.blind))
-    return Fitted(models, unseen, start, seconds, kriged.seconds)
+    if kriged is None:
+        return Fitted({name: model}, {name: model}, start, seconds)
+    began = time.monotonic()
+    validation_model = kriged.to(device_of(model)).fit(links)
+    checkpoint.exchange_model(folder / "best.ckpt", kriged, trained="trend")
+    models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged, validation_model))
+    return Fitted(models, unseen, start, seconds, time.monotonic() - began)
 
 
 def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Model, float]:
-    """Trains the model by gradients.
+    """Trains a model by gradient descent.
 
     Returns:
-        The model at the step with the best validation score, or at the last step where nothing is held out for
-        validation; and the seconds it took, over all parts of a run that was interrupted.
+        The model at the step with the best validation score, or at the last step without validation links; and the
+        duration [s], summed over the parts of an interrupted run.
 
     Raises:
         Stopped: Ctrl-C or SIGTERM; ``last.ckpt`` is written.
@@ -163,11 +160,9 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
     context = {"model": model, "loss": loss, "identity": identity, "seed": config["seed"]}
     module = registry("training").build(config["training"], **context)
     last, best = folder / "last.ckpt", folder / "best.ckpt"
-    timer, keep_last = Timer(), KeepLast(last, config["save_every"])
-    options, budget = make_budget(config["trainer"], timer)
-    callbacks = [timer, KeepBest(best, module.patience), keep_last]  # Lightning puts the last two behind all others
-    if budget is not None:
-        callbacks.insert(1, budget)
+    keep_last = KeepLast(last, config["save_every"])
+    options, budget = make_budget(config["trainer"])
+    callbacks = [budget, KeepBest(best, module.patience), keep_last]  # Lightning calls the last two after all others
     if module.density is not None:
         callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))
     if model.revisions:
@@ -178,7 +173,7 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
     if config["tensorboard"]:
         loggers.append(tensorboard_logger(folder))
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
-    for name in ("lightning.pytorch", "lightning.fabric"):  # which tell of devices that are there and not taken
+    for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
         logging.getLogger(name).setLevel(logging.WARNING)
     trainer = call("trainer", lightning.Trainer, options, **context)
     check_trainer(trainer)
@@ -191,19 +186,19 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
         content = resumable(last, best)
         check_same_links(content[checkpoint.KEY], identity, last)
         log.info("going on after step %d", content["global_step"])
-    # Before weights come from a checkpoint: Lightning converts behind that, which would round them.
+    # Lightning converts after it has loaded a checkpoint, which would round the weights: so convert first.
     module = trainer.precision_plugin.convert_module(module)
     handlers = {number: signal.getsignal(number) for number in STOPPING}
     module.train()  # a model that has been trained or loaded is in evaluation mode
     try:
         with warnings.catch_warnings():
-            # Of Lightning's own dealings with torch, of a split without validation links, and of few steps.
+            # Warnings about Lightning's use of torch, splits without validation links, and few steps.
             for message in (".*LeafSpec", "You defined a `validation_step` but", "The number of training batches"):
                 warnings.filterwarnings("ignore", message)
             trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     except Interrupted as stop:
         raise Stopped(str(stop), stop.number) from None
-    except SystemExit as end:  # Lightning's for a signal that came before its handler was ours
+    except SystemExit as end:  # raised by Lightning at a signal before the first step
         if isinstance(end.__context__, KeyboardInterrupt):
             raise Stopped("stopped", getattr(end.__context__, "number", signal.SIGINT)) from None
         raise
@@ -213,48 +208,53 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
                 signal.signal(number, handler)
         if distributed.is_available() and distributed.is_initialized():
             distributed.destroy_process_group()
-    if keep_last.received is not None:  # behind the last step
+    if keep_last.received is not None:  # after the last step
         raise Stopped(f"stopped after step {trainer.global_step}", keep_last.received)
-    seconds, steps, size = timer.time_elapsed("train"), trainer.global_step, module.batch_size
+    seconds, steps, size = budget.seconds, trainer.global_step, module.batch_size
     log.info("trained %d steps of %d places in %.0f s: %.1f steps/s", steps, size, seconds, steps / seconds)
     module.load_state_dict(checkpoint.trained_weights(checkpoint.read(best)))
     return model.eval().to(trainer.strategy.root_device), seconds
 
 
 def resumable(last: Path, best: Path) -> dict:
-    """The checkpoint to go on from, where it and the best one so far are whole; changes neither.
+    """The checkpoint to resume from; it and the best one are checked.
 
     Raises:
-        ValueError: One of them is not.
+        ValueError: One of them is damaged or incomplete.
     """
+    needed = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "epoch", "global_step", "split", "links")
     try:
         content = checkpoint.read(last)
-        if lacking := [key for key in RESUMED if key not in content | content[checkpoint.KEY]]:
-            raise ValueError(f"{last} must hold the state of a training, and lacks {', '.join(lacking)}")
+        if lacking := [key for key in needed if key not in content | content[checkpoint.KEY]]:
+            raise ValueError(f"{last} lacks {', '.join(lacking)} of a training")
         if best.is_file():
             checkpoint.read(best)
     except ValueError as error:
         raise ValueError(
-            f"the training cannot go on: {error}; move {last} elsewhere to train anew in this folder, which overwrites "
-            "best.ckpt, or choose another folder (hydra.run.dir=DIR)"
+            f"cannot resume the training: {str(error).partition(chr(10))[0]}\n"
+            f"move {last} elsewhere to train again, which overwrites best.ckpt, or choose another hydra.run.dir"
         ) from error
     return content
 
 
 def check_trainer(trainer: lightning.Trainer) -> None:
-    """Sees to it that a training can stop anywhere and go on there, in one process or several.
+    """Checks that a training can be stopped and resumed at any step, in one process or several.
 
     Raises:
         ValueError: The trainer's options do not allow it.
     """
     if trainer.accumulate_grad_batches > 1:
         raise ValueError("trainer.accumulate_grad_batches must be 1; set training.batch_size instead")
-    for name in ("fast_dev_run", "overfit_batches"):  # which set the others
+    for name in ("fast_dev_run", "overfit_batches"):  # they set the limits below
         if getattr(trainer, name):
             raise ValueError(f"trainer.{name} must be left out; set trainer.max_steps to end a training early")
-    for name, reason in LIMITS.items():
-        share = getattr(trainer, name)
-        if isinstance(share, int) or share != 1:  # 1 is one batch, 1.0 all of them
+    limits = {
+        "limit_train_batches": "trainer.max_steps ends a training",
+        "limit_val_batches": "all validation links decide on the best step",
+    }
+    for name, reason in limits.items():
+        limit = getattr(trainer, name)
+        if isinstance(limit, int) or limit != 1:  # 1 is one batch, 1.0 all of them
             raise ValueError(f"trainer.{name} must be left out, as {reason}")
     strategy, launcher = trainer.strategy, trainer.strategy.launcher
     starts_scripts = launcher is None or "Subprocess" in type(launcher).__name__
@@ -263,24 +263,24 @@ def check_trainer(trainer: lightning.Trainer) -> None:
             f"trainer.strategy must be auto for one process or ddp for several, got {type(strategy).__name__}"
         )
     is_sweep = HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
-    # Others would have the processes of one job come to the next at different times.
+    # With other launchers the processes of one job would start the next job at different times.
     if is_sweep and launcher is not None and not HydraConfig.get().launcher["_target_"].endswith("SlurmLauncher"):
         raise ValueError(
-            "a job of a multirun must train in one process; run it alone, or take hydra/launcher=submitit_slurm, which "
-            "starts the processes of each job"
+            "a job of a multirun must train in one process\n"
+            "run it alone, or use hydra/launcher=submitit_slurm, which starts the processes of each job"
         )
 
 
 def count_gaussians(model: Model) -> int:
-    """How many Gaussians a model has; 0 for one of another kind."""
+    """The number of Gaussians of a model; 0 for another kind of model."""
     return 0 if model.primitives is None else len(model.primitives)
 
 
 def tensorboard_logger(folder: Path) -> Logger:
-    """The logger for TensorBoard, an extra.
+    """The logger for TensorBoard.
 
     Raises:
-        ImportError: It is not installed.
+        ImportError: TensorBoard is not installed.
     """
     from lightning.pytorch.loggers import TensorBoardLogger
 

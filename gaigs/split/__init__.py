@@ -1,8 +1,8 @@
-"""Splits say which links train, validate and test. docs/data.md says what each of them measures.
+"""Splits of links into training, validation and test; docs/data.md describes the purpose of each.
 
-A component of kind ``split`` is a function of the links and its own options. Validation links are taken out of the
-training links in the way that the test links were taken out of all links, so that they predict the test error. Links of
-one row are never parted but by the official parts: they have their place in common, and so mostly what shadows it.
+A component of kind ``split`` is a function of the links and its own options. Validation links are taken from the
+training links as the test links are taken from all links, so that they predict the test error. Only the official parts
+may separate links of one row: these share a place, and so mostly its shadows.
 """
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 from gaigs.data import Links, Split
 
 
-def rows_of(links: Links) -> Int[Tensor, "n"]:
+def rows_of(links: Links) -> Int[Tensor, " n"]:
     """Row of each link in the order of measurement."""
     return torch.arange(len(links)) if links.rows is None else links.rows
 
@@ -20,20 +20,20 @@ def rows_of(links: Links) -> Int[Tensor, "n"]:
 def part(
     name: str,
     links: Links,
-    groups: Int[Tensor, "n"],
+    groups: Int[Tensor, " n"],
     test: float,
     validation: float,
     seed: int,
 ) -> Split:
-    """Holds out whole groups of links, for the test and of the rest for validation.
+    """Holds out whole groups of links, first for the test and then for validation.
 
     Args:
-        name: Of the protocol, with its own options.
-        links: All of them.
-        groups: Number of each link's group, which is never parted.
+        name: Name of the protocol, with its own options.
+        links: All links.
+        groups: Number of each link's group, which stays whole.
         test: Fraction of the links to test on.
         validation: Fraction of the training links to validate on; 0 for none.
-        seed: Of everything drawn at random.
+        seed: Seed of all random numbers.
 
     Raises:
         ValueError: An option is out of range, or there are too few groups.
@@ -47,16 +47,16 @@ def part(
 
 
 def hold_out(
-    name: str, links: Int[Tensor, "k"], groups: Int[Tensor, "n"], fraction: float, generator: torch.Generator
-) -> tuple[Int[Tensor, "kept"], Int[Tensor, "held"]]:
-    """Parts links into those kept and those held out: random whole groups, as near to the fraction as they come.
+    name: str, links: Int[Tensor, " k"], groups: Int[Tensor, " n"], fraction: float, generator: torch.Generator
+) -> tuple[Int[Tensor, " kept"], Int[Tensor, " held"]]:
+    """Holds out random whole groups, as near to a fraction of the links as possible.
 
     Args:
-        name: Of the option that says how many, as errors call it.
-        links: Numbers of the links to part, ascending.
-        groups: Number of the group of every link there is.
-        fraction: Of ``links`` to hold out; 0 for none.
-        generator: Draws the groups.
+        name: Name of the option with the fraction, for errors.
+        links: Numbers of the links to divide, ascending.
+        groups: Number of the group of every link of the data.
+        fraction: Fraction of ``links`` to hold out; 0 for none.
+        generator: Generator that draws the groups.
 
     Raises:
         ValueError: There are fewer than two groups.
@@ -77,66 +77,26 @@ def hold_out(
     return links[~held], links[held]
 
 
-def folds(links: Links, count: int, seed: int) -> list[Split]:
-    """Parts the training links into folds of random whole rows; each split tests on one of them.
-
-    Args:
-        links: With a split, whose validation links all splits keep.
-        count: Of folds.
-        seed: Of the order.
-
-    Raises:
-        ValueError: There are fewer rows than folds.
-    """
-    split = links.split
-    present, row = torch.unique(rows_of(links)[split.train], return_inverse=True)
-    if len(present) < count:
-        raise ValueError(f"kriging_folds must be at most {len(present)}, the rows of training links, got {count}")
-    fold = (torch.randperm(len(present), generator=torch.Generator().manual_seed(seed)) % count)[row]
-    return [
-        Split(
-            f"{split.name}, fold {i + 1} of {count}", split.train[fold != i], split.validation, split.train[fold == i]
-        )
-        for i in range(count)
-    ]
-
-
 def generator_of(seed: int) -> torch.Generator:
-    """What draws at random.
-
-    Raises:
-        ValueError: torch has no such seed.
-    """
+    """The random numbers of a seed; a ``ValueError`` for a seed that torch does not take."""
     check("seed", seed, 0 <= seed < 2**63, "a whole number from 0 to 2**63 - 1")
     return torch.Generator().manual_seed(seed)
 
 
-def runs_of(links: Links, length: int) -> Int[Tensor, "n"]:
-    """Number of the run of rows that each link is in.
-
-    Raises:
-        ValueError: A run has no row.
-    """
+def runs_of(links: Links, length: int) -> Int[Tensor, " n"]:
+    """Number of each link's run of ``length`` rows; a ``ValueError`` for a run without rows."""
     check("length", length, length >= 1, "a whole number of rows, at least 1")
     rows = rows_of(links)
     return rows // min(length, int(rows.max()) + 1)  # a longer run holds all rows too, and may be beyond int64
 
 
 def check_fractions(test: float, validation: float) -> None:
-    """Sees to it that both are in range.
-
-    Raises:
-        ValueError: One is not.
-    """
+    """Raises a ``ValueError`` for fractions out of range."""
     check("test", test, 0 < test < 1, "in (0, 1)")
     check("validation", validation, 0 <= validation < 1, "in [0, 1)")
 
 
 def check(name: str, value: float, holds: bool, bounds: str) -> None:
-    """Sees to it that an option is within its bounds.
-
-    Raises:
-        ValueError: It is not.
-    """
+    """Raises a ``ValueError`` for an option that is not within its bounds."""
     if not holds:
         raise ValueError(f"split.{name} must be {bounds}, got {value}")

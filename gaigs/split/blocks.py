@@ -6,25 +6,22 @@ from gaigs.data import Links, Split
 from gaigs.registry import register
 from gaigs.split import check, part
 
-EDGES = 1e-6, 1e6
-"""From the first to the second lies a cube's edge [m]: float32 tells no places apart below, and no data reach above."""
-
 
 @register("split", "blocks")
 def blocks(links: Links, edge: float, test: float = 0.2, validation: float = 0.1, seed: int = 0) -> Split:
     """Random cubes test: places where nothing was measured.
 
     Args:
-        links: All of them.
-        edge: Of a cube [m]; cubes are counted from the lower corner of all transmitters.
+        links: All links.
+        edge: Edge of a cube [m]; cubes are counted from the lower corner of all transmitters.
         test: Fraction of the links to test on.
         validation: Fraction of the training links to validate on; 0 for none.
-        seed: Of everything drawn at random.
+        seed: Seed of all random numbers.
 
     Raises:
         ValueError: An option is out of range, or there are too few cubes.
     """
-    low, high = EDGES
+    low, high = 1e-6, 1e6  # float32 resolves nothing smaller, and no data are larger
     check("edge", edge, low <= edge <= high, f"from {low:g} to {high:g} m")
     places = links.query.transmitters.double()
     cubes = ((places - places.amin(0)) / edge).floor().long()

@@ -10,10 +10,10 @@ def random(links: Links, test: float = 0.2, validation: float = 0.1, seed: int =
     """Random rows test: interpolation, as on dense trajectories a neighbour is always near.
 
     Args:
-        links: All of them.
+        links: All links.
         test: Fraction of the links to test on.
         validation: Fraction of the training links to validate on; 0 for none.
-        seed: Of everything drawn at random.
+        seed: Seed of all random numbers.
 
     Raises:
         ValueError: An option is out of range, or there are too few rows.

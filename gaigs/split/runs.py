@@ -10,11 +10,11 @@ def runs(links: Links, length: int, test: float = 0.2, validation: float = 0.1, 
     """Random runs test: a trajectory with gaps.
 
     Args:
-        links: All of them; their rows are in the order of measurement.
+        links: All links; their rows are in the order of measurement.
         length: Rows in a run.
         test: Fraction of the links to test on.
         validation: Fraction of the training links to validate on; 0 for none.
-        seed: Of everything drawn at random.
+        seed: Seed of all random numbers.
 
     Raises:
         ValueError: An option is out of range, or there are too few runs.

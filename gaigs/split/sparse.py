@@ -9,14 +9,14 @@ from gaigs.split import check, check_fractions, generator_of, hold_out, rows_of
 
 @register("split", "sparse")
 def sparse(links: Links, train: int, test: float = 0.2, validation: float = 0.1, seed: int = 0) -> Split:
-    """The test rows are those of ``random``; of the others so many train and validate, and fewer are part of more.
+    """Few random rows train and validate, a smaller number being a subset of a larger; test rows are as for ``random``.
 
     Args:
-        links: All of them.
+        links: All links.
         train: Rows to train and validate on.
         test: Fraction of the links to test on.
         validation: Fraction of the training links to validate on; 0 for none.
-        seed: Of everything drawn at random.
+        seed: Seed of all random numbers.
 
     Raises:
         ValueError: An option is out of range, or there are too few rows.

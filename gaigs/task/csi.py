@@ -1,22 +1,16 @@
 """Channel state information: a complex channel at each element of the receiver's array and each subcarrier."""
 
 import math
-from collections.abc import Mapping
-from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
 from gaigs.registry import register
-from gaigs.task import Metric, Task, check_values, need_samples, stored_scores
+from gaigs.task import Metric, Task, check_values, need_samples
 
 HIGHEST = 140.0
-"""No SNR is told beyond this [dB]: complex64 resolves nothing finer, and a perfect prediction has no finite one."""
-
-EXAMPLES = {"10th percentile": 0.1, "median": 0.5, "90th percentile": 0.9}
-"""Which channels are shown, by their rank in SNR."""
+"""Highest reported SNR [dB]: the resolution of complex64; a perfect prediction has no finite SNR."""
 
 
 @register("task", "csi")
@@ -25,14 +19,13 @@ class Csi(Task):
 
     Scores of a link, with error e = h - h' over its elements and subcarriers:
 
-    - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is that after the global phase of the prediction that suits
-      the label best, as where receiver and transmitter share no clock.
-    - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²): near the SNR where that is high, 3 dB for a prediction of 0, and at
-      least 0. Links in deep shadow may have an SNR of -50 dB, of which a few decide a mean; so the mean SINAD is
-      monitor.
+    - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is the SNR after the best global phase of the prediction,
+      for a receiver and a transmitter without a common clock.
+    - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²): near a high SNR, 3 dB for a prediction of 0, and at least 0. The
+      mean SINAD is monitored, since a few links in deep shadow, with an SNR of -50 dB, would dominate a mean SNR.
 
-    And of all links together NMSE [dB], 10 log10(sum |e|² / sum |h|²): the error of a link budget, in which loud links
-    count most.
+    All links together have an NMSE [dB], 10 log10(sum |e|² / sum |h|²): the error of a link budget, in which strong
+    links count most.
 
     Args:
         elements: Of the receivers' arrays; 1 for single antennas.
@@ -50,7 +43,7 @@ class Csi(Task):
     dtype = torch.complex64
     normalisation = "linear amplitude, in the data's own unit"
 
-    def __init__(self, elements: int, frequencies: Float[Tensor, "s"]):
+    def __init__(self, elements: int, frequencies: Float[Tensor, " s"]):
         if elements < 1:
             raise ValueError(f"a channel needs at least one element, got {elements}")
         if not len(frequencies) or not ((frequencies > 0) & frequencies.isfinite()).all():
@@ -116,48 +109,19 @@ class Csi(Task):
         return dict(zip(self.metrics(), [*numbers[:4], *between, *numbers[4:]], strict=True))
 
     def logged(self, means: dict[str, float]) -> dict[str, float]:
-        """NMSE in place of the powers."""
+        """The mean scores, with the NMSE in place of the powers."""
         error, power = (torch.tensor(means[name], dtype=torch.float64) for name in ("error_power", "label_power"))
         kept = {name: mean for name, mean in means.items() if not name.endswith("_power")}
         return kept | {"nmse_db": decibels(error, power).item()}
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Half of the difference's power is left: 3 dB more."""
+        """Half of the error's power: 3 dB more."""
         error, power = scores["error_power"] / 2, scores["label_power"]
         snr = {name: scores[name] + 10 * math.log10(2) for name in ("snr_db", "snr_aligned_db")}
         snr = {name: score.clamp(max=HIGHEST) for name, score in snr.items()}
         return snr | {"sinad_db": -decibels(error, power + error), "error_power": error, "label_power": power}
 
-    def figures(self, folder: Path, links) -> dict:
-        """Magnitude, phase and impulse response of the 10th, 50th and 90th percentile, how SNR is distributed, and the
-        links' errors by their power."""
-        from gaigs.report.channels import error_against_power, impulse_responses, magnitudes_and_phases
-        from gaigs.report.curves import cdf  # matplotlib is slow to import
-
-        with np.load(folder / "predictions.npz") as run:
-            stored = lambda kind: {key.removeprefix(kind): run[key] for key in run.files if key.startswith(kind)}
-            scores, errors, powers = (stored(kind) for kind in ("snr_db_", "error_power_", "label_power_"))
-            labels, predictions = run["labels"], run["prediction"]
-        name, own = next(iter(scores.items()))
-        order = np.argsort(own)
-        names = {order[round(rank * (len(own) - 1))]: name for name, rank in EXAMPLES.items()}
-        shown = list(names)
-        examples = labels[shown], predictions[shown], own[shown], list(names.values()), self.frequencies.numpy()
-        figures = {"channels": magnitudes_and_phases(*examples)}
-        if len(self.frequencies) > 1:
-            figures["impulse_response"] = impulse_responses(*examples)
-        split = links.split.name
-        figures["error_power"] = error_against_power(powers[name], errors, split)
-        return figures | {"snr_cdf": cdf(scores, "SNR [dB]", "channels", split, (None, None))}
-
-    @classmethod
-    def compared(cls, files: Mapping[str, Path], split: str) -> dict:
-        """How SNR is distributed."""
-        from gaigs.report.curves import cdf  # matplotlib is slow to import
-
-        return {"cdf": cdf(stored_scores(files, "snr_db"), "SNR [dB]", "channels", split, (None, None))}
-
 
 def decibels(error: Float[Tensor, "*k"], power: Float[Tensor, "*k"]) -> Float[Tensor, "*k"]:
-    """Of an error's power over a label's; at least -``HIGHEST``."""
+    """An error's power over a label's [dB]; at least -``HIGHEST``."""
     return 10 * (error / power).clamp(min=10 ** (-HIGHEST / 10)).log10()

@@ -1,16 +1,13 @@
-"""What tasks share whose label is one real number a link."""
+"""The base of tasks whose label is one real number a link."""
 
 import math
-from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.report.style import with_unit
-from gaigs.task import Metric, Task, check_values, need_samples, stored_scores
+from gaigs.task import Metric, Task, check_values, need_samples
 
 
 class Scalar(Task):
@@ -41,7 +38,7 @@ class Scalar(Task):
             f"rmse_{suffix}": Metric(f"RMSE [{cls.error_unit}]", False, is_brief=False),
         }
 
-    def scores(self, labels: Float[Tensor, "k"], values: Float[Tensor, "k"]) -> dict[str, Tensor]:
+    def scores(self, labels: Float[Tensor, " k"], values: Float[Tensor, " k"]) -> dict[str, Tensor]:
         """The absolute error of each prediction."""
         check_values(labels, values, (), "readings")
         return {self.monitor: (values.detach().cpu().double() - labels.detach().cpu().double()).abs()}
@@ -51,7 +48,7 @@ class Scalar(Task):
         return with_unit("|difference|", self.error_unit)
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Errors less by the root of 2."""
+        """Errors divided by the root of 2."""
         return {name: score / math.sqrt(2) for name, score in scores.items()}
 
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
@@ -62,52 +59,10 @@ class Scalar(Task):
         return dict(zip(self.metrics(), (number.item() for number in numbers), strict=True))
 
     def stored(self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        """``error``: prediction less label."""
+        """``error``: prediction minus label."""
         return {"error": (values - labels).numpy()}
 
-    def keep(self, folder: Path, model) -> None:
-        """``radio_map.npz``: what each receiver would report from everywhere on a plane."""
-        from gaigs.radio_maps import radio_map  # which itself asks a model
 
-        radio_map(model).save(folder / "radio_map.npz")
-
-    def figures(self, folder: Path, links) -> dict:
-        """How the error is distributed, predicted against measured values, and the radio map."""
-        from gaigs.report.curves import cdf  # matplotlib is slow to import
-        from gaigs.report.panels import numbered
-        from gaigs.report.radio_map import radio_maps
-        from gaigs.report.scatter import predicted_against_measured
-
-        with np.load(folder / "predictions.npz") as run:
-            errors = {name.removeprefix("error_"): abs(run[name]) for name in run.files if name.startswith("error_")}
-            transmitters, receiver, labels, predictions = (
-                run[name] for name in ("transmitters", "receiver", "labels", "prediction")
-            )
-        names = [receiver.name for receiver in links.receivers]
-        readings = np.column_stack((transmitters[:, :2], labels))
-        words = {"quantity": self.quantity, "unit": self.unit, "error_unit": self.error_unit}
-        paged = {
-            "predicted_against_measured": predicted_against_measured(labels, predictions, receiver, names, **words),
-            "radio_map": radio_maps(
-                folder / "radio_map.npz",
-                {receiver.name: receiver.pose.position.numpy() for receiver in links.receivers},
-                {name: readings[receiver == index] for index, name in enumerate(names)},
-                links.edges.numpy(),
-                **words,
-            ),
-        }
-        # The last hundredth would squeeze all others.
-        furthest = max(np.quantile(error, 0.99) for error in errors.values()) or None
-        title = f"|error| [{self.error_unit}]"
-        figures = {"error_cdf": cdf(errors, title, "readings", links.split.name, (0, furthest))}
-        return figures | numbered(paged)
-
-    @classmethod
-    def compared(cls, files: Mapping[str, Path], split: str) -> dict:
-        """How the error is distributed."""
-        from gaigs.report.curves import cdf  # matplotlib is slow to import
-
-        errors = {name: abs(values) for name, values in stored_scores(files, "error").items()}
-        # Of all readings and systems: a single system that failed would squeeze all others.
-        furthest = np.quantile(np.concatenate([*errors.values()]), 0.98) or None
-        return {"cdf": cdf(errors, f"|error| [{cls.error_unit}]", "readings", split, (0, furthest))}
+def with_unit(quantity: str, unit: str) -> str:
+    """A quantity with its unit in brackets; a ratio has none."""
+    return f"{quantity} [{unit}]" if unit else quantity

@@ -1,8 +1,6 @@
 """Spatial spectra: an amplitude in each direction of a grid."""
 
 import math
-from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,16 +8,13 @@ from jaxtyping import Float
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from gaigs.directions import Grid
+from gaigs.geometry import Grid
 from gaigs.query import Batch
 from gaigs.registry import register
-from gaigs.task import Metric, Task, Thinning, check_values, need_samples, stored_scores
+from gaigs.task import Metric, Task, Thinning, check_values, need_samples
 
 SSIM_WINDOW = 7
 """Edge of scikit-image's default uniform window [pixels]."""
-
-EXAMPLES = {"10th percentile": 0.1, "median": 0.5, "90th percentile": 0.9}
-"""Which spectra are shown, by their rank in SSIM."""
 
 
 @register("task", "spectrum")
@@ -29,7 +24,7 @@ class Spectrum(Task):
     Args:
         elevations: Of the rows, in the array's frame [rad].
         azimuths: Of the columns, in the array's frame [rad].
-        normalisation: How labels were scaled, in words of docs/data.md.
+        normalisation: Scale of the labels, in words of docs/data.md.
 
     Source: the protocol of GAI-GS, "Evaluation"; Wang et al., Image Quality Assessment, 2004.
     """
@@ -39,7 +34,7 @@ class Spectrum(Task):
     pair_score = "SSIM"
     normalisation = ""
 
-    def __init__(self, elevations: Float[Tensor, "rows"], azimuths: Float[Tensor, "columns"], normalisation: str):
+    def __init__(self, elevations: Float[Tensor, " rows"], azimuths: Float[Tensor, " columns"], normalisation: str):
         self.directions = Grid(elevations, azimuths)
         self.normalisation = normalisation
 
@@ -66,8 +61,8 @@ class Spectrum(Task):
     ) -> dict[str, Tensor]:
         """SSIM and mean absolute error of each predicted spectrum.
 
-        SSIM is scikit-image's with its default window and ``data_range=1``, computed in float64; the training loss
-        uses another window, so the two differ and bear different names. Values outside [0, 1] are scored as they are.
+        SSIM is scikit-image's with its default window and ``data_range=1``, computed in float64. The training loss uses
+        another window, so the two differ and have different names. Values outside [0, 1] are scored as they are.
 
         Raises:
             ValueError: As for every task; or spectra are smaller than the SSIM's window.
@@ -84,10 +79,10 @@ class Spectrum(Task):
         return {"ssim": torch.tensor(ssim, dtype=torch.float64), "mae": (labels - values).abs().mean((1, 2))}
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
-        """SSIM s becomes 2 s / (1 + s), below 0 becomes 0; absolute errors are less by the root of 2.
+        """SSIM s becomes 2 s / (1 + s), below 0 becomes 0; absolute errors fall by the root of 2.
 
-        Of two labels with the same mean that scatter about a pattern, SSIM is the pattern's share s of the variance; of
-        the pattern and one label it is 2 s / (1 + s). A mean over windows of unlike s is less, by Jensen's inequality.
+        The SSIM of two labels with the same mean that scatter about a pattern is the pattern's share s of the variance.
+        That of the pattern and one label is 2 s / (1 + s). A mean over windows of unlike s is less (Jensen).
         """
         shares = scores["ssim"].clamp(min=0)
         return {"ssim": 2 * shares / (1 + shares), "mae": scores["mae"] / math.sqrt(2)}
@@ -101,13 +96,13 @@ class Spectrum(Task):
         return dict(zip(self.metrics(), numbers, strict=True))
 
     def thinning(self, stride: int = 1, rays: int | None = None) -> Thinning:
-        """Every ``stride``-th row and column from random first ones on, or so many random pixels of all.
+        """Every ``stride``-th row and column, with random first ones, or ``rays`` random pixels.
 
         Neighbouring pixels of a spectrum are far closer than the array resolves.
 
         Args:
-            stride: Rows and columns from one looked at to the next.
-            rays: Random pixels, anew in each step and for all links of a batch the same; None for a grid.
+            stride: Step of the rows and columns.
+            rays: Number of random pixels, drawn in each step and the same for all links of a batch; None for a grid.
 
         Raises:
             ValueError: An option is out of range, or both are given.
@@ -138,48 +133,9 @@ class Spectrum(Task):
         return grid if rays is None else scattered
 
     def packed(self, values: Float[Tensor, "k rows columns"]) -> np.ndarray:
-        """Half of a float's digits are enough for an image, and half of the room."""
+        """float16, which is precise enough for an image."""
         return values.half().numpy()
 
     def stored(self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
         """``ssim``."""
         return {"ssim": scores["ssim"].numpy()}
-
-    def figures(self, folder: Path, links) -> dict:
-        """Spectra of the 10th, 50th and 90th percentile beside their labels, and how SSIM is distributed."""
-        from gaigs.report.curves import cdf  # matplotlib is slow to import
-        from gaigs.report.spectra import spectra
-
-        with np.load(folder / "predictions.npz") as run:
-            scores = {name.removeprefix("ssim_"): run[name] for name in run.files if name.startswith("ssim_")}
-            labels, predictions = run["labels"], run["prediction"]
-        own = next(iter(scores.values()))
-        order = np.argsort(own)
-        names = {order[round(rank * (len(own) - 1))]: name for name, rank in EXAMPLES.items()}
-        shown = list(names)
-        grid = (np.rad2deg(angles.numpy()) for angles in (self.directions.elevations, self.directions.azimuths))
-        examples = labels[shown], predictions[shown], own[shown], list(names.values()), *grid
-        return {
-            "spectra": spectra(*examples),
-            "spectra_polar": spectra(*examples, polar=True),
-            "ssim_cdf": cdf(scores, "SSIM", "spectra", links.split.name, (None, 1)),
-        }
-
-    @classmethod
-    def compared(cls, files: Mapping[str, Path], split: str) -> dict:
-        """How SSIM is distributed; and the test spectrum of median difficulty, as each system predicts it."""
-        from gaigs.report.curves import cdf  # matplotlib is slow to import
-        from gaigs.report.spectra import side_by_side
-
-        scores = stored_scores(files, "ssim")
-        order = np.argsort(np.mean([scores[name] for name in files], 0))
-        shown = order[round(0.5 * (len(order) - 1))]
-        predictions = {}
-        for name, file in files.items():
-            with np.load(file) as run:
-                predictions[name], label = run["prediction"][shown], run["labels"][shown]
-                grid = [np.rad2deg(run[key]) for key in ("elevations", "azimuths")]
-        return {
-            "cdf": cdf(scores, "SSIM", "spectra", split, (None, 1)),
-            "spectra": side_by_side(label, predictions, {name: scores[name][shown] for name in files}, *grid),
-        }

@@ -1,9 +1,9 @@
-"""Checks of each kind's contract, for the tests of whoever writes a component.
+"""Checks of each kind's contract, for the tests of components.
 
 >>> from gaigs.registry import registry
 >>> check_projection(registry("projection").build({"name": "mercator"}, pixel=0.02))
 
-A check raises ``AssertionError``, which says what must hold, and returns nothing where all of it does.
+A check raises an ``AssertionError`` with the broken rule, or returns nothing.
 """
 
 from gaigs.testing.data import check_data, example_links

@@ -1,24 +1,25 @@
-"""What the checks share: rules, tolerances, tensors and gradients."""
+"""Rules, tolerances, tensors, gradients and random inputs, shared by the checks."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from gaigs.query import Query
 from gaigs.scene import Scene
 
 PRECISION = {torch.float32: 1e-4, torch.float64: 1e-9}
-"""How far a result may be from the truth, of the largest true value."""
+"""Largest error of a result, relative to the largest true value."""
 
 
 def require(holds: bool, rule: str) -> None:
-    """Raises an ``AssertionError`` with the rule where it does not hold."""
+    """Raises an ``AssertionError`` with the rule unless it holds."""
     if not holds:
         raise AssertionError(rule)
 
 
 def require_raises(error: type[Exception], call: Callable, rule: str) -> None:
-    """Raises an ``AssertionError`` with the rule where a call does not raise an error of that type."""
+    """Raises an ``AssertionError`` with the rule unless a call raises an error of that type."""
     try:
         call()
     except error:
@@ -29,7 +30,7 @@ def require_raises(error: type[Exception], call: Callable, rule: str) -> None:
 
 
 def require_close(actual: Tensor, expected: Tensor, tolerance: float, rule: str) -> None:
-    """Equal to within a fraction of the largest expected value, or of 1 where that is smaller."""
+    """Requires equality to within a fraction of the largest expected value, at least 1."""
     largest = max(1.0, expected.abs().max().item()) if expected.numel() else 1.0
     wide = torch.complex128 if expected.is_complex() else torch.float64
     torch.testing.assert_close(
@@ -40,7 +41,7 @@ def require_close(actual: Tensor, expected: Tensor, tolerance: float, rule: str)
 def require_tensor(
     name: str, tensor: Tensor, shape: Sequence[int], dtype: torch.dtype, device: torch.device | str | None = None
 ) -> None:
-    """Of that shape, dtype and kind of device, and finite."""
+    """Requires a finite tensor of that shape, dtype and type of device."""
     require(tuple(tensor.shape) == tuple(shape), f"{name} must be of shape {tuple(shape)}, got {tuple(tensor.shape)}")
     require(tensor.dtype == dtype, f"{name} must be {dtype} as its input, got {tensor.dtype}")
     same = device is None or tensor.device.type == torch.device(device).type
@@ -49,7 +50,7 @@ def require_tensor(
 
 
 def require_gradients(outputs: Sequence[Tensor], leaves: dict[str, Tensor]) -> None:
-    """All gradients of a fixed function of the outputs exist where they can, and are finite."""
+    """Requires finite gradients of a fixed function of the outputs; a leaf that has no influence needs none."""
     outputs = [output for output in outputs if output.requires_grad and output.numel()]
     if not outputs:
         return
@@ -59,8 +60,15 @@ def require_gradients(outputs: Sequence[Tensor], leaves: dict[str, Tensor]) -> N
         require(gradient is None or bool(gradient.isfinite().all()), f"the gradient of {name} must be finite")
 
 
+def require_groups(groups: Mapping[str, Iterable[nn.Parameter]], module: nn.Module) -> None:
+    """Requires that each parameter of a module is in exactly one group."""
+    grouped = [id(parameter) for group in groups.values() for parameter in group]
+    rule = "each parameter must be in one of parameter_groups"
+    require(sorted(grouped) == sorted(map(id, module.parameters())), rule)
+
+
 def fixed_sum(values: Tensor) -> Tensor:
-    """A real sum with weights that differ but are always the same, so that no two gradients cancel."""
+    """A real sum with fixed, different weights, so that no two gradients cancel."""
     if values.is_complex():
         values = torch.view_as_real(values.resolve_conj())
     weights = torch.arange(values.numel(), device=values.device).cos().to(values)
@@ -68,7 +76,7 @@ def fixed_sum(values: Tensor) -> Tensor:
 
 
 def random_labels(shape: Sequence[int], dtype: torch.dtype, generator: torch.Generator) -> Tensor:
-    """Uniform in [0, 1], in both parts where they are complex: labels that suit every task."""
+    """Labels that suit every task: uniform in [0, 1], in both parts of complex ones."""
     if dtype.is_complex:
         return torch.view_as_complex(torch.rand(*shape, 2, generator=generator)).to(dtype)
     return torch.rand(*shape, generator=generator).to(dtype)
@@ -79,15 +87,18 @@ def random_places(scene: Scene, count: int, generator: torch.Generator) -> Tenso
     return torch.lerp(scene.lower, scene.upper, torch.rand(count, 3, generator=generator))
 
 
-def random_frequencies(scene: Scene, count: int) -> Tensor | None:
-    """The carriers of a scene that has some, over and over (count,) [Hz]; None for one that has none."""
-    if not len(scene.frequencies):
-        return None
-    return scene.frequencies[torch.arange(count) % len(scene.frequencies)]
+def random_query(
+    scene: Scene, count: int, generator: torch.Generator, dtype: torch.dtype, device: torch.device | str
+) -> Query:
+    """Links from random places to the receivers in turn, at the scene's carriers in turn where there are any."""
+    number = torch.arange(count)
+    frequencies = scene.frequencies[number % len(scene.frequencies)] if len(scene.frequencies) else None
+    places = random_places(scene, count, generator).to(dtype)
+    return Query(places, number % len(scene.receivers), frequencies).to(device)
 
 
 def flat(state: object) -> list:
-    """Tensors and all else in nested lists and dicts, one after another, comparable."""
+    """The content of nested lists and dicts as one list that can be compared."""
     if isinstance(state, Tensor):
         return [str(state.dtype), state.tolist()]
     if isinstance(state, dict):

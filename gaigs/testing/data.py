@@ -8,12 +8,12 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
+from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Parts, Split
 from gaigs.data.nerf2_spectrum import NORMALISATION
-from gaigs.directions import Grid
-from gaigs.geometry import Pose
+from gaigs.geometry import Grid, Pose
 from gaigs.query import CARRIERS, Query
-from gaigs.scene import Array, Receiver, Scene
+from gaigs.scene import Scene
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
@@ -25,11 +25,10 @@ POSES = (
 )
 
 CARRIER = 2.44e9
-"""Of the made-up channels [Hz]."""
-
+"""Carrier of the made-up channels [Hz]."""
 
 BANDWIDTH = 5e8
-"""Of the made-up spectra and levels whose carrier is known [Hz]."""
+"""Bandwidth of made-up spectra and levels with a known carrier [Hz]."""
 
 
 def example_links(task: str = "spectrum", carrier: float | None = None) -> Links:
@@ -39,8 +38,8 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
         task: ``spectrum``: random spectra of 18 x 36 pixels, each of another place. ``rssi``: random levels of 12
             places that both receivers hear. ``csi``: channels of 12 such places at 4 elements and 5 subcarriers, the
             direct wave and noise.
-        carrier: Of all links, whose bandwidth is then known too, and the array that spectra come from: 3 x 3 patches
-            half its wavelength apart [Hz]. None: unknown.
+        carrier: Carrier of all links [Hz], with a known bandwidth; spectra then come from 3 x 3 patches half a
+            wavelength apart. None if unknown.
 
     Raises:
         ValueError: There is no such task here.
@@ -81,7 +80,7 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
 
 
 def _direct_waves(
-    places: Float[Tensor, "k 3"], elements: Float[Tensor, "k e 3"], frequencies: Float[Tensor, "s"]
+    places: Float[Tensor, "k 3"], elements: Float[Tensor, "k e 3"], frequencies: Float[Tensor, " s"]
 ) -> Complex[Tensor, "k e s"]:
     """exp(-j 2 pi f d / c) / d, of amplitudes about 1."""
     distances = (places[:, None] - elements).double().norm(dim=-1)[..., None]
@@ -89,7 +88,7 @@ def _direct_waves(
 
 
 def check_data(links: Links) -> None:
-    """Links that a data set's reader gives: shapes, ranges, labels that stay, parts without overlap, a storable scene.
+    """Checks a reader's links: shapes, ranges, repeatable labels, parts without overlap, a storable scene.
 
     Raises:
         AssertionError: The links break the contract of ``gaigs.data.Links``.
@@ -124,7 +123,7 @@ def check_data(links: Links) -> None:
 
 
 def check_parts(parts: dict[str, Tensor], n: int) -> None:
-    """Parts of n links: ascending numbers, each of one link, some to train and some to test on."""
+    """Checks parts of n links: ascending numbers without repetition, some to train and some to test on."""
     for name, part in parts.items():
         require(part.ndim == 1 and part.dtype == torch.long, f"{name} must be the numbers of links, got {part.dtype}")
         require(bool((part.diff() > 0).all()), f"{name} must ascend")
@@ -160,10 +159,10 @@ def _check_rows(links: Links) -> None:
 
 
 def _official(links: Links) -> Parts | None:
-    """The parts that came with the data; None where none came, or their files are not there."""
+    """The parts that came with the data; None without parts or their files."""
     try:
         return None if links.official is None else links.official()
-    except FileNotFoundError:  # which hurts the official split alone
+    except FileNotFoundError:  # only the official split needs them
         return None
 
 

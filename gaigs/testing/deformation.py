@@ -6,41 +6,39 @@ import torch
 from torch import nn
 
 from gaigs.deformation import Residuals
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed, Tokens
 from gaigs.query import Query
 from gaigs.scene import Scene
 from gaigs.testing.checks import (
     PRECISION,
-    random_frequencies,
     random_places,
+    random_query,
     require,
     require_close,
     require_gradients,
     require_tensor,
 )
-from gaigs.tokenizer import Tokens
 
 CHANNELS = 2
 
 
 def check_deformation(build: Callable[..., nn.Module], scene: Scene, device: torch.device | str = "cpu") -> None:
-    """A deformation: residuals' shapes, dtype, gradients, attenuations in (0, 1], independence of the batch.
+    """Checks a deformation: residuals' shapes, dtype, gradients, attenuations in (0, 1], independence of the batch.
 
     Args:
-        build: Makes the deformation; it is called with what a model knows, as ``registry("deformation").build`` with a
-            configuration is: ``build(scene=..., channels=..., tokenizer_widths=...)``.
-        scene: What it is made for.
-        device: Where it works.
+        build: Makes the deformation: ``build(scene=..., channels=..., tokenizer_widths=...)``.
+        scene: Passed to ``build``.
+        device: Device of the computation.
 
     Raises:
-        AssertionError: It breaks the contract of ``gaigs.deformation.Deformation``.
+        AssertionError: The contract of ``gaigs.deformation.Deformation`` is broken.
     """
     generator = torch.Generator().manual_seed(0)
     cases = [(widths, 1) for widths in ((5, 4, 6), (5, 0, 0), (0, 4, 6), (0, 0, 0))] + [((5, 4, 6), 3)]
     for widths, sets in cases:
         for dtype in PRECISION:
             module = build(scene=scene, channels=CHANNELS, tokenizer_widths=widths).to(device, dtype).eval()
-            for parameter in module.parameters():  # heads that start at zero would hide what is behind them
+            for parameter in module.parameters():  # zero heads would hide earlier layers
                 parameter.data += 0.1 * torch.randn(parameter.shape, generator=generator).to(parameter)
             for n, b in ((7, 3), (1, 1)):
                 if b >= sets:
@@ -52,9 +50,7 @@ def _arguments(scene, widths, n, b, sets, generator, dtype, device) -> tuple[Tok
     gaussians = random(n, widths[1]) if sets == 1 else random(b, n, widths[1])
     tokens = Tokens(random(b, widths[0]), gaussians, random(b, widths[2]))
     placed = Placed(random_places(scene, sets * n, generator).to(device, dtype).unflatten(0, (sets, n)))
-    places = random_places(scene, b, generator).to(dtype)
-    query = Query(places, torch.arange(b) % len(scene.receivers), random_frequencies(scene, b)).to(device)
-    return tokens, placed, query
+    return tokens, placed, random_query(scene, b, generator, dtype, device)
 
 
 def _check_call(module: nn.Module, arguments: tuple[Tokens, Placed, Query]) -> None:
@@ -76,8 +72,7 @@ def _check_call(module: nn.Module, arguments: tuple[Tokens, Placed, Query]) -> N
     if residuals.attenuations is not None:
         inside = residuals.attenuations.gt(0) & residuals.attenuations.le(1)
         require(bool(inside.all()), "attenuations must lie in (0, 1]")
-    leaves = dict(module.named_parameters())
-    if leaves:
+    if leaves := dict(module.named_parameters()):
         require_gradients([residual for residual in residuals if residual is not None], leaves)
 
 

@@ -12,17 +12,17 @@ from gaigs.testing.checks import PRECISION, require, require_close, require_grad
 
 
 def check_loss(loss: Loss, links: Links, device: torch.device | str = "cpu") -> None:
-    """A loss: least at the labels, a mean over the links, with finite gradients everywhere and terms by name.
+    """Checks a loss: least at the labels, a mean over the links, finite gradients everywhere, terms by name.
 
-    Labels on a grid are also compared on every second row and column of it.
+    Labels on a grid are also compared on every second row and column.
 
     Args:
         loss: Made with the task of the links.
-        links: With labels to compare.
-        device: Where it works.
+        links: Links with labels.
+        device: Device of the computation.
 
     Raises:
-        AssertionError: It breaks the contract of ``gaigs.loss.Loss``.
+        AssertionError: The contract of ``gaigs.loss.Loss`` is broken.
     """
     batch = links.batch(links.split.train[:6])
     batches = [batch]
@@ -51,10 +51,11 @@ def _check_batch(loss: Loss, batch: Batch, dtype: torch.dtype) -> None:
         values, what = labels + scale * noise, f"with errors of about {scale:g}"
         total, terms_there = loss(values, batch)
         require_tensor(f"the loss {what}", total, (), dtype, labels.device)
-        require([*terms_there] == [*terms], "terms must be the same wherever the values lie")
+        require([*terms_there] == [*terms], "terms must be the same for all values")
         require(bool(total > least), f"the loss must be least at the labels, got {least:g} there and {total:g} {what}")
-        each = torch.stack([loss(values[i : i + 1], _only(batch, i))[0] for i in range(len(batch))])
-        require_close(each.mean(), total, PRECISION[dtype], "the loss must be the mean of those of its links")
+        single = lambda i: replace(batch, query=batch.query[i : i + 1], labels=labels[i : i + 1])
+        each = torch.stack([loss(values[i : i + 1], single(i))[0] for i in range(len(batch))])
+        require_close(each.mean(), total, PRECISION[dtype], "the loss must be the mean over its links")
     hard = {"at the labels": labels, "next to the labels": labels + 1e-12 * noise, "at zero": 0 * labels}
     hard["far off"] = 1e3 * noise
     for what, values in hard.items():
@@ -65,8 +66,3 @@ def _check_batch(loss: Loss, batch: Batch, dtype: torch.dtype) -> None:
     leaf = (labels + 0.1 * noise).requires_grad_()
     (gradient,) = torch.autograd.grad(loss(leaf, batch)[0], leaf)
     require(bool(gradient[..., None].flatten(1).any(1).all()), "each link must pull at its value")
-
-
-def _only(batch: Batch, i: int) -> Batch:
-    """One link by itself."""
-    return replace(batch, query=batch.query[i : i + 1], labels=batch.labels[i : i + 1])

@@ -6,28 +6,27 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from gaigs.gaussians import Gaussians
-from gaigs.placement import Placed
+from gaigs.gaussians import Gaussians, Placed
 from gaigs.query import Query
 from gaigs.scene import Scene
 from gaigs.testing.checks import (
     PRECISION,
-    random_frequencies,
-    random_places,
+    random_query,
     require,
     require_close,
     require_gradients,
+    require_groups,
     require_tensor,
 )
 
 
 def check_placement(placement: nn.Module, scene: Scene, device: torch.device | str = "cpu") -> None:
-    """A placement built for the scene and 2 channels: shapes, dtype, gradients, independence of the batch.
+    """Checks a placement built for the scene and 2 channels: shapes, dtype, gradients, independence of the batch.
 
-    One that has Gaussians of its own is asked for them alone, too.
+    A placement with Gaussians of its own is also asked for these alone.
 
     Raises:
-        AssertionError: It breaks the contract of ``gaigs.placement.Placement``.
+        AssertionError: The contract of ``gaigs.placement.Placement`` is broken.
     """
     generator = torch.Generator().manual_seed(0)
     free = (40, 0) if placement.has_own else (40,)
@@ -37,8 +36,7 @@ def check_placement(placement: nn.Module, scene: Scene, device: torch.device | s
     ):
         module = copy.deepcopy(placement).to(device, dtype).eval()
         gaussians = example_gaussians(scene, count).to(device, dtype) if count else None
-        places = random_places(scene, b, generator).to(dtype)
-        query = Query(places, torch.arange(b) % len(scene.receivers), random_frequencies(scene, b)).to(device)
+        query = random_query(scene, b, generator, dtype, device)
         query.transmitters.requires_grad_()
         placed = module(gaussians, query)
         require(isinstance(placed, Placed), f"a placement must give a Placed, got {type(placed).__name__}")
@@ -53,26 +51,22 @@ def check_placement(placement: nn.Module, scene: Scene, device: torch.device | s
         require_gradients(given, leaves | {"transmitters": query.transmitters})
         nothing = module(gaussians, query[:0]).means
         require(nothing.shape[0] in (0, 1) and nothing.shape[1:] == (n, 3), "no queries must be placed too")
-    grouped = sorted(id(leaf) for group in placement.parameter_groups().values() for leaf in group)
-    require(grouped == sorted(map(id, placement.parameters())), "each parameter must stand in one of parameter_groups")
+    require_groups(placement.parameter_groups(), placement)
     for name, penalty in placement.penalties().items():
         require_tensor(f"the penalty {name}", penalty, (), torch.float32)
 
 
-PER_QUERY = ("means", "lengths", "scales", "gains")
-"""Fields of ``Placed`` that may have a row for each query."""
-
-
 def _check_independence(module: nn.Module, gaussians: Gaussians | None, query: Query, placed: Placed) -> None:
-    """Two calls give the same, and so does a query by itself; receivers count where it says so alone."""
+    """Two calls and a single query give the same; the receiver counts only where ``sees_receivers`` is true."""
     dtype = placed.means.dtype
+    per_query = ("means", "lengths", "scales", "gains")  # fields that may have a row for each query
     again, alone = module(gaussians, query), module(gaussians, query[-1:])
     for name, whole, twice, single in zip(Placed._fields, placed, again, alone, strict=True):
         if whole is None:
             require(twice is None and single is None, f"{name} must be given for all queries or for none")
             continue
         require(torch.equal(whole, twice), f"two calls must give the same {name}")
-        own = whole[-1:] if name in PER_QUERY else whole
+        own = whole[-1:] if name in per_query else whole
         require_close(single, own, PRECISION[dtype], f"{name} must not depend on the other queries")
     if not module.sees_receivers:
         other = module(gaussians, replace(query, receivers=torch.zeros_like(query.receivers)))

@@ -1,122 +1,122 @@
 """The check of kind ``pooling``."""
 
 import copy
-import functools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from gaigs.antenna import Receiver
 from gaigs.data import Links
-from gaigs.directions import Directions, Grid
+from gaigs.geometry import Grid
 from gaigs.pooling import Pooling
+from gaigs.pooling.paths import PathPooling, ReceivedPaths
 from gaigs.query import Query
-from gaigs.scene import Array, Scene
+from gaigs.scene import Scene
 from gaigs.testing.checks import PRECISION, require, require_close, require_gradients, require_tensor
 
 
 def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch.device | str = "cpu") -> None:
-    """A pooling: the task's value for each map, gradients finite even where the map is 0, independence of the batch.
+    """A pooling: the task's value for each map or set of paths, finite gradients, independence of the batch.
 
-    It is fitted to the links, and its twin has the same state. One that has no grid of its own is given maps over the
-    label's directions and over a list of some of them, any other is asked for these. One that gives a real number a
-    link must also take maps that are constant, span 12 decades or are of half precision. One that takes lags or fields
-    is given some, and silence.
+    It is fitted to the links, and its twin has the same state. Silent maps and paths are among the inputs. A pooling of
+    maps without a grid of its own is given maps over the label's directions and over a list of some of them. Any other
+    is asked for these. A pooling of maps that gives a real number a link must also take maps that are constant, span 12
+    decades or are of half precision.
 
     Args:
         build: Makes the pooling for a scene.
-        links: What it is fitted to; of the task that it is made for.
-        device: Where it works.
+        links: Links of the task that it is made for; it is fitted to them.
+        device: Device of its inputs.
 
     Raises:
         AssertionError: It breaks the contract of ``gaigs.pooling.Pooling``.
     """
     pooling, task = build(links.scene), links.task
-    channels = pooling.channels
+    channels, takes_paths = pooling.channels, isinstance(pooling, PathPooling)
     require(isinstance(channels, int) and channels > 0, f"channels must be how many it needs, got {channels!r}")
+    require(not takes_paths or channels == 2, f"paths have 2 channels, real and imaginary part, got {channels}")
     _check_grid(pooling)
     pooling.fit(links)
     twin = build(links.scene)
     twin.load_state_dict(pooling.state_dict())
     grid = task.directions if pooling.grid is None else pooling.grid
-    require(grid is not None, f"labels of task {task.name!r} have no directions, so the pooling must have a grid")
+    rule = f"labels of task {task.name!r} have no directions, so the pooling must have a grid"
+    require(takes_paths or grid is not None, rule)
     for b, dtype in ((3, torch.float32), (1, torch.float32), (3, torch.float64)):
         module, other = (copy.deepcopy(part).to(device, dtype).eval() for part in (pooling, twin))
         query = _query(links, b).to(device)
-        generator = torch.Generator().manual_seed(0)
-        image = torch.randn(b, channels, *grid.shape, generator=generator).to(device, dtype).requires_grad_()
-        value = module(image, query)
+        if takes_paths:
+            what, received = "paths", example_paths(links.receivers[int(query.receivers[0])], query, dtype)
+            names = ("means", "semi_axes", "amplitudes", "lengths", "coherences", "bandwidth")
+            leaves = {name: getattr(received, name).requires_grad_() for name in names}
+            silence = replace(received, amplitudes=torch.zeros_like(received.amplitudes).requires_grad_())
+            silent = {"silent paths": silence.amplitudes}
+        else:
+            generator = torch.Generator().manual_seed(0)
+            what, received = "maps", torch.randn(b, channels, *grid.shape, generator=generator).to(device, dtype)
+            leaves = {"the map": received.requires_grad_()}
+            silence = torch.zeros_like(received).requires_grad_()
+            silent = {"a silent map": silence}
+        value = module(received, query)
         wanted = dtype.to_complex() if task.dtype.is_complex else dtype
         require_tensor("the value", value, (b, *task.shape), wanted, device)
-        require(torch.equal(value, module(image, query)), "two calls must give the same value")
-        require(torch.equal(value, other(image, query)), "all that it takes in fit must be in the state dict")
-        alone = module(image[-1:], query[-1:])
-        require_close(alone, value[-1:], PRECISION[dtype], "a value must not depend on the other maps")
-        require_gradients([value], {**dict(module.named_parameters()), "the map": image})
-        silence = torch.zeros_like(image).requires_grad_()
-        require_gradients([module(silence, query)], {"a silent map": silence})
-        none = module(image[:0], query[:0])
-        require(tuple(none.shape) == (0, *task.shape), f"no maps must give no values, got {tuple(none.shape)}")
-        if pooling.grid is None:
-            row = image.flatten(2)[:, :, None, ::3]
+        require(torch.equal(value, module(received, query)), "two calls must give the same value")
+        require(torch.equal(value, other(received, query)), "all that it takes in fit must be in the state dict")
+        alone = module(rows_of(received, slice(-1, None)), query[-1:])
+        require_close(alone, value[-1:], PRECISION[dtype], f"a value must not depend on the other {what}")
+        require_gradients([value], dict(module.named_parameters()) | leaves)
+        quiet = module(silence, query)
+        require(bool(quiet.isfinite().all()), "the value of silence must be finite")
+        require_gradients([quiet], silent)
+        none = module(rows_of(received, slice(0, 0)), query[:0])
+        require(tuple(none.shape) == (0, *task.shape), f"no {what} must give no values, got {tuple(none.shape)}")
+        if not takes_paths and pooling.grid is None:
+            row = received.flatten(2)[:, :, None, ::3]
             single = module(row, query)
             require_tensor("the value of a list of rays", single, (b, *row.shape[2:]), wanted, device)
             rule = "a list of rays must have the values of their pixels"
             require_close(single[:, 0], value.flatten(1)[:, ::3], PRECISION[dtype], rule)
-        else:
-            _check_directions(functools.partial(module, image, query), links, value)
-        _check_hearing(module, other, links, query, dtype)
-        if task.shape == () and not task.dtype.is_complex:
-            _check_hard_maps(module, image.detach(), query)
+        elif task.directions is not None:
+            rays = task.directions.flatten()[1::3].to(device)
+            rule = "fewer directions must get the same values"
+            require_close(module(received, query, rays), value.flatten(1)[:, 1::3], PRECISION[dtype], rule)
+        if not takes_paths and task.shape == () and not task.dtype.is_complex:
+            _check_hard_maps(module, received.detach(), query)
 
 
-def _check_directions(give: Callable[[Directions], Tensor], links: Links, whole: Tensor) -> None:
-    """Some of the label's directions have their values in the whole."""
-    if links.task.directions is None:
-        return
-    rays = links.task.directions.flatten()[1::3].to(whole.device)
-    rule = "fewer directions must get the same values"
-    require_close(give(rays), whole.flatten(1)[:, 1::3], PRECISION[whole.dtype], rule)
-
-
-def _check_hearing(module: Pooling, twin: Pooling, links: Links, query: Query, dtype: torch.dtype) -> None:
-    """What it makes of lags or fields, if it takes them."""
-    require(module.takes in (None, "lags", "fields"), f"takes must be lags, fields or None, got {module.takes!r}")
-    if module.takes is None:
-        return
-    task, array = links.task, links.receivers[int(query.receivers[0])].array
-    heard = example_fields(module.takes, array, query, task.shape[-1:] or (1,), dtype).requires_grad_()
-    value = module.hear(heard, query)
-    wanted = dtype.to_complex() if task.dtype.is_complex else dtype
-    require_tensor(f"the value of {module.takes}", value, (len(query), *task.shape), wanted, heard.device)
-    require(torch.equal(value, module.hear(heard, query)), "what is heard twice must have the same value")
-    require(torch.equal(value, twin.hear(heard, query)), "all that it takes in fit must be in the state dict")
-    alone = module.hear(heard[-1:], query[-1:])
-    require_close(alone, value[-1:], PRECISION[dtype], "a value must not depend on what others hear")
-    require_gradients([value], {**dict(module.named_parameters()), module.takes: heard})
-    silence = torch.zeros_like(heard).requires_grad_()
-    quiet = module.hear(silence, query)
-    require(bool(quiet.isfinite().all()), "the value of silence must be finite")
-    require_gradients([quiet], {"silence": silence})
-    none = module.hear(heard[:0], query[:0])
-    require(tuple(none.shape) == (0, *task.shape), f"no {module.takes} must give no values, got {tuple(none.shape)}")
-    _check_directions(functools.partial(module.hear, heard, query), links, value)
-
-
-def example_fields(
-    takes: str, array: Array, query: Query, subcarriers: tuple[int, ...], dtype: torch.dtype
-) -> Complex[Tensor, "b ..."]:
-    """Random fields of an array's elements, or their covariance at the array's lags, as ``aperture`` gives them."""
+def example_paths(receiver: Receiver, query: Query, dtype: torch.dtype, n: int = 9) -> ReceivedPaths:
+    """Random paths to a receiver, partly coherent over a band, at the carriers of a query or else at 5 GHz."""
     generator = torch.Generator().manual_seed(1)
-    shape = len(query), len(array), *subcarriers
-    fields = torch.randn(*shape, dtype=torch.complex128, generator=generator)
-    if takes == "lags":
-        covariances = (fields @ fields.mH).flatten(1) / shape[-1]
-        _, pairs, counts = array.lags
-        fields = covariances.new_zeros(len(query), len(counts)).index_add(1, pairs, covariances) / counts
-    return fields.to(query.transmitters.device, dtype.to_complex())
+    b, random = len(query), lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)
+    carriers = torch.full((b,), 5e9) if query.frequencies is None else query.frequencies
+    amplitudes = torch.randn(b, n, generator=generator, dtype=torch.complex128)
+    to = lambda part: part.to(query.transmitters.device, dtype)
+    directions = torch.nn.functional.normalize(random(b, n, 3) - 0.5, dim=-1)
+    points = to(directions * (1 + 5 * random(b, n, 1)))
+    means = receiver.pose.to(points).world(points)
+    return ReceivedPaths(
+        means,
+        to(0.3 * (random(b, n, 3, 3) - 0.5)),
+        amplitudes.to(means.device, dtype.to_complex()),
+        to(1 + 20 * random(b, n)),
+        to(random(n)),
+        to(torch.tensor(4e8)),
+        receiver,
+        to(carriers),
+    )
+
+
+def rows_of(received: Tensor | ReceivedPaths, rows: slice) -> Tensor | ReceivedPaths:
+    """Some queries' maps or paths."""
+    if isinstance(received, Tensor):
+        return received[rows]
+    shared = {"semi_axes"} if len(received.semi_axes) == 1 else set()
+    names = {"means", "semi_axes", "amplitudes", "lengths", "carriers"} - shared
+    return replace(received, **{name: getattr(received, name)[rows] for name in names})
 
 
 def _check_grid(pooling: Pooling) -> None:

@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from gaigs.directions import Directions, Grid, Rays
-from gaigs.geometry import Pose, from_spherical, quaternions_to_rotations
+from gaigs.geometry import Directions, Grid, Pose, Rays, from_spherical, quaternions_to_rotations
 from gaigs.projection import NEAR, Projection
 from gaigs.testing.checks import require, require_close, require_gradients, require_tensor
 

@@ -10,40 +10,36 @@ from torch import Tensor
 
 from gaigs.projection import Plane, Splats
 from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, Rasterizer
-from gaigs.testing._aperture import check_aperture
 from gaigs.testing.checks import PRECISION, fixed_sum, require, require_close, require_tensor
 
 
 def check_rasterizer(rasterizer: Rasterizer, device: torch.device | str = "cpu") -> None:
     """A rasterizer: map, transmittance and gradients against ``rasterize_densely``, on easy scenes and hard ones.
 
-    float64 may be refused by a ``TypeError``. Of one that draws no map fields and lags are held against plain sums.
+    float64 may be refused by a ``TypeError``.
 
     Raises:
         AssertionError: It breaks the contract of ``gaigs.rasterizer.Rasterizer``.
     """
-    if not getattr(rasterizer, "draws_map", True):
-        check_aperture(rasterizer, device)
-        return
     for title, arguments in _scenes():
         # Where A meets one of its bounds to within rounding, the two may rightly decide differently.
-        away = _distance_to_jumps(*arguments) > 1e-4
-        truth = _render(rasterize_densely, _cast(arguments, "cpu", torch.float64), away)
+        away = distance_to_jumps(*arguments) > 1e-4
+        truth = render_with_gradients(rasterize_densely, cast_scene(arguments, "cpu", torch.float64), away)
         for dtype, tolerance in PRECISION.items():
-            moved = _cast(arguments, device, dtype)
+            moved = cast_scene(arguments, device, dtype)
             try:
-                found = _render(rasterizer, moved, away.to(device))
+                found = render_with_gradients(rasterizer, moved, away.to(device))
             except TypeError:
                 require(dtype != torch.float32, "float32 must be supported")
                 continue
             for name, true in truth.items():
                 require_tensor(f"{title}: {name}", found[name], true.shape, dtype, device)
                 require_close(found[name].cpu(), true, tolerance, f"{title}: {name} must be that of the formula")
-            again = _render(rasterizer, moved, away.to(device))
+            again = render_with_gradients(rasterizer, moved, away.to(device))
             for name in ("map", "transmittance"):
                 require(torch.equal(found[name], again[name]), f"{title}: two runs must give the same {name}")
             require(isinstance(rasterizer.used, str), f"used must say what drew the map, got {rasterizer.used!r}")
-            alone = _render(rasterizer, _only_last(moved), away[-1:].to(device))
+            alone = render_with_gradients(rasterizer, _only_last(moved), away[-1:].to(device))
             rule = f"{title}: a map must not depend on other transmitters"
             require_close(alone["map"], found["map"][-1:], tolerance, rule)
     _check_nan_shows(rasterizer, device)
@@ -83,7 +79,7 @@ def footprints_of(splats: Splats, plane: Plane) -> tuple[Tensor, Float[Tensor, "
 
 
 @torch.no_grad()
-def _distance_to_jumps(splats, signal, opacities, attenuations, plane) -> Float[Tensor, "b rows columns"]:
+def distance_to_jumps(splats, signal, opacities, attenuations, plane) -> Float[Tensor, "b rows columns"]:
     """How far, relatively, each pixel is from the nearest jump of value or gradient, a G = ALPHA_MIN or ALPHA_MAX."""
     order, footprints = footprints_of(splats, plane)
     product = opacities[:, order, None, None].double() * footprints
@@ -137,7 +133,9 @@ def _scenes() -> Iterator[tuple[str, tuple]]:
     yield "rubbish that is not visible", (splats, *rest)
 
 
-def _render(rasterizer: Rasterizer, arguments: tuple, pixels: Bool[Tensor, "b rows columns"]) -> dict[str, Tensor]:
+def render_with_gradients(
+    rasterizer: Rasterizer, arguments: tuple, pixels: Bool[Tensor, "b rows columns"]
+) -> dict[str, Tensor]:
     """Map and transmittance at ``pixels``, and the gradients of a fixed function of both."""
     splats, signal, opacities, attenuations, plane = arguments
     leaves = {"means2d": splats.means2d, "factors": splats.factors}
@@ -154,7 +152,8 @@ def _render(rasterizer: Rasterizer, arguments: tuple, pixels: Bool[Tensor, "b ro
     return results
 
 
-def _cast(arguments: tuple, device: torch.device | str, dtype: torch.dtype) -> tuple:
+def cast_scene(arguments: tuple, device: torch.device | str, dtype: torch.dtype) -> tuple:
+    """Arguments of a rasterizer on another device and in another precision."""
     splats, signal, opacities, attenuations, plane = arguments
     to = lambda tensor: None if tensor is None else tensor.to(device, dtype)
     splats = Splats(*map(to, (splats.means2d, splats.factors, splats.depths)), splats.visible.to(device))
@@ -169,9 +168,9 @@ def _only_last(arguments: tuple) -> tuple:
 
 
 def _check_nan_shows(rasterizer: Rasterizer, device: torch.device | str) -> None:
-    """What is broken must not vanish."""
+    """NaN in an input must show in the map."""
     for name in ("means2d", "factors", "signal", "opacities"):
-        splats, signal, opacities, attenuations, plane = _cast(next(_scenes())[1], device, torch.float32)
+        splats, signal, opacities, attenuations, plane = cast_scene(next(_scenes())[1], device, torch.float32)
         broken = {"means2d": splats.means2d[None], "factors": splats.factors, "signal": signal}
         front = torch.where(splats.visible, splats.depths, torch.inf).argmin()
         broken.get(name, opacities)[:, front] = torch.nan

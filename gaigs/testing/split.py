@@ -11,34 +11,33 @@ from gaigs.testing.data import check_parts
 
 
 def check_split(build: Callable[[int], Split], links: Links, parts_rows: bool = False) -> None:
-    """A split: parts that ascend and share no link, rows that are never parted, and a seed that alone decides.
+    """Checks a split: ascending parts without a common link, whole rows, and the same parts for the same seed.
 
     Args:
-        build: Splits the links with a seed. Its other options are such that links are drawn at random, for the test or
-            to validate.
-        links: Those that it splits.
-        parts_rows: Whether links of one row may come into different parts, as for parts that came with the data.
+        build: Function from a seed to the split; its other options make it draw links at random.
+        links: Links to split.
+        parts_rows: True if links of one row may come into different parts, as for parts that came with the data.
 
     Raises:
-        AssertionError: It breaks the contract of ``gaigs.split``.
+        AssertionError: The split breaks the contract of ``gaigs.split``.
     """
     split = build(0)
     require(isinstance(split, Split), f"a split must be a gaigs.data.Split, got {type(split).__name__}")
-    require(isinstance(split.name, str) and bool(split.name), "a split must say its protocol as its name")
+    require(isinstance(split.name, str) and bool(split.name), "a split's name must be its protocol")
     check_parts(split.parts(), len(links))
     if not parts_rows:
         rows = rows_of(links)
         parts = [set(rows[part].tolist()) for part in split.parts().values()]
-        require(sum(map(len, parts)) == len(set().union(*parts)), "links of one row must come into one part")
+        require(sum(map(len, parts)) == len(set().union(*parts)), "links of one row must be in one part")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(12345)
-        _require_same(build(0), split, "the same seed must give the same split, whatever was drawn before")
+        _require_same(build(0), split, "the same seed must give the same split in any random state")
     others = [build(seed) for seed in range(1, 6)]
     for other in others:
         check_parts(other.parts(), len(links))
     drawn = {tuple(tuple(part.tolist()) for part in other.parts().values()) for other in (split, *others)}
     require(len(drawn) > 1, "another seed must give another split")
-    require(len({other.name for other in (split, *others)}) == 6, "a split's name must tell seeds apart")
+    require(len({other.name for other in (split, *others)}) == 6, "a split's name must differ between seeds")
 
 
 def _require_same(split: Split, other: Split, rule: str) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaigs.directions import Grid
+from gaigs.geometry import Grid
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.task import Metric, Task
@@ -17,14 +17,14 @@ SAMPLES = 5
 
 
 def check_task(task: Task, *thinnings: Mapping) -> None:
-    """A task: it comes back from its state, scores what is right best, refuses what is broken, thins consistently.
+    """Checks a task: its state restores it, true values score best, broken ones are refused, thinning is consistent.
 
     Args:
-        task: What to check.
-        thinnings: Options of its ``thinning`` to check beside none.
+        task: The task.
+        thinnings: Further options of its ``thinning`` to check.
 
     Raises:
-        AssertionError: It breaks the contract of ``gaigs.task.Task``.
+        AssertionError: The contract of ``gaigs.task.Task`` is broken.
     """
     _check_facts(task)
     _check_state(task)
@@ -58,10 +58,10 @@ def _check_state(task: Task) -> None:
     file.seek(0)
     state = torch.load(file, weights_only=True)
     again = registry("task").build(state)
-    require(type(again) is type(task), "the task must come back from its state as one of its kind")
-    require(flat(again.state()) == flat(task.state()), "the task must come back from its state as it was")
+    require(type(again) is type(task), "the task's state must restore its class")
+    require(flat(again.state()) == flat(task.state()), "the task's state must restore it")
     facts = lambda task: (task.shape, task.dtype, task.unit, task.normalisation, task.monitor, task.higher_is_better)
-    require(facts(again) == facts(task), "the task must come back from its state as it was")
+    require(facts(again) == facts(task), "the task's state must restore it")
 
 
 def _check_scores(task: Task, labels: Tensor, noise: Tensor) -> None:
@@ -73,7 +73,7 @@ def _check_scores(task: Task, labels: Tensor, noise: Tensor) -> None:
         require(right, f"the score {name} must be ({SAMPLES},) float64 on the CPU, got {score.shape}, {score.dtype}")
         require(bool(score.isfinite().all()), f"the score {name} must be finite")
     gain = perfect[task.monitor] - worse[task.monitor]
-    require(bool((gain > 0).all() if task.higher_is_better else (gain < 0).all()), "what is right must score best")
+    require(bool((gain > 0).all() if task.higher_is_better else (gain < 0).all()), "true values must score best")
     for name, score in task.scores(labels[-1:], values[-1:]).items():
         require_close(score, worse[name][-1:], 1e-9, f"the score {name} must not depend on the other samples")
     graded = task.scores(labels, values.clone().requires_grad_())
@@ -85,7 +85,7 @@ def _check_scores(task: Task, labels: Tensor, noise: Tensor) -> None:
     require(all(type(number) is float for number in best.values()), "summarise must give plain numbers")
     for name, metric in metrics.items():
         better = best[name] > second[name] if metric.higher_is_better else best[name] < second[name]
-        require(better, f"what is right must have the best {name}, got {best[name]} and else {second[name]}")
+        require(better, f"true values must have the best {name}, got {best[name]} and else {second[name]}")
     if (averaged := task.averaged(worse)) is not None:
         require([*averaged] == [*worse], f"averaged must give {', '.join(worse)}, got {', '.join(averaged)}")
         gain = averaged[task.monitor] - worse[task.monitor]
@@ -111,18 +111,18 @@ def _check_refusals(task: Task, labels: Tensor, values: Tensor) -> None:
 
 
 def _check_thinning(task: Task, options: dict) -> None:
-    """Each label is the number of its pixel, so that labels and directions tell whether they were parted."""
+    """Each label is the number of its pixel, which shows if labels and directions were thinned differently."""
     thin = task.thinning(**options)
     count = max(1, int(np.prod(task.shape)))
     numbers = torch.arange(count, dtype=torch.float64).reshape(task.shape).expand(2, *task.shape)
     query = Query(torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), torch.tensor([0, 1]))
     batch = Batch(query, task.directions, numbers, (0.5, 0.25))
     part, again = (thin(batch, torch.Generator().manual_seed(3)) for _ in range(2))
-    require(torch.equal(part.labels, again.labels), "the generator alone must decide what is looked at")
+    require(torch.equal(part.labels, again.labels), "only the generator may decide the thinning")
     require(part.shares == batch.shares and len(part) == 2, "thinning must keep links and shares")
     require(torch.equal(part.query.transmitters, query.transmitters), "thinning must keep the query")
     require(part.labels[0].numel() > 0, "thinning must leave something")
-    require(torch.equal(part.labels[0], part.labels[1]), "all links must be looked at in the same directions")
+    require(torch.equal(part.labels[0], part.labels[1]), "all links must keep the same directions")
     if task.directions is None:
         require(part.directions is None, "labels without directions must have none when thinned")
         return
@@ -132,4 +132,4 @@ def _check_thinning(task: Task, options: dict) -> None:
     if part.labels[0].numel() < count:
         other = [thin(batch, torch.Generator().manual_seed(seed)).labels for seed in range(8)]
         moved = any(x.shape != part.labels.shape or not torch.equal(x, part.labels) for x in other)
-        require(moved, "thinning must look at other directions in another step")
+        require(moved, "thinning must keep other directions in another step")

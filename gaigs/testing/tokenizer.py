@@ -5,38 +5,34 @@ import copy
 import torch
 from torch import nn
 
-from gaigs.placement import Placed
-from gaigs.query import Query
+from gaigs.gaussians import Placed, Tokens
 from gaigs.scene import Scene
 from gaigs.testing.checks import (
     PRECISION,
-    random_frequencies,
     random_places,
+    random_query,
     require,
     require_close,
     require_gradients,
     require_tensor,
 )
-from gaigs.tokenizer import Tokens
 
 
 def check_tokenizer(tokenizer: nn.Module, scene: Scene, device: torch.device | str = "cpu") -> None:
-    """A tokenizer built for the scene: widths, dtype, gradients, independence of the batch.
+    """Checks a tokenizer built for the scene: widths, dtype, gradients, independence of the batch.
 
-    Gaussians that stand elsewhere for each query are among what it is given, and so are the carriers of a scene that
-    has some.
+    The inputs include Gaussians that stand elsewhere for each query, and the scene's carriers.
 
     Raises:
-        AssertionError: It breaks the contract of ``gaigs.tokenizer.Tokens``.
+        AssertionError: The contract of ``gaigs.tokenizer.Tokens`` is broken.
     """
     generator = torch.Generator().manual_seed(0)
     cases = (40, 3, 1, torch.float32), (1, 1, 1, torch.float32), (40, 3, 1, torch.float64), (40, 3, 3, torch.float32)
     for n, b, sets, dtype in cases:
         module = copy.deepcopy(tokenizer).to(device, dtype).eval()
-        means, places = (random_places(scene, count, generator).to(device, dtype) for count in (sets * n, b))
-        placed = Placed(means.unflatten(0, (sets, n)))
+        placed = Placed(random_places(scene, sets * n, generator).to(device, dtype).unflatten(0, (sets, n)))
         opacities = torch.rand(n, generator=generator).to(device, dtype)
-        query = Query(places, torch.arange(b) % len(scene.receivers), random_frequencies(scene, b)).to(device)
+        query = random_query(scene, b, generator, dtype, device)
         query.transmitters.requires_grad_()
         tokens = module(placed, opacities, query)
         _check_shapes(module, tokens, n, b, sets, dtype, device)
@@ -51,7 +47,7 @@ def check_tokenizer(tokenizer: nn.Module, scene: Scene, device: torch.device | s
         heard = torch.cat((tokens.scene, tokens.transmitters), -1)
         if b > 1 and heard.shape[1]:
             apart = (heard[0] - heard[1]).abs().max() > PRECISION[dtype] * heard.abs().max()
-            require(bool(apart), "tokens must tell two transmitters apart")
+            require(bool(apart), "tokens of two transmitters must differ")
         nothing = module(Placed(placed.means[:1]), opacities, query[:0])
         require(len(nothing.scene) == len(nothing.transmitters) == 0, "no queries must have no tokens")
 
@@ -61,7 +57,10 @@ def _check_shapes(module, tokens, n, b, sets, dtype, device) -> None:
     gaussians = (n, module.gaussian_width)
     if tokens.gaussians.ndim == 3:
         gaussians = (b, *gaussians)
-    require(sets == 1 or not module.gaussian_width or len(gaussians) == 3, "Gaussians that move must have own tokens")
+    require(
+        sets == 1 or not module.gaussian_width or len(gaussians) == 3,
+        "Gaussians that differ between queries must have own tokens",
+    )
     shapes = (b, module.scene_width), gaussians, (b, module.transmitter_width)
     for name, token, shape in zip(Tokens._fields, tokens, shapes, strict=True):
         require_tensor(f"the token {name}", token, shape, dtype, device)

@@ -19,16 +19,10 @@ from gaigs.query import Batch
 from gaigs.scene import Scene
 from gaigs.testing.checks import flat, require, require_close, require_raises
 from gaigs.training.batches import Batches, InOrder
-from gaigs.training.callbacks import KeepLast, save
+from gaigs.training.checkpoints import KeepLast, save
 
-STEPS = 6
-"""Of a whole training."""
-
-STOP = 3
-"""The step behind which one is stopped; validations are due behind every second."""
-
-ADVICE = (".*LeafSpec", ".*does not have many workers", "GPU available but not used")
-"""Warnings of Lightning's that say nothing of the training."""
+STEPS, STOP = 6, 3
+"""Steps of a whole training and of an interrupted one; every second step validates."""
 
 
 def check_training(
@@ -37,17 +31,17 @@ def check_training(
     links: Links,
     device: torch.device | str = "cpu",
 ) -> None:
-    """A training: it takes one step a batch, validates, follows from its seed, and goes on as if it had never stopped.
+    """Checks a training: one step a batch, validation, results that follow from the seed, bit-exact resume.
 
     Args:
-        build: Makes it, given ``model``, ``loss``, ``identity`` and ``seed`` by name, as
-            ``functools.partial(registry("training").build, config)`` does; all of its learning rates positive.
-        build_model: Makes a model that it trains, for a scene.
-        links: What it trains on; with a split that validates.
-        device: Where it works.
+        build: Makes the training, given ``model``, ``loss``, ``identity`` and ``seed`` by name, as
+            ``functools.partial(registry("training").build, config)`` does; all learning rates are positive.
+        build_model: Makes a model for a scene.
+        links: Links with a split that validates.
+        device: Device of the computation.
 
     Raises:
-        AssertionError: It breaks the contract of kind ``training``, see ``gaigs.training.descent.Descent``.
+        AssertionError: The contract of kind ``training`` is broken, see ``gaigs.training.descent.Descent``.
     """
     identity = {"who": "the check", "numbers": torch.arange(3)}
 
@@ -65,26 +59,27 @@ def check_training(
     module.on_save_checkpoint(content)
     require(flat(content.get(KEY)) == flat(identity), f"a checkpoint must hold the identity as its entry {KEY!r}")
     other = f"none but {module.model.trained_by}"
-    require_raises(ValueError, lambda: make(trained_by=other), "a model that is trained otherwise must be a ValueError")
+    require_raises(ValueError, lambda: make(trained_by=other), "a model of another training must be a ValueError")
     before = _copy(module.model)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         whole = _train(module, links, folder, device)
         require(whole.steps == list(range(1, STEPS + 1)), f"{STEPS} batches must be as many steps, got {whole.steps}")
-        _check_loss(whole)
+        finite = all(map(math.isfinite, whole.losses))
+        require(finite, f"each step must log a finite train/loss for the progress bar, got {whole.losses}")
         _check_changes(module.model, before)
         _check_validation(module.model, links, whole.metrics)
         again = _train(make(), links, folder, device)
         _compare(again.states, whole.states, "the same seed must give the same training")
         unlike = make()
-        torch.manual_seed(1)  # another process need not start from the same
+        torch.manual_seed(1)  # another process starts from another state
         rest = _train(unlike, links, folder, device, resume=folder / f"{STOP}.ckpt")
-    require(rest.steps == whole.steps[STOP:], f"a training must go on where it stopped, got steps {rest.steps}")
-    _compare(rest.states, whole.states[STOP:], "a training must go on as if it had never stopped")
+    require(rest.steps == whole.steps[STOP:], f"a resumed training must start where it stopped, got steps {rest.steps}")
+    _compare(rest.states, whole.states[STOP:], "a resumed training must equal an uninterrupted one")
 
 
 class _Course(Callback):
-    """The model behind every step, and what the training told; writes a checkpoint behind one of them."""
+    """Keeps the model and the logged loss of every step; writes a checkpoint after step ``STOP``."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -107,22 +102,19 @@ class _Course(Callback):
 def _train(module, links: Links, folder: Path, device, resume: Path | None = None) -> _Course:
     course = _Course(folder)
     with stopping(), warnings.catch_warnings():
-        for message in ADVICE:
+        for message in (".*LeafSpec", ".*does not have many workers", "GPU available but not used"):  # Lightning's
             warnings.filterwarnings("ignore", message)
+        quiet = dict.fromkeys(("logger", "enable_progress_bar", "enable_model_summary"), False)
+        steps = {"max_epochs": -1, "max_steps": STEPS, "val_check_interval": 2, "check_val_every_n_epoch": None}
         trainer = lightning.Trainer(
             accelerator="gpu" if torch.device(device).type == "cuda" else "cpu",
             devices=1,
-            max_epochs=-1,
-            max_steps=STEPS,
-            val_check_interval=2,
-            check_val_every_n_epoch=None,
             num_sanity_val_steps=0,
             log_every_n_steps=1,
-            logger=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
             callbacks=[course, KeepLast(folder / "last.ckpt", math.inf)],
             default_root_dir=folder,
+            **steps,
+            **quiet,
         )
         batches = Batches(links, links.split.train, module.batch_size, 0, STEPS)
         validation = InOrder(links, links.split.validation, module.batch_size)
@@ -131,13 +123,13 @@ def _train(module, links: Links, folder: Path, device, resume: Path | None = Non
 
 
 def _squared(values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-    """The mean squared error, of any task."""
+    """The mean squared error of any task."""
     error = (values - batch.labels).abs().square().mean()
     return error, {"squared": error}
 
 
 def _check_attributes(module: lightning.LightningModule, links: Links) -> None:
-    """What a run asks a training for."""
+    """Attributes that a run reads."""
     require(isinstance(module, lightning.LightningModule), f"a training must be a LightningModule, got {type(module)}")
     require(isinstance(module.model, Model), "the training's model must be its attribute model")
     require(module.task.name == links.task.name, "the training's task must be that of its model's scene")
@@ -148,16 +140,11 @@ def _check_attributes(module: lightning.LightningModule, links: Links) -> None:
     require(density is None or isinstance(density, Mapping), f"density must be options or None, got {density!r}")
 
 
-def _check_loss(course: _Course) -> None:
-    finite = all(math.isfinite(loss) for loss in course.losses)
-    require(finite, f"each step must log a finite train/loss for the progress bar, got {course.losses}")
-
-
 def _check_changes(model: Model, before: dict[str, Tensor]) -> None:
     after, names = _copy(model), {id(parameter): name for name, parameter in model.named_parameters()}
     for group, parameters in model.parameter_groups().items():
         changed = any(not torch.equal(after[names[id(p)]], before[names[id(p)]]) for p in parameters if p.requires_grad)
-        require(changed, f"the parameters of group {group} must be trained, and stay as they were")
+        require(changed, f"the parameters of group {group} must change in training")
 
 
 def _check_validation(model: Model, links: Links, metrics: Mapping[str, float]) -> None:
@@ -168,7 +155,7 @@ def _check_validation(model: Model, links: Links, metrics: Mapping[str, float]) 
     for name, expected in links.task.logged({name: score.mean().item() for name, score in scores.items()}).items():
         logged = metrics.get(f"validation/{name}")
         require(logged is not None, f"a validation must log validation/{name}, got {', '.join(metrics) or 'nothing'}")
-        rule = f"validation/{name} must be the mean over the validation links of what the model evaluates"
+        rule = f"validation/{name} must be the mean score of the validation links"
         require_close(torch.tensor(logged), torch.tensor(expected), 1e-4, rule)
 
 

@@ -6,46 +6,35 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed, Tokens
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene
-from gaigs.tokenizer import Tokens
 
-PERIOD = 16
-"""The shortest period of the transmitter's features over the distance between neighbouring training transmitters;
-chosen on validation parts of rfid-s23-200 and the built-in room."""
-
-NOISY_OCTAVE = -4
-"""The highest octave of the transmitter's features where labels are noisy: an RSSI scatters by decibels however close
-the next one is, and features of 16 m leave it to the network how sharp a wall's shadow is; chosen by leaving out one of
-the robot's training runs in ble-flat."""
-
-FINEST = 30
-"""No octave is beyond it, up or down: float32 tells no places apart in waves of a nanometre, or of a million km."""
+MAX_OCTAVE = 30
+"""Bound of octaves, up and down: float32 resolves no places in waves of a nanometre or a million km."""
 
 BAND_FREQUENCIES = math.pi * 2.0 ** torch.arange(-1, 3)
-"""Angular frequencies of the features of the carrier, over its position in the band, -1 to 1: periods from twice the
-band down to a quarter of it."""
+"""Angular frequencies of the carrier's features over its position in the band, -1 to 1: periods from twice the band to
+a quarter of it."""
 
 
 @register("tokenizer", "euclidean")
 class EuclideanTokenizer(nn.Module):
     """Fourier features of the Gaussians, and of the transmitter through a two-layer network.
 
-    The transmitter's network runs once a transmitter, not once a Gaussian, so its width costs next to nothing. Where
-    the data have several carriers, it also sees where in their band the query's lies.
+    The transmitter's network runs once for each transmitter, not for each Gaussian, so its width costs little. For
+    data with several carriers its input also has the carrier's position in the band.
 
     Args:
-        scene: Positions are taken relative to the middle of the transmitters' box, and of the receivers.
+        scene: The middles of the transmitters' box and of the receivers are the origins of positions.
         gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a metre.
-        transmitter_octaves: The same for the transmitter; None takes those that the training transmitters can teach,
-            see ``learnable_octaves``.
+        transmitter_octaves: The same for the transmitter; None: see ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
         width: Width of E(P_TX). With None for both there is no network, and E(P_TX) are the features themselves.
 
     Raises:
-        ValueError: A range of octaves is empty or too wide, a width is out of range, or one of the two is None alone.
+        ValueError: A range of octaves is empty or too wide, a width is out of range, or only one width is None.
 
     Source: GAI-GS, "Multi-view Tokenizer"; Tancik et al., Fourier Features, 2020.
     """
@@ -86,8 +75,8 @@ class EuclideanTokenizer(nn.Module):
         if width is not None:
             self.network = nn.Sequential(nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, width))
 
-    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
-        """E(P_x) and E(P_TX); opacities are not looked at."""
+    def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
+        """E(P_x) and E(P_TX); opacities have no influence."""
         means = placed.means[0] if len(placed.means) == 1 else placed.means
         gaussians = fourier_features(means - self.receivers_middle, self.gaussian_frequencies)
         features = fourier_features(query.transmitters - self.transmitters_middle, self.transmitter_frequencies)
@@ -98,33 +87,36 @@ class EuclideanTokenizer(nn.Module):
 
 
 def learnable_octaves(scene: Scene) -> tuple[int, int]:
-    """Lowest and highest octave of features of the transmitter, as far as the training transmitters bear them out.
+    """Lowest and highest octave of the transmitter's features that the training transmitters can teach.
 
-    Periods go from twice the box's longest edge down to ``PERIOD`` distances between neighbouring transmitters: the
-    network multiplies frequencies, so what it is given must be well below what these sample. Noisy labels bear out no
-    more than ``NOISY_OCTAVE``.
+    Periods range from twice the box's longest edge down to 16 distances between neighbouring transmitters: the network
+    multiplies frequencies, so its input must be well below their sampling limit. For noisy labels they are at least
+    16 m: an RSSI scatters by decibels at any distance, and the network finds how sharp a wall's shadow is.
     """
     edge = (scene.upper - scene.lower).max().item()
-    highest = min(round(-math.log2(PERIOD * scene.spacing)), FINEST)
+    # 16 distances: chosen on validation parts of rfid-s23-200 and the built-in room.
+    highest = min(round(-math.log2(16 * scene.spacing)), MAX_OCTAVE)
     if scene.task.is_noisy:
-        highest = min(highest, NOISY_OCTAVE)
+        highest = min(highest, -4)  # 16 m: chosen by leaving out one of the robot's training runs in ble-flat
     return min(highest, math.floor(-math.log2(2 * edge))), highest
 
 
-def octaves(option: str, lowest: int, highest: int) -> Float[Tensor, "octaves"]:
+def octaves(option: str, lowest: int, highest: int) -> Float[Tensor, " octaves"]:
     """Angular frequencies 2 pi 2^k [rad/m] for k from lowest to highest.
 
     Raises:
-        ValueError: The range is empty, or goes beyond ``FINEST``.
+        ValueError: The range is empty, or exceeds ``MAX_OCTAVE``.
     """
-    if not -FINEST <= lowest <= highest <= FINEST:
-        raise ValueError(f"{option} must be [lowest, highest] within {-FINEST}..{FINEST}, got [{lowest}, {highest}]")
+    if not -MAX_OCTAVE <= lowest <= highest <= MAX_OCTAVE:
+        raise ValueError(
+            f"{option} must be [lowest, highest] within {-MAX_OCTAVE}..{MAX_OCTAVE}, got [{lowest}, {highest}]"
+        )
     return 2 * math.pi * 2.0 ** torch.arange(lowest, highest + 1)
 
 
 def fourier_features(
-    points: Float[Tensor, "*batch d"], frequencies: Float[Tensor, "octaves"]
+    points: Float[Tensor, "*batch d"], frequencies: Float[Tensor, " octaves"]
 ) -> Float[Tensor, "*batch features"]:
-    """[x, sin(w x), cos(w x)] for every coordinate and angular frequency w: d (1 + 2 octaves) numbers."""
+    """[x, sin(w x), cos(w x)] for every coordinate x and angular frequency w: d (1 + 2 octaves) numbers."""
     phases = (points[..., None] * frequencies).flatten(-2)
     return torch.cat((points, phases.sin(), phases.cos()), -1)

@@ -7,11 +7,10 @@ from torch import Tensor, nn
 from gaigs.algebra import PROJECTIVE, SPACETIME
 from gaigs.algebra.embedding import embed_event, embed_point
 from gaigs.algebra.layers import EquivariantLinear, GATrBlock
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed, Tokens
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene
-from gaigs.tokenizer import Tokens
 
 ALGEBRAS = {"projective": (PROJECTIVE, embed_point), "spacetime": (SPACETIME, embed_event)}
 
@@ -20,25 +19,25 @@ ALGEBRAS = {"projective": (PROJECTIVE, embed_point), "spacetime": (SPACETIME, em
 class GATokenizer(nn.Module):
     """CLS of a Geometric Algebra Transformer (GATr) over CLS, the transmitter and anchors; no position embeddings.
 
-    Tokens are [CLS, TX, anchors]: CLS is a learnable point, anchors are the centres of the most opaque Gaussians,
-    chosen anew at every call, the same for all transmitters, without a gradient. Each is a multivector, and two scalars
-    say which of the three it is; where the data have several carriers, a third says where in their band the query's
-    lies. The linear read-out makes CLS depend on the room's axes, as the field does.
+    Tokens are [CLS, TX, anchors]: CLS is a learnable point; anchors are the centres of the most opaque Gaussians,
+    chosen at every call, the same for all transmitters, without a gradient. Each is a multivector with two scalars for
+    its type; for data with several carriers a third scalar has the carrier's position in the band. The linear read-out
+    makes CLS depend on the room's axes, as the field does.
 
-    Positions are taken relative to the middle of the box around the transmitters and receivers and divided by half its
-    longest edge, one scale for all axes, so that they are of order one and motions remain motions.
+    Positions are relative to the middle of the box around transmitters and receivers, and divided by half its longest
+    edge, so that they are of order one and motions remain motions.
 
     Args:
-        scene: Its box and receivers fix that middle and scale.
-        anchors: Gaussians among the tokens; all of them where there are fewer. The paper's M, 16 as released.
+        scene: Its box and receivers set that middle and scale.
+        anchors: Number of anchors, at most all Gaussians; the paper's M, 16 as released.
         blocks: GATr blocks; one as released.
         multivectors: Multivector channels within the blocks, even and a multiple of ``heads``; 16 as released.
         scalars: Scalar channels within the blocks, a multiple of ``heads``; 4 as released.
         heads: Attention heads of a block; ours.
         width: Numbers of the scene token; 16 as released.
-        algebra: ``projective``, G(3,0,1), whose motions are rotations, translations and mirrors (GATr's), or
-            ``spacetime``, G(3,1,0), rotations, boosts and mirrors about the middle (the paper's preliminaries); points
-            are events at time zero there.
+        algebra: ``projective``, G(3,0,1) with rotations, translations and mirrors (GATr's); or ``spacetime``,
+            G(3,1,0) with rotations, boosts and mirrors about the middle (the paper's preliminaries), whose points are
+            events at time zero.
 
     Raises:
         ValueError: An option is out of range, or the box is a single point.
@@ -75,7 +74,7 @@ class GATokenizer(nn.Module):
         scale = (upper - lower).max() / 2
         if not scale > 0:
             raise ValueError(
-                f"transmitters and receivers must not all stand at one point, got {lower.tolist()}; check the positions"
+                f"transmitters and receivers must not all be at one point, got {lower.tolist()}; check the positions"
             )
         self.register_buffer("middle", (lower + upper) / 2)
         self.register_buffer("scale", scale)
@@ -90,7 +89,7 @@ class GATokenizer(nn.Module):
         self.last = EquivariantLinear(self.algebra, (multivectors, 1), (scalars, 2))
         self.read_out = nn.Linear(self.algebra.size + 2, width)
 
-    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
+    def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
         """CLS for every query.
 
         Args:
@@ -104,7 +103,7 @@ class GATokenizer(nn.Module):
         tx, anchors = ((positions - self.middle) / self.scale for positions in (transmitters, anchors))
         tokens = [self.cls.expand(b, 1, 3), tx[:, None]]
         *blocks, final = self.blocks
-        # Anchors are alike for all queries as long as nobody reads what they become once they see the transmitter.
+        # With a single block anchors stay the same for all queries: their outputs are not read.
         alike = len(anchors) == 1 and not blocks and not self.scene.has_band
         if not alike:
             tokens.append(anchors.expand(b, m, 3))
@@ -121,13 +120,13 @@ class GATokenizer(nn.Module):
 
         points = self.embed(tokens)
         multivectors, scalars = self.first(points[:, None], types)
-        reference = points[: b * groups[1]].unflatten(0, groups)[:, 1]  # the transmitter, which moves with the room
+        reference = points[: b * groups[1]].unflatten(0, groups)[:, 1]  # the transmitter moves with the room
         if blocks:
             multivectors, scalars = multivectors.unflatten(0, groups), scalars.unflatten(0, groups)
             for block in blocks:
                 multivectors, scalars = block(multivectors, scalars, reference)
             multivectors, scalars = multivectors.flatten(0, 1), scalars.flatten(0, 1)
-        # Only CLS is read, so in the final block it alone looks, and it alone goes on.
+        # Only CLS is read, so the final block computes CLS alone.
         multivectors, scalars = final.transform(*final.look(multivectors, scalars, groups), reference)
         multivectors, scalars = self.last(multivectors, scalars)
         scene = self.read_out(torch.cat((multivectors.flatten(1), scalars.flatten(1)), -1))

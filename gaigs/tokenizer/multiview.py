@@ -5,11 +5,10 @@ from collections.abc import Mapping
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed, Tokens
 from gaigs.query import Query
 from gaigs.registry import register, registry
 from gaigs.scene import Scene
-from gaigs.tokenizer import Tokens
 
 
 @register("tokenizer", "multiview")
@@ -17,9 +16,9 @@ class MultiviewTokenizer(nn.Module):
     """The scene token of ``ga`` beside the position embeddings of ``euclidean``.
 
     Args:
-        scene: Handed to both.
-        ga: The tokenizer that gives the scene token, its name or its configuration.
-        euclidean: The one that gives the position embeddings, likewise.
+        scene: Passed to both.
+        ga: Tokenizer of the scene token: its name, configuration or the object.
+        euclidean: Tokenizer of the position embeddings, likewise.
 
     Source: GAI-GS, "Multi-view Tokenizer".
     """
@@ -34,7 +33,7 @@ class MultiviewTokenizer(nn.Module):
         self.gaussian_width = self.euclidean.gaussian_width
         self.transmitter_width = self.euclidean.transmitter_width
 
-    def forward(self, placed: Placed, opacities: Float[Tensor, "n"], query: Query) -> Tokens:
-        """CLS of the one, E(P_x) and E(P_TX) of the other."""
+    def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
+        """CLS of ``ga``; E(P_x) and E(P_TX) of ``euclidean``."""
         _, gaussians, transmitters = self.euclidean(placed, opacities, query)
         return Tokens(self.ga(placed, opacities, query).scene, gaussians, transmitters)

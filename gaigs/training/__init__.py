@@ -1,4 +1,4 @@
-"""Training fits a model to the links: how it descends, in which batches, and what happens between the steps."""
+"""Training: gradient descent of a model on links, its batches, and its callbacks between the steps."""
 
 import torch
 
@@ -7,7 +7,7 @@ from gaigs.task import Task
 
 
 def seeded(*numbers: int) -> torch.Generator:
-    """A random generator that a seed and, say, a step decide alone."""
+    """A random generator that follows from numbers alone, such as a seed and a step."""
     return torch.Generator().manual_seed(hash(numbers) % 2**63)
 
 
@@ -15,7 +15,7 @@ class MeanScores:
     """Means of a task's scores over links, which may be spread over several processes.
 
     Args:
-        task: Whose scores.
+        task: Its scores.
     """
 
     def __init__(self, task: Task):
@@ -24,14 +24,14 @@ class MeanScores:
         self.count = 0
 
     def add(self, batch: Batch, values: torch.Tensor) -> None:
-        """Scores the links of a batch; one whose share is 0 counts for nothing."""
+        """Adds the scores of a batch, weighted by the batch's share of links."""
         share = batch.shares[0]
         self.count += share * len(batch)
         for name, scores in self.task.scores(batch.labels, values).items():
             self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """The mean of each score, as ``Task.logged`` has it; every process has to ask.
+        """The mean of each score, as of ``Task.logged``; every process has to call it.
 
         Args:
             strategy: Lightning's, which knows the processes.

@@ -1,6 +1,6 @@
-"""Batches of links: shuffled for training, such that a run can stop anywhere and go on there; in order for scores.
+"""Batches of links: shuffled and resumable for training; in order for scores.
 
-Where several processes train together, each takes its share of every batch.
+Of several processes that train together, each takes its share of every batch.
 """
 
 from collections.abc import Iterator
@@ -16,33 +16,33 @@ from gaigs.training import seeded
 
 
 def process() -> tuple[int, int]:
-    """The number of this process, from 0, and how many train together."""
+    """The number of this process, from 0, and the number of processes."""
     if distributed.is_available() and distributed.is_initialized():
         return distributed.get_rank(), distributed.get_world_size()
     return 0, 1
 
 
 class Batches:
-    """Batches of a fixed number of places with all their links, in an order that seed and step alone decide.
+    """Batches of a fixed number of places with all their links, in an order that follows from seed and step alone.
 
-    A place is a transmitter's position and frequency: what it excites is the same for all receivers, and is computed
-    once where its links come together. Every pass goes through all places once, anew shuffled. The batch of step k is
-    the same whether or not the run was interrupted before it, so a resumed training sees what an uninterrupted one
-    would have. Of several processes each gets every so-manieth place of the batch, with the weights (``Batch.shares``)
-    that make the mean over processes the mean over the batch.
+    A place is a transmitter's position and frequency: its excitation is the same for all receivers, and is computed
+    once where its links come together. Every pass goes through all places once, in a new order. The batch of a step
+    does not depend on an interruption before it, so a resumed training equals an uninterrupted one. Each process gets
+    every ``world_size``-th place of the batch, with the weights (``Batch.shares``) that make the mean over processes
+    the mean over the batch.
 
     Args:
         links: The data set.
         index: The links to draw from.
         size: Places a batch, of all processes together; the last batch of a pass may hold fewer.
         seed: Of the order.
-        steps: How many batches there are in all.
+        steps: Number of batches.
 
     Raises:
         ValueError: The size or the number of steps is less than 1.
     """
 
-    def __init__(self, links: Links, index: Int[Tensor, "k"], size: int, seed: int, steps: int):
+    def __init__(self, links: Links, index: Int[Tensor, " k"], size: int, seed: int, steps: int):
         for option, value in (("training.batch_size", size), ("trainer.max_steps", steps)):
             if value < 1:
                 raise ValueError(f"{option} must be at least 1, got {value}")
@@ -63,9 +63,9 @@ class Batches:
                 self.position += 1
                 yield self._share([self.places[i] for i in chosen])
 
-    def _share(self, places: list[Int[Tensor, "k"]]) -> Batch:
+    def _share(self, places: list[Int[Tensor, " k"]]) -> Batch:
         rank, processes = process()
-        # A process that would have none takes one with no weight: it has to take part in the step.
+        # A process without a place takes one with weight 0: every process has to take part in the step.
         own = places[rank::processes] or places[:1]
         batch = self.links.batch(torch.cat(own))
         if processes == 1:
@@ -75,16 +75,14 @@ class Batches:
         return replace(batch, shares=(links, held * processes * len(own) / len(places)))
 
     def state_dict(self) -> dict:
-        """How far the training has come."""
         return {"position": self.position}
 
     def load_state_dict(self, state: dict) -> None:
-        """Goes on from there."""
         self.position = state["position"]
 
 
 class InOrder:
-    """One pass over links in their order; of several processes each gets every so-manieth link of a batch.
+    """One pass over links in their order; each process gets every ``world_size``-th link of a batch.
 
     Args:
         links: The data set.
@@ -92,7 +90,7 @@ class InOrder:
         size: Links a batch, of all processes together; the last one may hold fewer.
     """
 
-    def __init__(self, links: Links, index: Int[Tensor, "k"], size: int):
+    def __init__(self, links: Links, index: Int[Tensor, " k"], size: int):
         self.links = links
         self.parts = index.split(size) if len(index) else ()
 
@@ -103,6 +101,6 @@ class InOrder:
         rank, processes = process()
         for part in self.parts:
             own = part[rank::processes]
-            # A process that would have none takes one with no weight: all go through the same number of batches.
+            # A process without a link takes one with weight 0: all go through the same number of batches.
             share = float(len(own) > 0)
             yield replace(self.links.batch(own if share else part[:1]), shares=(share, share))

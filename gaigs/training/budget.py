@@ -1,5 +1,6 @@
-"""What a training may take: steps, wall time, or both; and how much of it is spent."""
+"""The budget of a training: steps, wall time, or both; and how much of it is spent."""
 
+import time
 from collections.abc import Callable, Mapping
 
 import lightning
@@ -9,51 +10,61 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from gaigs.registry import check_type
 
 ENDLESS = 2**40
-"""A number of steps that no training comes to. Without one Lightning fetches batches ahead of the steps, and a training
-that goes on would miss those."""
-
-
-VALIDATING = 0.2
-"""The share of a training by time that validations take at the most, where they are slow: they wait until then."""
+"""A number of steps that no training comes to. Without a number Lightning fetches batches ahead of the steps, and a
+resumed training would miss those."""
 
 
 class Budget(Callback):
-    """Ends a training when its time is up, and has it validate by time.
+    """Measures a training's time, ends it when its time is up, and has it validate by time.
 
-    The clock of the first process decides for all, behind each step. It goes on while a training validates, and where
-    one goes on it has the time that was spent before. Lightning's own validation by time is not used: its processes
-    each go by a clock of their own, and nothing between the steps could tell that a validation is due.
+    The clock of the first process decides for all, after each step. It goes on while a training validates, and a
+    resumed training starts with the time spent before. Lightning's own validation by time is not used: each process
+    follows a clock of its own there, and no callback can know between steps that a validation is due.
+
+    It stands first among the callbacks, and the trainer has no ``max_time``.
 
     Args:
-        timer: Measures the time; it stands before this one among the callbacks, and the trainer has no ``max_time``.
         max_time: Of the training [s]; None where steps alone end it.
-        every: Time from the end of a validation to the next, or more where validations are slow [s]; None where steps
-            say when to validate.
+        every: Time from the end of a validation to the next [s], or more, so that slow validations take a fifth of the
+            training at the most; None where steps say when to validate.
+
+    Attributes:
+        share: Share of ``max_time`` spent, the same in all processes; 0 without it.
     """
 
-    def __init__(self, timer: Timer, max_time: float | None, every: float | None):
-        self.timer, self.max_time, self.every = timer, max_time, every
+    def __init__(self, max_time: float | None = None, every: float | None = None):
+        self.max_time, self.every = max_time, every
         self.share = 0.0
         self.began = self.validated = 0.0  # the last validation, and its end [s]
         self.is_due = False
+        self.spent, self.start = 0.0, None  # time before this process took over [s], and its clock then
+
+    @property
+    def seconds(self) -> float:
+        """Time of the training so far [s]."""
+        return self.spent + (0.0 if self.start is None else time.monotonic() - self.start)
 
     def state_dict(self) -> dict:
-        return {"share": self.share, "began": self.began, "validated": self.validated, "is_due": self.is_due}
+        last = {"share": self.share, "began": self.began, "validated": self.validated, "is_due": self.is_due}
+        return {"seconds": self.seconds, **last}
 
     def load_state_dict(self, state: dict) -> None:
-        self.share, self.is_due = state["share"], state["is_due"]
+        self.spent, self.share, self.is_due = state["seconds"], state["share"], state["is_due"]
         self.began, self.validated = state["began"], state["validated"]
 
     def on_fit_start(self, trainer, module) -> None:
         self._stop_in_time(trainer)  # a run that was killed once its time was up
 
     def on_train_start(self, trainer, module) -> None:
-        if self.is_due:  # the checkpoint was written behind a validation, which is not to be repeated
+        self.start = time.monotonic()
+        if self.is_due:  # the checkpoint was written after a validation, which is not to be repeated
             trainer.val_check_batch = trainer.global_step
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
+        if self.max_time is None and self.every is None:
+            return
         elapsed = self._look(trainer)
-        pause = (self.validated - self.began) * (1 - VALIDATING) / VALIDATING
+        pause = 4 * (self.validated - self.began)
         is_time = self.every is not None and elapsed >= self.validated + max(self.every, pause)
         self.is_due = trainer.should_stop or is_time
         if self.is_due:
@@ -63,14 +74,19 @@ class Budget(Callback):
             trainer.val_check_batch = ENDLESS
 
     def on_validation_end(self, trainer, module) -> None:
+        if self.max_time is None and self.every is None:
+            return
         self.validated = self._look(trainer)
         if not trainer.sanity_checking:
             for logger in trainer.loggers:  # beside the scores of this validation
                 logger.log_metrics({"seconds": self.validated}, step=trainer.global_step - 1)
 
+    def on_train_end(self, trainer, module) -> None:
+        self.spent, self.start = self.seconds, None
+
     def _look(self, trainer) -> float:
-        """Looks at the clock: seconds so far."""
-        elapsed = trainer.strategy.broadcast(self.timer.time_elapsed("train"))
+        """The first process's time [s]; stops the training when it is up."""
+        elapsed = trainer.strategy.broadcast(self.seconds)
         self.share = 0.0 if self.max_time is None else elapsed / self.max_time
         self._stop_in_time(trainer)
         return elapsed
@@ -79,20 +95,16 @@ class Budget(Callback):
         trainer.should_stop = trainer.should_stop or self.share >= 1
 
 
-def make_budget(options: Mapping, timer: Timer) -> tuple[dict, Budget | None]:
-    """The options of Lightning's trainer without those that the budget keeps, and the budget.
+def make_budget(options: Mapping) -> tuple[dict, Budget]:
+    """The options of Lightning's trainer without those of the budget, and the budget.
 
     Args:
-        options: Those of the configuration: ``max_time`` and, where it is a time, ``val_check_interval`` are kept.
-        timer: As ``Budget`` takes it.
-
-    Returns:
-        None in place of a budget where steps alone count.
+        options: Of the configuration: the budget takes ``max_time`` and a ``val_check_interval`` that is a time.
 
     Raises:
-        TypeError: What counts steps is no whole number.
-        ValueError: A time is not written as Lightning reads it, or is less than a second; nothing ends the training; or
-            an option has steps or epochs at which nothing can happen.
+        TypeError: A number of steps is no whole number.
+        ValueError: A time is not as Lightning reads it, or less than a second; nothing ends the training; or an option
+            counts in epochs.
     """
     options = dict(options)
     max_time, every = options.pop("max_time", None), options.get("val_check_interval")
@@ -113,38 +125,38 @@ def make_budget(options: Mapping, timer: Timer) -> tuple[dict, Budget | None]:
         epochs = options.get(option)
         if epochs not in (only, None):
             raise ValueError(f"trainer.{option} must be {only or 'null'}, as steps or time count, got {epochs}")
-    return options, None if max_time is None and every is None else Budget(timer, max_time, every)
+    return options, Budget(max_time, every)
 
 
-def seconds(option: str, time: object) -> float:
-    """A time in the words of Lightning's ``Timer`` [s].
+def seconds(option: str, duration: object) -> float:
+    """A duration as Lightning's ``Timer`` reads it [s].
 
     Args:
-        option: Whose it is.
-        time: DD:HH:MM:SS, or a mapping such as ``{minutes: 3}``.
+        option: Its name in errors.
+        duration: DD:HH:MM:SS, or a mapping such as ``{minutes: 3}``.
 
     Raises:
         ValueError: It is neither, or less than a second.
     """
     try:
-        found = Timer(duration=time).time_remaining() if isinstance(time, str | dict) else 0
+        found = Timer(duration=duration).time_remaining() if isinstance(duration, str | dict) else 0
     except (MisconfigurationException, TypeError):
         found = 0
     if found < 1:
         raise ValueError(
-            f"{option} must be a time of at least a second as 'DD:HH:MM:SS', in quotes in a file, got {time!r}"
+            f"{option} must be a time of at least a second as 'DD:HH:MM:SS', in quotes in a file, got {duration!r}"
         )
     return found
 
 
 def time_share(trainer: lightning.Trainer) -> float | None:
-    """The share of the time that is spent, the same in all processes; None where no time is given."""
+    """The share of the time that is spent, the same in all processes; None without ``max_time``."""
     budgets = (callback for callback in trainer.callbacks if isinstance(callback, Budget))
     return next((budget.share for budget in budgets if budget.max_time is not None), None)
 
 
 def share_done(trainer: lightning.Trainer) -> Callable[[int], float]:
-    """How much of a training is done after so many steps: of its steps or of its time, whichever is more."""
+    """The share of a training done after a number of steps: of its steps or of its time, whichever is more."""
 
     def share(step: int) -> float:
         by_steps = step / trainer.max_steps if trainer.max_steps > 0 else 0.0

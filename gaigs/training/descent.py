@@ -1,5 +1,6 @@
-"""Gradient descent of one optimizer."""
+"""Gradient descent with one optimizer."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import lightning
@@ -7,7 +8,6 @@ import torch
 from torch import Tensor
 
 from gaigs.checkpoint import KEY
-from gaigs.gaussians import Gaussians
 from gaigs.loss import Loss
 from gaigs.model import Model
 from gaigs.query import Batch
@@ -17,35 +17,30 @@ from gaigs.training.budget import share_done
 from gaigs.training.finite import find_broken, is_finite
 from gaigs.training.schedule import make_optimizer, make_schedule
 
-RATES = {*Gaussians.PARAMETERS, "network", "planes", "paths", "obstacles"}
-"""Groups of parameters of the splatting pipeline: rates of those that a configuration leaves out may stay."""
-
-PENALTIES = {"opacity", "obstacles"}
-"""Its penalties: likewise their weights."""
-
 
 @register("training", "descent")
 class Descent(lightning.LightningModule):
-    """A loss with the model's penalties, a learning rate for each group of parameters, and what a checkpoint must hold.
+    """A loss with the model's penalties, and a learning rate for each group of parameters.
 
     Args:
-        model: What to train.
-        loss: What to minimise.
-        identity: What ``gaigs.load`` needs beside the weights, and the configuration and split they come from.
-        seed: Of what the training draws at random.
+        model: The model to train.
+        loss: The loss to minimise.
+        identity: Entry of a checkpoint beside the weights: what ``gaigs.load`` needs, configuration and split.
+        seed: Of the training's random numbers.
         batch_size: Places a step.
-        thinning: Options of the task's thinning: which part of each label a step looks at.
+        thinning: Options of the task's thinning: the part of each label in a step.
         jitter: Standard deviation by which each place is moved along each axis, anew in every step [m]. Places are not
             known to the centimetre and readings fade within a wavelength: what changes faster is not to be learnt.
-        penalties: Weight of each of the model's penalties, the paper's alpha.
-        learning_rates: Of each of the model's parameter groups, at the start.
+        penalties: Weights of penalties by name, in place of ``Model.penalty_weights``.
+        learning_rates: At the start, by parameter group, in place of ``Model.learning_rates``.
         optimizer: As ``gaigs.training.schedule.make_optimizer`` takes it.
         schedule: As ``gaigs.training.schedule.make_schedule`` takes it.
         patience: Validations without a better score until the training stops; None: it goes on to the last step.
-        density: Options of ``gaigs.training.callbacks.DensityControl``; None for none.
+        density: Options of ``gaigs.training.density_control.DensityControl``; None for none.
 
     Raises:
-        ValueError: An option is out of range, or the learning rates are not those of the model's groups.
+        ValueError: An option is out of range; the model has no such parameter group or penalty, or no learning rate for
+            one of its groups.
 
     Source: optimiser and schedules after the released configuration.
     """
@@ -73,14 +68,13 @@ class Descent(lightning.LightningModule):
             raise ValueError(f"this model is trained by {model.trained_by!r}; set training={model.trained_by}")
         if not jitter >= 0:
             raise ValueError(f"training.jitter must be at least 0 m, got {jitter}")
-        check_rates(model, learning_rates)
-        for key, weight in penalties.items():
-            if not weight >= 0:
-                raise ValueError(f"training.penalties.{key} must be at least 0, got {weight}")
+        self.penalties = _overridden("training.penalties", model.penalty_weights, penalties)
+        self.learning_rates = _overridden("training.learning_rates", model.learning_rates, learning_rates)
+        if unset := model.parameter_groups().keys() - self.learning_rates.keys():
+            raise ValueError(f"the model has no learning rate for {', '.join(sorted(unset))}; add it to learning_rates")
         self.model, self.loss, self.identity, self.seed = model, loss, identity, seed
-        self.batch_size, self.jitter = batch_size, jitter
-        self.penalties, self.learning_rates = penalties, learning_rates
-        self.optimizer, self.schedule, self.patience, self.density = optimizer, schedule, patience, density
+        self.batch_size, self.jitter, self.patience, self.density = batch_size, jitter, patience, density
+        self.optimizer, self.schedule = optimizer, schedule
         self.task = model.scene.task
         self.thin = call("training.thinning", self.task.thinning, thinning)
 
@@ -96,7 +90,7 @@ class Descent(lightning.LightningModule):
         return self.add_up(loss, terms, penalties, batch)
 
     def prepare(self, batch: Batch) -> Batch:
-        """What a step looks at of a batch."""
+        """A batch as a step sees it: thinned, its places moved."""
         generator = seeded(self.seed, self.global_step)
         batch = self.thin(batch, generator)
         if self.jitter:
@@ -110,18 +104,15 @@ class Descent(lightning.LightningModule):
         """The loss with its penalties, checked and logged."""
         links, places = batch.shares
         total = links * loss
-        if unknown := self.penalties.keys() - penalties.keys() - PENALTIES:
-            words = " and ".join(suggest(name, PENALTIES | penalties.keys()) for name in sorted(unknown))
-            raise ValueError(f"training.penalties has {words}, and the model has no such penalty; leave it out")
         for name, penalty in penalties.items():
             if name not in self.penalties:
-                raise ValueError(f"training.penalties must give a weight for {name}; 0 for none")
+                raise ValueError(f"the model has no weight of its penalty {name!r}; add it to penalty_weights")
             total = total + self.penalties[name] * places * penalty
         if not torch.isfinite(total):
             raise self._diverged(total, terms, batch)
         self.log("train/loss", total, prog_bar=True, logger=False)
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
-            # Now: Lightning would log behind the step's callbacks, and a checkpoint written there would lack the row.
+            # Now: Lightning would log after the step's callbacks, and a checkpoint written there would lack the row.
             shared = {name: links * term for name, term in terms.items()}
             shared |= {name: places * penalty for name, penalty in penalties.items()}
             values = torch.stack([total, *shared.values()]).detach()
@@ -132,15 +123,14 @@ class Descent(lightning.LightningModule):
         return total
 
     def _diverged(self, total: Tensor, terms: dict[str, Tensor], batch: Batch) -> ValueError:
-        """Says what it is that is not finite in a step, and what to do."""
-        what, remedy = "the data's labels", "check the files"
+        """The error of a step whose loss is not finite: the first broken quantity, and the remedy."""
+        broken, remedy = "the data's labels", "check the files"
         if is_finite(batch.labels):
-            what, remedy = find_broken(self.model, batch, terms), "lower training.learning_rates"
+            broken, remedy = find_broken(self.model, batch, terms), "lower training.learning_rates"
             if self.global_step == 0:
                 remedy = "no rate has acted yet, so check the options of that part"
         return ValueError(
-            f"the loss must stay finite, got {total:g} at step {self.global_step}, and what is not finite there is "
-            f"{what}; {remedy}"
+            f"the loss must stay finite, got {total:g} at step {self.global_step}, first in {broken}; {remedy}"
         )
 
     def on_validation_epoch_start(self) -> None:
@@ -160,19 +150,16 @@ class Descent(lightning.LightningModule):
         checkpoint[KEY] = self.identity
 
 
-def check_rates(model: Model, rates: dict[str, float]) -> None:
-    """Sees to it that each of a model's parameter groups has a learning rate, and that no rate is for nothing.
+def _overridden(option: str, defaults: Mapping[str, float], values: Mapping[str, float]) -> dict[str, float]:
+    """A model's defaults with some of them replaced.
 
     Raises:
-        ValueError: A group has none, or a rate has no group; the groups of the splatting pipeline may stay. A rate is
-            negative.
+        ValueError: The model has no such name, or a value is negative.
     """
-    groups = set(model.parameter_groups())
-    if unset := groups - set(rates):
-        raise ValueError(f"training.learning_rates must give a rate for {', '.join(sorted(unset))}")
-    if unknown := set(rates) - groups - RATES:
-        words = " and ".join(suggest(name, groups | RATES) for name in sorted(unknown))
-        raise ValueError(f"training.learning_rates has {words}, and the model's groups are {', '.join(sorted(groups))}")
-    for name, rate in rates.items():
-        if not rate >= 0:
-            raise ValueError(f"training.learning_rates.{name} must be at least 0, got {rate}")
+    for name, value in values.items():
+        if name not in defaults:
+            listed = ", ".join(sorted(defaults)) or "none"
+            raise ValueError(f"{option} has no key {suggest(name, defaults)}; it has: {listed}")
+        if not value >= 0:
+            raise ValueError(f"{option}.{name} must be at least 0, got {value}")
+    return {**defaults, **values}

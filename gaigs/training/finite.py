@@ -1,4 +1,4 @@
-"""What it is that makes a loss infinite or NaN."""
+"""The part of a training step that is not finite."""
 
 from collections.abc import Iterator, Mapping
 
@@ -11,14 +11,14 @@ from gaigs.query import Batch
 
 @torch.no_grad()
 def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
-    """Names the first of what enters a step's loss that is not finite.
+    """Names the first quantity of a step's loss that is not finite.
 
-    It asks the model once more, to see what each of its parts gives.
+    It calls the model once more, with a hook at each part.
 
     Args:
         model: As it was in the step.
-        batch: What the step looked at, with finite labels.
-        terms: Of the loss, by name.
+        batch: Batch of the step, with finite labels.
+        terms: Terms of the loss, by name.
 
     Returns:
         The places, a parameter, the output of a part, the prediction, a penalty, or a term of the loss.
@@ -42,20 +42,20 @@ def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
     finally:
         for hook in hooks:
             hook.remove()
-    if not is_finite(value):
-        found.append("the prediction")
-    found += [f"the penalty {name}" for name, penalty in penalties.items() if not is_finite(penalty)]
-    found += [f"the term {name}" for name, term in terms.items() if not is_finite(term)]
+    rest = {"the prediction": value}
+    rest |= {f"the penalty {name}": penalty for name, penalty in penalties.items()}
+    rest |= {f"the term {name}": term for name, term in terms.items()}
+    found += [name for name, tensor in rest.items() if not is_finite(tensor)]
     return (found or ["their sum"])[0]
 
 
 def is_finite(values: Tensor) -> bool:
-    """Whether all of them are."""
+    """True if every element is finite."""
     return bool(values.isfinite().all())
 
 
 def _tensors(output: object) -> Iterator[tuple[str, Tensor]]:
-    """The tensors that a part gives, with what to call them."""
+    """The tensors in a part's output, each with a name."""
     if isinstance(output, Tensor):
         yield "the output", output
     elif isinstance(output, tuple):

@@ -1,4 +1,4 @@
-"""Revisions: what a model changes in itself between two steps."""
+"""Revisions: changes that a model makes to itself between two steps."""
 
 import logging
 
@@ -15,18 +15,18 @@ from gaigs.training.budget import time_share
 log = logging.getLogger(__name__)
 
 LINKS = 48
-"""Links that a revision looks at, of those that train and of those that validate: a search takes hundreds of looks."""
+"""Training links, and validation links, of a revision: a search takes hundreds of looks."""
 
 
 class Revision(Callback):
-    """Calls ``Model.revise`` after the shares of the training that the model asks for: of its steps or of its time,
-    whichever comes first.
+    """Calls ``Model.revise`` after the shares of the training in ``Model.revisions``.
 
-    All processes look at the same links, so that they decide alike.
+    Shares are of the training's steps or of its time, whichever comes first. All processes look at the same links, so
+    that they decide alike.
 
     Args:
-        links: What is trained on.
-        seed: Says which of them.
+        links: The links of the training.
+        seed: Of their choice.
     """
 
     def __init__(self, links: Links, seed: int):
@@ -40,7 +40,7 @@ class Revision(Callback):
         self.made = state["made"]
 
     def on_train_batch_start(self, trainer, module, *_) -> None:
-        if trainer.global_step == 0:  # behind the validation of models that predict untrained
+        if trainer.global_step == 0:  # after the validation of models that predict untrained
             self._revise(trainer, module)
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
@@ -48,35 +48,26 @@ class Revision(Callback):
 
     @torch.no_grad()
     def _revise(self, trainer, module) -> None:
+        time = time_share(trainer)
         for number, share in enumerate(module.model.revisions):
-            if number in self.made or not _is_due(trainer, share):
+            by_steps = trainer.max_steps > 0 and trainer.global_step == round(share * trainer.max_steps)
+            if number in self.made or not (by_steps or (time is not None and time >= share)):
                 continue
             self.made.append(number)
-            split = self.links.split
-            convert = trainer.precision_plugin.convert_input
+            convert, split = trainer.precision_plugin.convert_input, self.links.split
             parts = (self._batch(module, part, number) for part in (split.train, split.validation))
             train, validation = (None if part is None else convert(part) for part in parts)
-            # As for every prediction that is no training step.
-            module.eval()
-            told = module.model.revise(number, train, validation, lambda batch: loss_of(module, batch))
+            module.eval()  # as for every prediction outside of a training step
+            done = module.model.revise(
+                number, train, validation, lambda batch: module.loss(module.model(batch).value, batch)[0].item()
+            )
             module.train()
-            log.info("step %d: %s", trainer.global_step, told)
+            log.info("step %d: %s", trainer.global_step, done)
 
-    def _batch(self, module, index: Int[Tensor, "k"], number: int) -> Batch | None:
+    def _batch(self, module, index: Int[Tensor, " k"], number: int) -> Batch | None:
+        """Some of the links, thinned as those of a step; None where there are none."""
         if not len(index):
             return None
         generator = seeded(self.seed, number, len(index))
         chosen = index[torch.randperm(len(index), generator=generator)[:LINKS].sort().values]
         return module.thin(self.links.batch(chosen).to(module.device), generator)
-
-
-def _is_due(trainer, share: float) -> bool:
-    """Whether so much of a training is done."""
-    time = time_share(trainer)
-    by_steps = trainer.max_steps > 0 and trainer.global_step == round(share * trainer.max_steps)
-    return by_steps or (time is not None and time >= share)
-
-
-def loss_of(module, batch: Batch) -> float:
-    """The loss of a module's model as it stands, without penalties."""
-    return module.loss(module.model(batch).value, batch)[0].item()

@@ -1,4 +1,4 @@
-"""Learning rates over a training, and the optimizers they belong to."""
+"""Optimizers, and their learning rates over a training."""
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
@@ -18,9 +18,9 @@ def make_optimizer(
     """An optimizer of ``torch.optim`` with a learning rate for each group.
 
     Args:
-        config: ``_target_``, a class of ``torch.optim``, and its options. A weight decay is that of the group
-            ``network`` alone: positions, scales and opacities have no reason to be small. On a CPU a step is fused
-            where the class can do it and no option says otherwise.
+        config: ``_target_``, a class of ``torch.optim``, and its options. A weight decay acts on the group ``network``
+            alone: positions, scales and opacities have no reason to be small. On a CPU a step is fused where the class
+            can do it and no option says otherwise.
         groups: Parameters by name.
         rates: Learning rate of each group.
 
@@ -48,8 +48,8 @@ def make_schedule(config: Mapping, optimizer: Optimizer, share_done: Callable[[i
 
     Args:
         config: Options of ``warmup_and_decay``; or ``_target_``, a class of ``torch.optim.lr_scheduler``, with its own.
-        optimizer: Whose rates.
-        share_done: How much of the training is done after so many steps; a class of torch counts steps alone.
+        optimizer: The optimizer.
+        share_done: Share of the training done after a number of steps; a class of torch counts steps alone.
 
     Raises:
         TypeError: An option is not of its type.
@@ -67,10 +67,10 @@ def warmup_and_decay(
     """Rates rise linearly at first and fall exponentially.
 
     Args:
-        optimizer: Whose rates.
-        share_done: How much of the training is done after so many steps.
+        optimizer: The optimizer.
+        share_done: Share of the training done after a number of steps.
         warmup: Steps over which the rates rise.
-        final: Every rate falls to this fraction of itself at the end.
+        final: Fraction of itself that every rate falls to at the end.
 
     Raises:
         ValueError: An option is out of range.
@@ -85,8 +85,8 @@ def warmup_and_decay(
 def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tuple[type, dict]:
     """The class that a configuration names, and its options."""
     options = dict(config)
-    target = options.pop("_target_", None)
-    found = getattr(module, str(target).removeprefix(f"{module.__name__}."), None)
-    if not str(target).startswith(f"{module.__name__}.") or not (isinstance(found, type) and issubclass(found, base)):
+    target = str(options.pop("_target_", None))
+    found = getattr(module, target.removeprefix(f"{module.__name__}."), None)
+    if not target.startswith(f"{module.__name__}.") or not (isinstance(found, type) and issubclass(found, base)):
         raise ValueError(f"{option}._target_ must be a class of {module.__name__}, got {target!r}")
     return found, options

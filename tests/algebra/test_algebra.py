@@ -1,6 +1,6 @@
 import functools
 
-import clifford
+import numba
 import numpy as np
 import pytest
 import torch
@@ -8,6 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gaigs.algebra import PROJECTIVE, SPACETIME, Algebra
+
+numba.config.DISABLE_JIT = True  # compiling takes longer than these few products
+import clifford  # noqa: E402
 
 SIGNATURES = [(3, 0, 1), (3, 1, 0), (1, 2, 1)]
 signatures = pytest.mark.parametrize("signature", SIGNATURES, ids=str)
@@ -150,13 +153,6 @@ def test_batches_broadcast():
     assert PROJECTIVE.product(x[:0], y).shape == (0, 3, 16)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_results_have_the_dtype_of_the_input(dtype):
-    x = torch.ones(16, dtype=dtype)
-    for result in (SPACETIME.product(x, x), SPACETIME.dual(x), SPACETIME.inner(x, x), SPACETIME.grade(x, 2)):
-        assert result.dtype == dtype
-
-
 def test_tables_first_used_in_inference_mode_serve_training_later():
     algebra = Algebra(1, 1, 2)  # of no other test
     x = torch.randn(16)
@@ -169,7 +165,7 @@ def test_tables_first_used_in_inference_mode_serve_training_later():
 
 @pytest.mark.parametrize("signature", [(0, 0, 0), (3, -1, 0)])
 def test_impossible_signatures_are_refused(signature):
-    with pytest.raises(ValueError, match="at least one basis vector and none negative"):
+    with pytest.raises(ValueError, match="at least one basis vector and no negative count"):
         Algebra(*signature)
 
 

@@ -1,6 +1,7 @@
 """Data sets that tests of several files read, written by hand, and the configuration as a run composes it."""
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -35,14 +36,14 @@ def rssi_folder(tmp_path):
     return root
 
 
-@pytest.fixture
-def spectrum_folder(tmp_path):
-    """A whole data set of six spectra, whose pixels are drawn with the number of the image as a seed."""
-    root = tmp_path / "room"
+@pytest.fixture(scope="session")
+def spectra(tmp_path_factory):
+    """A data set of six spectra, whose pixels are drawn with the number of the image as a seed."""
+    root = tmp_path_factory.mktemp("spectra") / "room"
     (root / "spectrum").mkdir(parents=True)
     for k in range(1, 7):
         pixels = np.random.default_rng(k).integers(0, 256, (90, 360), dtype=np.uint8)
-        Image.fromarray(pixels).save(root / "spectrum" / f"{k:05d}.png")
+        Image.fromarray(pixels).save(root / "spectrum" / f"{k:05d}.png", compress_level=1)
     (root / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{k}.5,{-k},0.25\n" for k in range(1, 7)))
     (root / "gateway_info.yml").write_text(
         "dataset_name: room\ngateway1:\n"
@@ -51,6 +52,12 @@ def spectrum_folder(tmp_path):
     (root / "train_index.txt").write_text("00005\n00001\n00002\n00003\n")
     (root / "test_index.txt").write_text("00006\n00004\n")
     return root
+
+
+@pytest.fixture
+def spectrum_folder(spectra, tmp_path):
+    """A copy of these spectra, to be changed."""
+    return Path(shutil.copytree(spectra, tmp_path / "room"))
 
 
 @pytest.fixture(scope="session")

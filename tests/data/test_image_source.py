@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.constants import speed_of_light
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from gaigs.antenna import Array, Receiver
+from gaigs.data.simulation import rss_dbm
 from gaigs.data.synthetic.image_source import (
     Box,
     Room,
@@ -17,13 +18,10 @@ from gaigs.data.synthetic.image_source import (
     passes,
     permittivity,
     respond,
-    rss_dbm,
     trace,
 )
-from gaigs.directions import Grid
-from gaigs.geometry import Pose, from_spherical
-from gaigs.propagation import bartlett, fresnel, min_max
-from gaigs.scene import Array, Receiver
+from gaigs.geometry import Grid, Pose, from_spherical
+from gaigs.propagation import bartlett, fresnel
 
 FREQUENCY = 3e9
 WAVELENGTH = speed_of_light / FREQUENCY
@@ -101,15 +99,8 @@ def test_patches_do_not_hear_from_behind_and_fade_as_the_cosine():
     torch.testing.assert_close(responses / responses[0], angles.cos().clamp(min=0).double(), atol=1e-3, rtol=0)
 
 
-def test_isotropic_elements_hear_alike_from_all_around():
-    receiver = Receiver("gateway1", pose((200.0, 200.0, 200.0), (10, 50, 0)), SCATTERED)
-    directions = from_spherical(torch.linspace(-3, 3, 20), torch.linspace(-1.5, 1.5, 20))
-    responses = respond(HALL, receiver.pose.position + 100 * directions, receiver, FREQUENCY, CARRIER, 0).abs()
-    assert responses.flatten().tolist() == pytest.approx([WAVELENGTH / (4 * math.pi * 100)] * 80, rel=2e-3)
-
-
 @pytest.mark.parametrize("angles", [(0, 0, 0), (40, 125, 20), (-100, 60, 170)])
-@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 30), (77, 45), (180, 20), (301, 62), (359, 75)])
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 30), (77, 45), (301, 62)])
 def test_spectrum_peaks_at_the_direction_of_arrival(angles, azimuth, elevation):
     receiver = patches((200.0, 200.0, 200.0), angles)
     direction = from_spherical(*torch.tensor([azimuth, elevation]).deg2rad())
@@ -143,24 +134,6 @@ def test_band_spectrum_is_the_mean_power_of_its_frequencies():
     torch.testing.assert_close(bartlett(responses, grid, PATCHES, FREQUENCY), single.square().mean(0).sqrt())
 
 
-def test_a_wide_band_adds_powers_of_paths_and_a_carrier_their_fields():
-    generator = torch.Generator().manual_seed(0)
-    transmitters = 0.5 + torch.tensor([6.0, 4.0, 2.0]) * torch.rand(60, 3, generator=generator)
-    room, centre = Room(ROOM.size, WALLS), pose(RECEIVER.tolist(), (45, 120, 0))
-    receiver = Receiver("gateway1", centre, Array.planar(4, 4, speed_of_light / 6e9 / 2, "cosine"))
-    band, carrier = (
-        rss_dbm(respond(room, transmitters, receiver, 6e9, offsets, 2))
-        for offsets in (frequency_offsets(room, 2e9, 2), CARRIER)
-    )
-    paths = trace(room, transmitters, centre.position, 6e9, 2)
-    local = (paths.images - centre.position.double()) @ centre.rotation.double()
-    amplitudes = paths.gains.abs() * local[..., 2].clamp(min=0) / local.square().sum(-1) * speed_of_light / 6e9
-    incoherent = 10 * torch.log10((amplitudes / (4 * math.pi)).square().sum(-1))
-    fading_db, left_db = ((rss - incoherent).square().mean().sqrt() for rss in (carrier, band))
-    assert fading_db > 1
-    assert left_db < 0.4 * fading_db
-
-
 def test_a_band_is_sampled_finely_enough_for_its_longest_path():
     offsets = frequency_offsets(ROOM, 500e6, 2)
     assert offsets[[0, -1]].tolist() == [-250e6, 250e6]
@@ -168,34 +141,6 @@ def test_a_band_is_sampled_finely_enough_for_its_longest_path():
     corners = torch.tensor([[0.01, 0.01, 0.01], [6.99, 4.99, 2.99]], dtype=torch.float64)
     longest = max((trace(ROOM, corners, c, FREQUENCY, 2).images - c).norm(dim=-1).max().item() for c in corners)
     assert spacing < speed_of_light / longest
-
-
-def test_image_distances_are_the_shortest_ways_over_the_walls():
-    """Fermat: each path minimises its length among all that touch the same walls in the same order."""
-    size, start, end = np.array(ROOM.size), RECEIVER.numpy(), TRANSMITTERS[0].numpy()
-    walls = [(axis, side) for axis in range(3) for side in (0, 1)]
-
-    def shortest(order):
-        def length(free):
-            points = np.insert(free.reshape(-1, 2), 0, 0, axis=1)
-            stops = [start]
-            for point, (axis, side) in zip(points, order, strict=True):
-                stop = np.roll(point, axis)
-                stop[axis] = side * size[axis]
-                stops.append(stop)
-            return sum(np.linalg.norm(b - a) for a, b in itertools.pairwise([*stops, end]))
-
-        return minimize(length, np.ones(2 * len(order)), method="BFGS").fun
-
-    lengths = [np.linalg.norm(end - start), *(shortest([wall]) for wall in walls)]
-    for first, second in itertools.permutations(walls, 2):
-        if first[0] == second[0]:
-            lengths.append(shortest([first, second]))
-        elif first < second:  # at a corner only one of the two orders is a mirror path, the other is a detour
-            lengths.append(min(shortest([first, second]), shortest([second, first])))
-    distances = (trace(ROOM, TRANSMITTERS[:1], RECEIVER, FREQUENCY, 2).images[0] - RECEIVER).norm(dim=-1)
-    assert len(distances) == 25
-    np.testing.assert_allclose(np.sort(distances), np.sort(lengths), atol=1e-6)
 
 
 def test_third_order_has_every_image_once():
@@ -234,14 +179,14 @@ def test_gains_are_those_of_the_reflection_points():
 
 
 def test_furniture_takes_its_loss_on_every_leg():
-    """Brute force: every leg is sampled each 0.2 mm and folded into the room."""
+    """Brute force: every leg is sampled each 0.5 mm and folded into the room."""
     size, start = np.array(ROOM.size), RECEIVER.numpy()
     furnished = trace(ROOM, TRANSMITTERS, RECEIVER, FREQUENCY, 2)
     empty = trace(Room(ROOM.size, WALLS), TRANSMITTERS, RECEIVER, FREQUENCY, 2)
     losses_db = -20 * torch.log10((furnished.gains / empty.gains).abs())
     for images, losses in zip(furnished.images.numpy(), losses_db.tolist(), strict=True):
         for image, loss_db in zip(images, losses, strict=True):
-            points = np.linspace(start, image, int(np.linalg.norm(image - start) / 2e-4))
+            points = np.linspace(start, image, int(np.linalg.norm(image - start) / 5e-4))
             legs, inside = np.floor(points / size), fold(points, size)
             expected = 0.0
             for box in ROOM.furniture:
@@ -275,71 +220,12 @@ def test_segments_through_the_unit_cube(start, end, hits):
     assert passes(end, start, *cube).item() is hits
 
 
-def test_channel_is_reciprocal():
-    there = trace(ROOM, TRANSMITTERS, RECEIVER, FREQUENCY, 2)
-    wavenumber = 2 * math.pi / WAVELENGTH
-    field = lambda paths, at: (
-        paths.gains * torch.polar(1 / (paths.images - at).norm(dim=-1), -wavenumber * (paths.images - at).norm(dim=-1))
-    ).sum(-1)
-    forward = field(there, RECEIVER)
-    back = torch.stack([field(trace(ROOM, RECEIVER[None], t, FREQUENCY, 2), t)[0] for t in TRANSMITTERS])
-    torch.testing.assert_close(forward, back, rtol=1e-9, atol=0)
-
-
-@pytest.mark.parametrize("angles", [(90, 0, 0), (33, 71, -140)])
-def test_turning_everything_in_free_space_changes_nothing(angles):
-    turn = torch.tensor(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix(), dtype=torch.float32)
-    first = patches((200.0, 200.0, 200.0), (40, 125, 20))
-    position = first.pose.position
-    turned = Receiver("turned", Pose(position, turn @ first.pose.rotation), PATCHES)
-    offset = torch.tensor([[1.0, 0.7, -2.0], [3.0, -1.0, 0.5]])
-    grid = Grid.degrees(range(1, 91, 4), range(0, 360, 10))
-    here, there = (
-        bartlett(respond(HALL, position + r, receiver, FREQUENCY, CARRIER, 0), grid, PATCHES, FREQUENCY)
-        for r, receiver in ((offset, first), (offset @ turn.T, turned))
-    )
-    torch.testing.assert_close(here, there, rtol=1e-3, atol=1e-3 * here.max().item())
-
-
-def test_turning_room_receiver_and_transmitters_changes_nothing():
-    """A quarter turn about the vertical, (x, y) to (5 - y, x), which leaves the polarisation as it is."""
-    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    shift = torch.tensor([5.0, 0.0, 0.0], dtype=torch.float64)
-    move = lambda point: torch.as_tensor(point, dtype=torch.float64) @ turn.T + shift
-    boxes = []
-    for box in ROOM.furniture:
-        corners = torch.stack((move(box.lower), move(box.upper)))
-        boxes.append(Box(box.name, tuple(corners.amin(0).tolist()), tuple(corners.amax(0).tolist()), box.loss_db))
-    west, east, south, north, floor, ceiling = WALLS
-    turned = Room((5.0, 7.0, 3.0), (north, south, west, east, floor, ceiling), tuple(boxes))
-    first = pose(RECEIVER.tolist(), (45, 130, 20))
-    second = Pose(move(first.position).float(), turn.float() @ first.rotation)
-    grid = Grid.degrees(range(1, 91, 4), range(0, 360, 10))
-    offsets = frequency_offsets(ROOM, 200e6, 2)
-
-    def spectra(room, transmitters, pose):
-        responses = respond(room, transmitters, Receiver("gateway1", pose, PATCHES), FREQUENCY, offsets, 2)
-        return bartlett(responses, grid, PATCHES, FREQUENCY)
-
-    here, there = spectra(ROOM, TRANSMITTERS, first), spectra(turned, move(TRANSMITTERS), second)
-    torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4 * here.max().item())
-    # The receiver left behind sees something else.
-    other = spectra(turned, move(TRANSMITTERS), Pose(second.position, first.rotation))
-    assert (here - other).abs().max() > 0.1 * here.max()
-
-
 def test_permittivity_is_that_of_the_recommendation():
     """Its own form of the imaginary part: 17.98 sigma / f with f in GHz."""
     at_2, at_10 = permittivity("concrete", 2e9), permittivity("concrete", 10e9)
     assert at_2.real == at_10.real == 5.24
     assert at_2.imag == pytest.approx(-17.98 * 0.0462 * 2**0.7822 / 2, rel=1e-3)
     assert at_10.imag == pytest.approx(-17.98 * 0.0462 * 10**0.7822 / 10, rel=1e-3)
-
-
-def test_labels_span_zero_to_one():
-    labels = min_max(torch.rand(4, 5, 6) + 3)
-    assert labels.amin((1, 2)).tolist() == [0] * 4
-    assert labels.amax((1, 2)).tolist() == [1] * 4
 
 
 @pytest.mark.parametrize(
@@ -366,9 +252,3 @@ def test_impossible_scenes_are_refused(change, message):
     }
     with pytest.raises(ValueError, match=message):
         respond(**{**scene, **change})
-
-
-@pytest.mark.parametrize("bandwidth", [0, -1e6, math.inf, math.nan])
-def test_impossible_bands_are_refused(bandwidth):
-    with pytest.raises(ValueError, match="bandwidth must be positive"):
-        frequency_offsets(ROOM, bandwidth, 2)

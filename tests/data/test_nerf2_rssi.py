@@ -3,11 +3,11 @@
 import re
 from itertools import pairwise
 
-import numpy as np
 import pytest
 import torch
+from damages import replace
 
-from gaigs.data import load
+from gaigs.data import load, nerf2_rssi
 from gaigs.testing import check_data
 
 OFFICIAL = {"name": "official", "validation": 0}
@@ -20,12 +20,6 @@ def read(folder, split=OFFICIAL):
 @pytest.fixture
 def folder(rssi_folder):
     return rssi_folder
-
-
-def replace(folder, file, old, new):
-    text = (folder / file).read_text()
-    assert old in text
-    (folder / file).write_text(text.replace(old, new, 1))
 
 
 def named(links, index=slice(None)):
@@ -58,6 +52,7 @@ def test_every_reading_that_was_heard_is_a_link(folder):
     assert (links.task.name, links.task.unit, links.query.frequencies) == ("rssi", "dBm", None)
     assert links.rows.tolist() == [0, 0, 1, 1, 2, 2, 4, 4, 4, 5, 5, 5]
     assert links.edges.shape == (0, 2, 3)
+    assert links.remarks == "12 readings of 6 rows at 3 gateways; 6 of -100 dBm were not heard and are left out"
     check_data(links)
 
 
@@ -65,10 +60,6 @@ def test_the_official_parts_are_those_of_the_index_files(folder):
     split = read(folder).split
     assert split.train.tolist() == [0, 1, 2, 3, 6, 7, 8]
     assert split.test.tolist() == [4, 5, 9, 10, 11]
-
-
-def test_the_remarks_count_what_is_left_out(folder):
-    assert read(folder).remarks == "12 readings of 6 rows at 3 gateways; 6 of -100 dBm were not heard and are left out"
 
 
 def test_readings_in_no_index_file_are_in_no_part(folder):
@@ -111,32 +102,24 @@ def test_index_files_of_rows_and_gateways(folder, train, test):
 
 def test_gateways_named_by_numbers_are_never_taken_for_columns(folder):
     for old, new in (("west", "1"), ("east", "2"), ("attic", "010")):
-        replace(folder, "gateway_rssi.csv", old, new)
-        replace(folder, "gateway_position.yml", old, new)
+        replace(folder / "gateway_rssi.csv", old, new)
+        replace(folder / "gateway_position.yml", old, new)
     (folder / "train_index.txt").write_text("0 1\n4 010\n")
     (folder / "test_index.txt").write_text("0 2\n")
     links = read(folder)
     assert named(links, links.split.train) == [(0.5, "1", -50.5), (4.5, "010", -88)]
     assert named(links, links.split.test) == [(0.5, "2", -61)]
     (folder / "test_index.txt").write_text("0 0\n")
-    with pytest.raises(ValueError, match="line 1: expected a gateway by name or column from 0, got '0'"):
+    with pytest.raises(ValueError, match=r"line 1: expected a row in 0\.\.5, or a row and a gateway, got '0 0'"):
         read(folder)
 
 
 def test_without_a_header_columns_are_in_the_order_of_the_gateways(folder):
-    replace(folder, "gateway_rssi.csv", "west,east,attic\n", "")
-    replace(folder, "tx_pos.csv", "x,y,z\n", "")
+    replace(folder / "gateway_rssi.csv", "west,east,attic\n", "")
+    replace(folder / "tx_pos.csv", "x,y,z\n", "")
     links = read(folder)
     assert named(links)[:2] == [(0.5, "east", -50.5), (0.5, "west", -61)]
     assert len(links.labels) == 12
-
-
-def test_numbers_that_yaml_takes_for_strings_and_quoted_names_are_read(folder):
-    replace(folder, "gateway_position.yml", "[5.0, 1, 2]", '[1e-3, "1", 2]')
-    replace(folder, "gateway_rssi.csv", "west,east", '"west", "east"')
-    receiver = read(folder).receivers[1]
-    assert receiver.name == "east"
-    assert receiver.pose.position.tolist() == pytest.approx([1e-3, 1, 2])
 
 
 @pytest.mark.parametrize("header", ["x,y\n", ""])
@@ -147,27 +130,88 @@ def test_walls_run_from_each_vertex_to_the_next(folder, header):
     assert edges.tolist() == [[*ends] for ends in pairwise(corners)]
 
 
-def test_readings_of_a_row_stay_together_off_the_official_split(folder):
-    for seed in range(5):
-        links = read(folder, {"name": "random", "test": 0.3, "validation": 0.3, "seed": seed})
-        rows = [set(links.query.transmitters[part, 0].tolist()) for part in links.split.parts().values()]
-        assert all(rows)
-        assert sum(map(len, rows)) == len(set.union(*rows)) == 5
-
-
 def test_index_files_are_read_for_the_official_split_only(folder):
     (folder / "train_index.txt").unlink()
     (folder / "test_index.txt").write_text("99\n")
     assert len(read(folder, {"name": "runs", "length": 2, "validation": 0}).split.test) > 0
-    with pytest.raises(ValueError, match="has 2 defects:"):
+    with pytest.raises(
+        ValueError, match=r"train_index\.txt: missing; expected a row in 0\.\.5, or a row and a gateway"
+    ):
         read(folder)
 
 
-def test_the_folder_stays_as_it_is(folder):
-    state = lambda: {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in folder.iterdir()}
-    before = state()
-    assert read(folder).split.name == "official"
-    assert state() == before
+TX, RSSI, YML, TRAIN, TEST = (
+    "tx_pos.csv",
+    "gateway_rssi.csv",
+    "gateway_position.yml",
+    "train_index.txt",
+    "test_index.txt",
+)
+
+DEFECTS = [
+    (RSSI, "-54,-65,-100", "nan,nan,nan", ", line 4: expected an RSSI from -100 to below 0 dBm (-100 where nothing was "
+     "heard), got 'nan' in column west"),
+    (RSSI, "-65", "", ", line 4: expected an RSSI from -100 to below 0 dBm (-100 where nothing was heard), got ''"),
+    (RSSI, "-60", "+20", ", line 7: expected an RSSI from -100 to below 0 dBm"),
+    (RSSI, "-60", "0", ", line 7: expected an RSSI from -100 to below 0 dBm"),
+    (RSSI, "-60", "-100.5", ", line 7: expected an RSSI from -100 to below 0 dBm"),
+    (RSSI, "west,east,attic\n-50.5", "120", ", line 1: expected an RSSI from"),
+    (RSSI, "-52,-100,-80", "-52,-100", ", line 3: expected 3 columns 'west,east,attic', got 2: '-52,-100'"),
+    (RSSI, None, ",west,east,attic\n0,-50,-60,-70\n", ", line 1: column '' has no position in gateway_position.yml"),
+    (RSSI, "attic", "east", ", line 1: expected one column 'east', got 2"),
+    (RSSI, "-54,-65,-100\n", "", ": tx_pos.csv has 6 positions, and gateway_rssi.csv 5 rows"),
+    (RSSI, None, "west,east,attic\n" + 6 * "-100,-100,-100.0\n", ": expected readings above -100 dBm, got none"),
+    (RSSI, None, None, ": missing; expected an RSSI [dBm] of each gateway"),
+    (RSSI, None, "west,east,attic\n", ": no readings below the header"),
+    (TX, "2.5,-2,0.25", "nan,-2,inf", ", line 4: expected a finite number, got 'nan' in column x"),
+    (TX, "2.5,-2", "1e5,-2", ", line 4: expected positions within 1e5 m of the origin on each axis (subtract a common"),
+    (YML, "attic: [3, 1, 4.5]\n", "", "gateway_rssi.csv, line 1: column 'attic' has no position in gateway_position"),
+    (YML, "attic", "cellar: [3, 1, -2]\nattic", "gateway_rssi.csv, line 1: expected one column 'cellar', got 0"),
+    (YML, "[5.0, 1, 2]", "[5.0, 1]", ": east must be 3 finite numbers x, y, z, written as 1.5 or -2e-3, got ['5.0',"),
+    (YML, "5.0, 1, 2", "5.0, -100000, 2", ": east: expected positions within 1e5 m of the origin on each axis"),
+    (YML, "attic", "east", "cannot parse"),
+    (TEST, None, "\n\n", ": empty; expected a row in 0..5, or a row and a gateway"),
+    (TRAIN, None, None, ": missing; expected a row in 0..5"),
+    (TEST, "5", "6", ", line 1: expected a row in 0..5, or a row and a gateway, got '6'"),
+    (TRAIN, "4", "-4", ", line 1: expected a row in 0..5, or a row and a gateway, got '-4'"),
+    (TRAIN, "0", "0.0", ", line 2: expected a row"),
+    (TRAIN, "0", "", ", line 2: expected a row in 0..5, or a row and a gateway, got ''"),
+    (TRAIN, "1", "4", ", line 3: expected each entry once, got '4', which is in train_index.txt, line 1 already"),
+    (TEST, "2", "0", ", line 2: expected each entry once, got '0', which is in train_index.txt, line 2 already"),
+    (TEST, "2", "2 east", ": index files must list rows, or pairs of row and gateway, got both"),
+    (TRAIN, None, "0 1 4\n", ", line 1: expected a row in 0..5, or a row and a gateway, got '0 1 4'"),
+    (TRAIN, None, "0 west\n1 3\n", ", line 2: expected a row in 0..5, or a row and a gateway, got '1 3'"),
+    (TEST, None, "3\n", ": expected a reading that was heard, got none"),
+    (TRAIN, None, "9" * 5000, ", line 1: expected a row in 0..5, or a row and a gateway, got '999"),
+    ("layout.csv", None, "x,y\n1,2\n", ": expected two wall vertices or more, got 1"),
+    ("layout.csv", None, "1,2\n3,\n", ", line 2: expected a finite number, got '' in column y"),
+    ("layout.csv", None, "", ": empty; expected consecutive wall vertices"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("file", "old", "new", "message"), DEFECTS)
+def test_a_defect_is_named_with_its_place(folder, file, old, new, message):
+    replace(folder / file, old, new)
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        nerf2_rssi.read(folder).official()
+    assert str(folder) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_pairs_are_known_by_name_and_column(folder):
+    (folder / TRAIN).write_text("0 west\n")
+    (folder / TEST).write_text("1 west\n0 0\n")
+    with pytest.raises(ValueError, match=r"line 2: expected each entry once, got '0 0', which is in train_index\.txt"):
+        read(folder)
+
+
+def test_a_position_without_a_column_in_a_table_without_header_is_refused(folder):
+    replace(folder / RSSI, "west,east,attic\n", "")
+    replace(folder / YML, "attic", "cellar: [3, 1, -2]\nattic")
+    with pytest.raises(
+        ValueError, match="line 1 and 5 other lines: expected 4 columns 'east,west,cellar,attic', got 3"
+    ):
+        read(folder)
 
 
 @pytest.fixture(scope="module")
@@ -197,13 +241,3 @@ def test_measured_flat_scores_as_known(flat):
         errors["mean"].append((labels.mean() - flat.labels[far]).abs())
     assert torch.cat(errors["mean"]).mean().item() == pytest.approx(6.28, abs=0.01)
     assert torch.cat(errors["knn"]).mean().item() == pytest.approx(4.16, abs=0.01)
-
-
-def test_measured_flat_validates_on_runs(flat):
-    rows = lambda part: {tuple(p) for p in flat.query.transmitters[part].tolist()}
-    apart = torch.cdist(flat.query.transmitters[flat.split.validation], flat.query.transmitters[flat.split.train]).amin(
-        1
-    )
-    assert len(flat.split.validation) == pytest.approx(0.1 * 22277, abs=600)
-    assert np.quantile(apart, 0.5) > 0.02  # one by one it would be the robot's step of some millimetres
-    assert rows(flat.split.test).isdisjoint(rows(flat.split.train))

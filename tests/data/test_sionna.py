@@ -1,7 +1,6 @@
-"""Spectra of the ray tracer's rooms: where lobes point, what repeats, and the same from the folder."""
+"""Labels of the ray tracer's rooms: where lobes point, the direct wave's phase, levels near free space."""
 
-import runpy
-import sys
+import math
 
 import numpy as np
 import pytest
@@ -9,28 +8,40 @@ import torch
 from scipy.constants import speed_of_light
 from scipy.spatial import cKDTree
 
-from gaigs.data import load, nerf2_spectrum
-from gaigs.data.sionna import patch_array, place
-from gaigs.data.sionna.meshes import FURNITURE_MARGIN, HEIGHTS, edges, wavefront_obj
+from gaigs.data import load
+from gaigs.data.nerf2_spectrum import NORMALISATION
+from gaigs.data.simulation import patch_array
+from gaigs.data.sionna import HEIGHTS, place
+from gaigs.data.sionna.meshes import FURNITURE_MARGIN, edges
 from gaigs.data.sionna.rooms import ROOMS
-from gaigs.directions import Grid
-from gaigs.geometry import from_spherical
+from gaigs.geometry import Grid, from_spherical
 from gaigs.propagation import bartlett, min_max
 from gaigs.testing import check_data
 
-OFFICIAL = {"name": "official", "validation": 0}
-SMALL = {"room": "slanted", "transmitters": 10}
+CARRIER, BANDWIDTH = 6.4896e9, 499.2e6
+CLEAR = {"noise": 0.0, "sensitivity": -300.0}
 
 every_room = pytest.mark.parametrize("name", ROOMS)
 
 
-def traced_room(split=OFFICIAL, **options):
-    return load({"name": "sionna", **SMALL, **options}, split)
+def simulate(data="sionna", **options):
+    options = {"room": "slanted", "transmitters": 10, **options}
+    return load({"name": data, **options}, {"name": "official", "validation": 0})
 
 
 @pytest.fixture(scope="module")
 def links(tracer):
-    return traced_room()
+    return simulate()
+
+
+@pytest.fixture(scope="module")
+def channels(tracer):
+    return simulate("sionna_csi")
+
+
+@pytest.fixture(scope="module")
+def clear(tracer):
+    return simulate("sionna_rssi", **CLEAR)
 
 
 # --- places and array ---
@@ -50,9 +61,10 @@ def test_transmitters_stand_free_and_everywhere(name):
     assert not any(cuboid.contains(places, FURNITURE_MARGIN).any() for cuboid in room.furniture)
     assert torch.equal(places, place(room, 400, 0))
     assert not torch.equal(places, place(room, 400, 1))
+    assert (room.pose().local(places)[:, 2] > 0).all(), "in front of the array"
 
 
-def test_transmitters_are_uniform_over_what_is_free():
+def test_transmitters_are_uniform_over_free_space():
     """As many in the long arm of the L as it has of the free volume, by a fine lattice."""
     room = ROOMS["l_shape"]
     axes = [torch.arange(0.05, 8, 0.1), torch.arange(0.05, 6.6, 0.1), torch.arange(0.35, 2.0, 0.1)]
@@ -63,37 +75,30 @@ def test_transmitters_are_uniform_over_what_is_free():
     assert long_arm(places) == pytest.approx(long_arm(lattice), abs=3 * 0.5 / 3000**0.5)
 
 
-@every_room
-def test_every_transmitter_is_in_front_of_the_array(name):
-    places, pose = place(ROOMS[name], 400, 0), patch_array(ROOMS[name], 6e9).pose
-    assert (pose.local(places)[:, 2] > 0).all()
-
-
 def test_the_array_is_square_and_half_a_wavelength_apart():
-    array = patch_array(ROOMS["slanted"], 6e9).array
+    array = patch_array(ROOMS["slanted"].pose(), 6e9).array
     assert (len(array), array.pattern) == (16, "cosine")
     distances, _ = cKDTree(array.elements.numpy()).query(array.elements.numpy(), k=2)
     np.testing.assert_allclose(distances[:, 1], speed_of_light / 6e9 / 2, rtol=1e-6)
 
 
-# --- labels ---
+# --- spectra ---
 
 
-def test_the_room_keeps_the_contract(links):
+def test_spectra_keep_the_contract(links):
     check_data(links)
     assert links.labels.shape == (10, 90, 360)
-    assert links.labels.dtype == torch.float32
     assert links.labels.amin((1, 2)).tolist() == [0] * 10
     assert links.labels.amax((1, 2)).tolist() == [1] * 10
-    assert links.task.normalisation == nerf2_spectrum.NORMALISATION
-    assert links.query.frequencies.tolist() == [6.4896e9] * 10
+    assert links.task.normalisation == NORMALISATION
+    assert links.query.frequencies.tolist() == [CARRIER] * 10
     assert links.split.test.tolist() == [8, 9]
-    assert links.bandwidth == 499.2e6
+    assert links.bandwidth == BANDWIDTH
     assert torch.equal(links.edges, edges(ROOMS["slanted"].meshes()))
 
 
 def test_lobes_point_at_transmitters_in_line_of_sight(links):
-    """The highest pixel against the direction, of those that nothing stands before."""
+    """The highest pixel against the direction of each transmitter that nothing hides."""
     (receiver,) = links.receivers
     places = links.query.transmitters
     steps = torch.linspace(0.02, 0.98, 400)[:, None, None]
@@ -109,131 +114,79 @@ def test_lobes_point_at_transmitters_in_line_of_sight(links):
     assert (angles[clear] < 8).double().mean() > 0.8
 
 
-def test_band_and_carrier_differ_and_are_told(links):
-    carrier = traced_room(spectrum="carrier")
+def test_band_and_carrier_differ_and_a_narrow_band_is_the_carrier(links):
+    carrier, narrow = simulate(spectrum="carrier"), simulate(bandwidth=1e3)
     assert carrier.bandwidth == 0
     assert torch.equal(carrier.query.transmitters, links.query.transmitters)
     assert (carrier.labels - links.labels).abs().max() > 0.05
-
-
-def test_a_narrow_band_is_the_carrier(tracer):
-    narrow, carrier = traced_room(bandwidth=1e3), traced_room(spectrum="carrier")
     torch.testing.assert_close(narrow.labels, carrier.labels, rtol=0, atol=1e-3)
 
 
-def test_each_place_sends_at_each_carrier(tracer):
-    carriers = [5e9, 6.4896e9]
-    both, high = traced_room(frequency=carriers), traced_room()
+def test_each_place_sends_at_each_carrier(links):
+    carriers = [5e9, CARRIER]
+    both = simulate(frequency=carriers)
     assert both.query.frequencies.tolist() == pytest.approx(carriers * 10)
     assert both.rows.tolist() == [k // 2 for k in range(20)]
-    assert torch.equal(both.query.transmitters[::2], high.query.transmitters)
-    assert torch.equal(both.labels[1::2], high.labels), "the array is that of the highest carrier"
+    assert torch.equal(both.query.transmitters[::2], links.query.transmitters)
+    assert torch.equal(both.labels[1::2], links.labels), "the array is that of the highest carrier"
     check_data(both)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"room": "round"}, "room must be one of l_shape, slanted, furnished, got 'round'"),
-        ({"spectrum": "lobes"}, "spectrum must be 'band' or 'carrier', got 'lobes'"),
-        ({"transmitters": 1}, "transmitters must be at least 2"),
-        ({"bandwidth": 0}, "bandwidth must be positive"),
-        ({"frequency": []}, "frequency must be a carrier or several different ones"),
-        ({"frequency": [5e9, 5e9]}, "frequency must be a carrier or several different ones"),
-        ({"frequency": -5e9}, "frequency must be a carrier in Hz"),
-    ],
-)
-def test_options_out_of_range_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        traced_room(**options)
-
-
-def test_frequencies_are_numbers():
-    with pytest.raises(TypeError, match="'frequency' must be a number or a list, got '5e9'"):
-        traced_room(frequency="5e9")
 
 
 # --- channels ---
 
 
-def test_spectra_of_the_channels_are_those_of_the_room(links):
-    """With one subcarrier, steering the channels gives the carrier's spectra."""
-    channels = load({"name": "sionna_csi", **SMALL, "subcarriers": 1}, OFFICIAL)
-    carrier = traced_room(spectrum="carrier")
-    array = channels.receivers[0].array
-    steered = bartlett(channels.labels.to(torch.complex128), Grid.degrees(), array, 6.4896e9)
-    assert (min_max(steered) - carrier.labels).abs().max() < 1e-4
-    assert torch.equal(channels.query.transmitters, links.query.transmitters)
+def test_channels_keep_the_contract(channels):
+    check_data(channels)
+    assert channels.labels.dtype == torch.complex64
+    assert channels.labels.shape == (10, 16, 26)
+    expected = np.linspace(CARRIER - BANDWIDTH / 2, CARRIER + BANDWIDTH / 2, 26)
+    np.testing.assert_allclose(channels.task.frequencies, expected, rtol=1e-12)
 
 
-# --- files ---
+def test_the_direct_wave_dominates_with_its_phase(channels):
+    """Averaged over elements and subcarriers, channels are free-space waves, time dependence exp(+j omega t)."""
+    (receiver,) = channels.receivers
+    turned = receiver.array.elements.double() @ receiver.pose.rotation.double().T
+    elements = (receiver.pose.position.double() + turned).numpy()
+    distances = np.linalg.norm(channels.query.transmitters.double().numpy()[:, None] - elements, axis=-1)
+    frequencies = channels.task.frequencies.numpy()
+    waves = np.exp(-2j * np.pi * frequencies * distances[..., None] / speed_of_light)
+    wavelengths = speed_of_light / frequencies / (4 * np.pi * distances[..., None])
+    rays = channels.query.transmitters - receiver.pose.position
+    cosines = (rays @ receiver.pose.rotation[:, 2] / rays.norm(dim=1)).numpy()
+    shares = (channels.labels.numpy() / (waves * wavelengths * cosines[:, None, None])).mean((1, 2))
+    assert np.median(np.abs(shares - 1)) < 0.1
 
 
-def command(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["sionna", *map(str, arguments)])
-    runpy.run_module("gaigs.data.sionna", run_name="__main__")
+def test_steered_channels_of_the_carrier_are_its_spectra(links):
+    alone, three = simulate("sionna_csi", subcarriers=1), simulate("sionna_csi", subcarriers=3)
+    assert alone.task.frequencies.tolist() == [CARRIER]
+    torch.testing.assert_close(alone.labels[..., 0], three.labels[..., 1])
+    steered = bartlett(alone.labels.to(torch.complex128), Grid.degrees(), alone.receivers[0].array, CARRIER)
+    assert (min_max(steered) - simulate(spectrum="carrier").labels).abs().max() < 1e-4
+    assert torch.equal(alone.query.transmitters, links.query.transmitters)
 
 
-def same(first, second):
-    torch.testing.assert_close(first.query.transmitters, second.query.transmitters)
-    torch.testing.assert_close(first.receivers[0].pose.position, second.receivers[0].pose.position)
+# --- readings ---
 
 
-def test_the_command_writes_each_task_in_its_layout(links, tmp_path, monkeypatch, capsys):
-    options = ["--room", "slanted", "--transmitters", 10]
-    for task in ("spectrum", "rssi", "csi"):
-        command(monkeypatch, tmp_path / task, "--task", task, *options)
-        assert (tmp_path / task / "geometry.obj").read_text() == wavefront_obj(ROOMS["slanted"].meshes())
-    assert "spectrum: 8 training and 2 test labels" in capsys.readouterr().out
-
-    spectra = load({"name": "nerf2_spectrum", "root": str(tmp_path / "spectrum")}, OFFICIAL)
-    same(spectra, links)
-    assert (spectra.labels[torch.arange(10)] - links.labels).abs().max() <= 0.5 / 255 + 1e-6
-    torch.testing.assert_close(spectra.receivers[0].pose.rotation, links.receivers[0].pose.rotation)
-
-    everything = {"name": "random", "validation": 0}
-    readings = load({"name": "rssi_csv", "file": str(tmp_path / "rssi" / "room.csv")}, everything)
-    simulated = load({"name": "sionna_rssi", **SMALL}, OFFICIAL)
-    same(readings, simulated)
-    assert torch.equal(readings.labels, simulated.labels)
-
-    channels = load({"name": "csi_npz", "file": str(tmp_path / "csi" / "room.npz")}, everything)
-    simulated = load({"name": "sionna_csi", **SMALL}, OFFICIAL)
-    same(channels, simulated)
-    assert torch.equal(channels.labels, simulated.labels)
-    (found,), (expected,) = channels.receivers, simulated.receivers
-    places = lambda receiver: receiver.pose.world(receiver.array.elements.float())
-    torch.testing.assert_close(places(found), places(expected), rtol=0, atol=1e-5)
+def test_readings_keep_the_contract(clear):
+    check_data(clear)
+    assert clear.labels.shape == (40,)
+    assert clear.query.frequencies.tolist() == pytest.approx([2.441e9] * 40, rel=1e-6)
+    assert clear.bandwidth == 78e6
+    assert [receiver.name for receiver in clear.receivers] == [name for name, _ in ROOMS["slanted"].gateways]
+    assert clear.split.test.tolist() == list(range(32, 40))
+    assert clear.remarks.startswith("40 readings of 10 places at 4 gateways; 0 below -300 dBm")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--transmitters", 5], "must be an empty folder or none"),
-        (["--spectrum", "lobes"], "invalid choice: 'lobes'"),
-        (["--wavelength", 3], "unrecognized arguments: --wavelength 3"),
-    ],
-)
-def test_the_command_refuses(tmp_path, monkeypatch, capsys, arguments, message):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(SystemExit) as caught:
-        command(monkeypatch, tmp_path, *arguments)
-    assert caught.value.code == 2
-    assert message in capsys.readouterr().err
-    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--transmitters", 1], "transmitters must be at least 2"),
-        (["--room", "round"], "room must be one of"),
-        (["--noise", 1], "data 'sionna' has no option 'noise'"),
-        (["--task", "rssi", "--frequency", 5e9], "data 'sionna_rssi' has no option 'frequency'"),
-    ],
-)
-def test_the_command_writes_nothing_where_an_option_is_wrong(tmp_path, monkeypatch, capsys, arguments, message):
-    with pytest.raises(SystemExit):
-        command(monkeypatch, tmp_path / "room", *arguments)
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "room").exists()
+def test_readings_fall_with_distance_as_in_a_room(clear):
+    """Reflections raise the median above free space, blockers lower single readings; far readings are weaker."""
+    positions = torch.stack([receiver.pose.position for receiver in clear.receivers])
+    distances = (clear.query.transmitters - positions[clear.query.receivers]).norm(dim=1).double().numpy()
+    friis = 20 * np.log10(speed_of_light / 2.441e9 / (4 * math.pi * distances))
+    excess = clear.labels.double().numpy() - friis
+    assert 0 < np.median(excess) < 4
+    assert np.abs(excess).max() < 25
+    slope, _ = np.polyfit(np.log10(distances), clear.labels.double().numpy(), 1)
+    assert -30 < slope < -8

@@ -11,12 +11,12 @@ import torch
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
+from gaigs.antenna import Array, Receiver
 from gaigs.data.sionna import cache, tracing
 from gaigs.data.sionna.meshes import THICKNESS, Cuboid, Mesh
 from gaigs.data.sionna.rooms import ROOMS
 from gaigs.data.synthetic import image_source
 from gaigs.geometry import Pose
-from gaigs.scene import Array, Receiver
 
 FREQUENCY = 6e9
 RECEIVER = torch.tensor([0.0, 0.0, 1.0])
@@ -57,14 +57,6 @@ def test_a_wall_of_metal_turns_the_vertical_field_around(tracer):
     np.testing.assert_allclose(gains, [1, -1], atol=0.02)
 
 
-def test_two_mirrors_make_three_images_and_no_more(tracer):
-    places = torch.tensor([[1.5, -0.5, 0.7]])
-    images, gains = strong(tracer.trace([FLOOR, WALL], RECEIVER, places, FREQUENCY))
-    expected = {(1.5, -0.5, 0.7), (1.5, -0.5, -0.7), (1.5, 4.5, 0.7), (1.5, 4.5, -0.7)}
-    assert {tuple(image) for image in images.round(3).tolist()} == expected
-    np.testing.assert_allclose(np.abs(gains), 1, atol=0.02)
-
-
 @pytest.mark.parametrize("frequency", [0.45e9, 6e9, 28e9])
 def test_a_board_lets_through_what_a_slab_does(tracer, frequency):
     """At normal incidence: Airy's formula for the slab, with the board's thickness of air left out of the way."""
@@ -102,15 +94,6 @@ def test_a_wave_bends_around_a_corner(tracer):
     half = np.array([0.5, -1.0, 0.0])  # from the receiver to the edge
     np.testing.assert_allclose(images, [receiver.numpy() + 2 * half], atol=1e-3)
     assert 0.01 < abs(gains[0]) < 0.5  # at the shadow's boundary it is half the field
-
-
-def test_channel_is_reciprocal(tracer):
-    here, there = RECEIVER, torch.tensor([[1.5, -0.5, 0.7]])
-    forth = strong(tracer.trace([FLOOR, WALL], here, there, FREQUENCY))
-    back = strong(tracer.trace([FLOOR, WALL], there[0], here[None], FREQUENCY))
-    field = lambda found, start: sorted(np.linalg.norm(found[0] - start, axis=1).round(4))
-    assert field(forth, here.numpy()) == pytest.approx(field(back, there[0].numpy()), abs=2e-4)
-    assert forth[1].sum() == pytest.approx(back[1].sum(), abs=0.02)
 
 
 @pytest.mark.parametrize("frequency", [1e8, 5e10, math.nan])
@@ -280,7 +263,7 @@ def test_a_damaged_file_is_named(traced, tmp_path):
     cache.find_paths(ROOMS["slanted"], RECEIVER, PLACE, FREQUENCY)
     (file,) = (tmp_path / "gaigs" / "sionna").iterdir()
     file.write_bytes(file.read_bytes()[:100])
-    with pytest.raises(ValueError, match=rf"{file} must be a whole file of paths, and is damaged .*; delete it"):
+    with pytest.raises(ValueError, match=rf"cannot parse {file}: .*; delete it"):
         cache.find_paths(ROOMS["slanted"], RECEIVER, PLACE, FREQUENCY)
 
 

@@ -1,7 +1,6 @@
 """What the hard cases share: components as they are configured, and float32 held against float64."""
 
 import copy
-import functools
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -22,26 +21,10 @@ TASKS = test_contracts.TASKS
 DTYPES = (torch.float32, torch.float64)
 
 
-@functools.cache
-def _composed(*overrides):
-    return test_contracts.composed(*overrides)
-
-
-def composed(*overrides):
-    """The whole configuration, as the command line would have it; composed once."""
-    return copy.deepcopy(_composed(*overrides))
-
-
-def configured(kind, name, *overrides):
-    """The configuration of a name, its plug-ins' too, small enough for a test."""
-    small = [*test_contracts.SMALL.get(name, []), *test_contracts.GIVEN.get(name, [])]
-    return composed(f"{kind}={name}", *small, *overrides)[kind]
-
-
 def build(kind, name, *overrides, **context):
     """A component of that name, the same at each call."""
     torch.manual_seed(0)
-    return registry(kind).build(configured(kind, name, *overrides), **context)
+    return registry(kind).build(test_contracts.configured(kind, name, *overrides), **context)
 
 
 def build_rasterizer(name):

@@ -1,13 +1,13 @@
-"""What an array hears without a map, and faint waves: silence, footprints beyond digits, no splat, one."""
+"""Paths at an array, and faint waves: silence, footprints beyond digits, no splat, one."""
 
 import pytest
 import torch
 from precision import DTYPES, require_same
 
-from gaigs.geometry import magnitudes, polar
+from gaigs.antenna import Array, Receiver
+from gaigs.geometry import Pose, magnitudes, polar
+from gaigs.pooling.paths import LagPooling, ReceivedPaths, element_fields
 from gaigs.projection import Splats
-from gaigs.registry import registry
-from gaigs.scene import Array
 
 FAINT = [0.0, 1e-45, 1e-42, 1e-39, 1.2e-38, 1e-30, 1.0, 1e30]
 
@@ -56,8 +56,8 @@ CASES += [("narrow", "loud", 1), ("narrow", "loud", 0)]
 @pytest.mark.parametrize("coherence", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("bandwidth", [None, 0.0, 1e9])
 def test_what_an_array_hears(splats, waves, n, coherence, bandwidth):
-    aperture = registry("rasterizer").build({"name": "aperture"})
     array = Array.planar(3, 3, 0.03)
+    receiver = Receiver("here", Pose(torch.zeros(3), torch.eye(3)), array)
     size = WAVES[waves]
     amplitudes = size * torch.randn(B, N, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
     lengths = torch.linspace(0, 50, B * N).view(B, N)
@@ -72,8 +72,9 @@ def test_what_an_array_hears(splats, waves, n, coherence, bandwidth):
         drawn = Splats(centres, factors, lengths.detach(), visible.expand(B, n))
         carriers, offsets = lengths.new_full((B,), 5e9), lengths.new_tensor([[-1e7, 0, 1e7]]).expand(B, 3)
         band = None if bandwidth is None else lengths.new_tensor(bandwidth)
-        fields = aperture.fields(points, axes, amplitudes, lengths, array, carriers, offsets)
-        lags = aperture.lags(drawn, amplitudes, lengths, coherences, band, array, carriers)
+        own = amplitudes, lengths, coherences, band
+        fields = element_fields(ReceivedPaths(points, axes, *own, receiver, carriers), offsets)
+        lags = LagPooling.covariances(drawn, *own, array, carriers)
         return (fields, lags) if size <= 1 else (fields / size, lags / size**2)
 
     factors = SPLATS[splats].expand(1, N, 3)

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from precision import build, composed, require_same, widen
+from precision import build, require_same, widen
+from test_contracts import composed
 from torch.nn import functional
 
-from gaigs.placement.mirrored import BOX, TILT, UNIT
-from gaigs.placement.mirrored.reflections import all_words, fold, images
+from gaigs.placement.mirrored.paths import BOX, TILT
+from gaigs.placement.mirrored.reflections import all_sequences, fold, images
 from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.testing import example_links
@@ -54,7 +55,7 @@ def laid(placement, planes):
     if planes and hasattr(placement, "place"):
         for number, (normal, offset) in enumerate(planes):
             placement.place(number, torch.tensor(normal), offset)
-        placement.kept.copy_(placement.words_of(torch.arange(len(planes))))
+        placement.kept.copy_(placement.sequences_of(torch.arange(len(planes))))
     return placement
 
 
@@ -96,7 +97,7 @@ def test_placed(name, task, planes, places):
 @pytest.mark.parametrize("places", PLACES)
 def test_ways_of_words(order, planes, places):
     """Folded paths are as long as the straight line to the image wherever they exist, and stay near elsewhere."""
-    words = all_words(len(PLANES[planes]), order)
+    words = all_sequences(len(PLANES[planes]), order)
     normals = functional.normalize(torch.tensor([normal for normal, _ in PLANES[planes]]), dim=1)
     offsets = torch.tensor([offset for _, offset in PLANES[planes]])
 
@@ -136,7 +137,7 @@ def test_phases_of_many_mirrors_are_those_of_float64(planes):
     config = composed("placement=mirrored", "placement.planes=6", "placement.order=3", "placement.obstacles=0")
     torch.manual_seed(0)
     placement = registry("placement").build(config["placement"], scene=scene, channels=2)
-    laid(placement, PLANES[planes]).sharpen(0.06)
+    laid(placement, PLANES[planes]).enable_phases(0.06)
     require_same(ask_placed(None), placement, PLACES["somewhere"], tolerance=5e-3)
 
 
@@ -160,14 +161,3 @@ def test_planes_of_a_room_lie_alike_wherever_the_origin_is():
         torch.testing.assert_close(there.normals, here.normals)
         apart = (there.offsets - there.normals @ FAR) - here.offsets
         assert apart[:BOX].abs().max() < 4 * TILT * here.diagonal
-
-
-def test_planes_of_earlier_checkpoints_stay_where_they_were():
-    """They know no pivot and turn about the world's origin."""
-    placement = far_placement()
-    assert placement.pivot.abs().max() > 8000
-    state = {name: part for name, part in placement.state_dict().items() if name != "pivot"}
-    state["shifts"] = 0.1 * torch.ones_like(state["shifts"])
-    placement.load_state_dict(state)
-    assert not placement.pivot.any()
-    torch.testing.assert_close(placement.offsets, state["origin"][:, 3] + UNIT * placement.diagonal * 0.1)

@@ -9,15 +9,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from precision import TASKS, build, configured, require_same, widen
+from precision import TASKS, build, require_same, widen
 
+from gaigs.gaussians import Placed, Tokens
 from gaigs.geometry import Pose
-from gaigs.placement import Placed
+from gaigs.pooling.paths import LagPooling, PathPooling
 from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.testing import example_links
 from gaigs.testing.placement import example_gaussians
-from gaigs.tokenizer import Tokens
+from gaigs.testing.pooling import example_paths
 
 SCENE = example_links("rssi").scene
 every = lambda kind: pytest.mark.parametrize("name", registry(kind).names())
@@ -112,10 +113,7 @@ def test_residuals(name, size, n):
     tokens = [size * torch.randn(*shape, generator=generator) for shape in ((b, 5), (n, 4), (b, 6))]
     stands = means[None, :n].clone()
     stands[0, :1] = receiver
-    torch.manual_seed(0)
-    module = registry("deformation").build(
-        configured("deformation", name), scene=SCENE, channels=2, tokenizer_widths=widths
-    )
+    module = build("deformation", name, scene=SCENE, channels=2, tokenizer_widths=widths)
 
     def ask(module, transmitters, stands, *tokens):
         return module(Tokens(*tokens) if module.reads_tokens else None, Placed(stands), query_at(transmitters))
@@ -165,12 +163,16 @@ def poolings_of(name):
             pooling = build("pooling", name, scene=links.scene)
         except ValueError:
             continue
-        grid = pooling.grid or links.task.directions
-        if grid is not None:
+        if isinstance(pooling, PathPooling):
+            paths, grid = example_paths(links.receivers[0], links.query[:1], torch.float32), None
+            value = pooling(paths, links.query[:1])
+        elif (grid := pooling.grid or links.task.directions) is not None:
             value = pooling(torch.zeros(1, pooling.channels, *grid.shape), links.query[:1])
-            if value.shape[1:] == links.task.shape and value.dtype == links.task.dtype:
-                pooling.fit(links)
-                found.append((pooling, links, grid))
+        else:
+            continue
+        if value.shape[1:] == links.task.shape and value.dtype == links.task.dtype:
+            pooling.fit(links)
+            found.append((pooling, links, grid))
     assert found, f"pooling {name!r} gives the labels of none of the tasks {', '.join(TASKS)}"
     return found
 
@@ -179,29 +181,30 @@ def poolings_of(name):
 @pytest.mark.parametrize("what", MAPS)
 def test_values(name, what):
     for pooling, links, grid in poolings_of(name):
-        query = links.query[:2]
-        ask = lambda module, image, query=query: module(image, widen(query, image.dtype))
-        require_same(ask, pooling, MAPS[what]((2, pooling.channels, *grid.shape)))
+        if grid is not None:
+            query = links.query[:2]
+            ask = lambda module, image, query=query: module(image, widen(query, image.dtype))
+            require_same(ask, pooling, MAPS[what]((2, pooling.channels, *grid.shape)))
 
 
 @every("pooling")
 @pytest.mark.parametrize("size", [0.0, 1e-42, 1e-15, 1.0, 1e10])
 @pytest.mark.parametrize("alike", [True, False])
-def test_values_of_what_an_array_hears(name, size, alike):
-    """Fields or lags of a silent, faint or loud wave; ``alike`` where all elements hear the same."""
-    for pooling, links, _ in poolings_of(name):
-        if pooling.takes is None:
+def test_values_of_paths(name, size, alike):
+    """Fields or lags of a silent, faint or loud wave; ``alike`` where all elements have the same."""
+    for pooling, links, grid in poolings_of(name):
+        if grid is not None:
             continue
         array = links.receivers[0].array
-        if pooling.takes == "fields":
-            shape = 2, *links.task.shape
-            waves = torch.polar(torch.ones(shape), torch.zeros(shape) if alike else torch.arange(40.0).view(shape))
-        else:
+        if isinstance(pooling, LagPooling):
             steps = array.lags[0].float()
             turns = 0 * steps[:, 0] if alike else 60 * steps[:, 0] + 30 * steps[:, 1]
             waves = torch.polar(torch.ones_like(turns), turns).expand(2, -1)
+        else:
+            shape = 2, *links.task.shape
+            waves = torch.polar(torch.ones(shape), torch.zeros(shape) if alike else torch.arange(40.0).view(shape))
         query = links.query[:2]
-        ask = lambda module, heard, query=query: module.hear(heard, widen(query, heard.real.dtype))
+        ask = lambda module, received, query=query: module.read(received, widen(query, received.real.dtype))
         require_same(ask, pooling, size * waves)
 
 

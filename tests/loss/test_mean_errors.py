@@ -5,10 +5,9 @@ import pytest
 import torch
 from scipy.special import huber
 
-from gaigs.directions import Grid
+from gaigs.geometry import Grid
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
-from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
 
@@ -70,17 +69,3 @@ def test_an_outlier_pulls_no_harder_than_another_but_on_the_square(errors):
         build(name)(values, batch_of(torch.zeros(2)))[0].backward()
         pulls[name] = (values.grad[1] / values.grad[0]).item()
     assert pulls == {"absolute": 1, "squared": 100, "huber": 1}
-
-
-@pytest.mark.parametrize("delta", [0.0, -1.0])
-def test_a_bend_that_is_not_positive_is_refused(delta):
-    with pytest.raises(ValueError, match=rf"loss\.delta must be more than 0, got {delta}"):
-        build("huber", delta=delta)
-
-
-@every
-def test_complex_labels_are_refused(name):
-    with pytest.raises(
-        ValueError, match="labels of task 'csi' are complex, and this loss takes real ones; take loss=log_relative"
-    ):
-        build(name, Csi(2, torch.tensor([1e9])))

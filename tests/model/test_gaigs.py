@@ -8,15 +8,14 @@ from pipeline import MEAN_POWER, NONE, PARTS, SOFTMAX, trained, two_branch, watc
 from torch import nn
 
 from gaigs.data import Split
-from gaigs.directions import Grid
-from gaigs.geometry import semi_axes
+from gaigs.gaussians import Placed, Tokens
+from gaigs.geometry import Grid, semi_axes
 from gaigs.model.gaigs import GaussianSplatting
-from gaigs.placement import Placed, Placement
+from gaigs.placement import Placement
 from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.testing import check_model, example_links
 from gaigs.testing.rasterizer import rasterize_densely
-from gaigs.tokenizer import Tokens
 
 
 def excite(model, query):
@@ -355,12 +354,6 @@ def test_a_projection_that_folds_the_sphere_is_refused(readings):
     options = PARTS | NONE | {"pooling": SOFTMAX, "projection": {"name": "direction_cosine"}}
     with pytest.raises(ValueError, match="below the array's plane, which direction_cosine folds"):
         GaussianSplatting(readings.scene, **options)
-
-
-@pytest.mark.parametrize("grid", [[2.5, 3], [6, 12, 3], [True, 4]])
-def test_a_map_takes_two_whole_numbers(readings, grid):
-    with pytest.raises((ValueError, TypeError), match=r"grid.* whole number"):
-        GaussianSplatting(readings.scene, **PARTS | NONE | {"pooling": SOFTMAX | {"grid": grid}})
 
 
 @pytest.mark.parametrize("name", ["knn", "gaussian_process"])

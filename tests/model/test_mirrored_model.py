@@ -1,4 +1,4 @@
-"""Mirrored Gaussians in the pipeline: told the walls, they predict what the simulator does."""
+"""Mirrored Gaussians in the pipeline: with the room's walls they predict as the simulator."""
 
 import math
 from dataclasses import replace
@@ -8,16 +8,18 @@ import torch
 from pipeline import NONE, PARTS
 from scipy.constants import speed_of_light
 
+from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Split
 from gaigs.data.nerf2_spectrum import NORMALISATION
-from gaigs.data.synthetic import POSE, ROOM, patch_array, place, spectra
-from gaigs.data.synthetic.image_source import permittivity, respond, rss_dbm
-from gaigs.directions import Grid
+from gaigs.data.simulation import patch_array, rss_dbm
+from gaigs.data.synthetic import POSE, ROOM, place, spectra
+from gaigs.data.synthetic.image_source import permittivity, respond
+from gaigs.geometry import Grid
 from gaigs.model.friis import Friis
 from gaigs.model.gaigs import GaussianSplatting
-from gaigs.model.mirrored import Mirrored
+from gaigs.model.mirrored import MirroredSplatting
+from gaigs.placement.mirrored import search
 from gaigs.query import Query
-from gaigs.scene import Array, Receiver
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
@@ -29,20 +31,20 @@ MIRRORED = {"name": "mirrored", "planes": 6, "order": 2, "obstacles": 0}
 OPTIONS = PARTS | NONE | {
     "gaussians": None,
     "placement": MIRRORED,
-    "projection": {"name": "direction_cosine"},
-    "rasterizer": {"name": "aperture"},
-    "pooling": {"name": "array_response", "grid": [24, 48]},
+    "projection": None,
+    "rasterizer": None,
+    "pooling": "path_spectrum",
 }  # fmt: skip
 FREQUENCIES = CARRIER + torch.linspace(-2e7, 2e7, 5, dtype=torch.float64)
 
 
 def build(links, **options):
     torch.manual_seed(0)
-    return Mirrored(links.scene, **(OPTIONS | options))
+    return MirroredSplatting(links.scene, **(OPTIONS | options))
 
 
-def told(model):
-    """The model with the planes of the built-in room and what they are made of; each path a single direction."""
+def walled(model):
+    """The model with planes and materials of the built-in room; each path has a single direction."""
     placement = model.placement
     with torch.no_grad():
         for wall, material in enumerate(EMPTY.walls):
@@ -70,21 +72,21 @@ def links_of(labels, task, receiver, bandwidth=None):
 
 
 def room_spectra(spectrum, count=12):
-    grid, receiver = Grid.degrees(range(1, 91, 3), range(0, 360, 6)), patch_array(CARRIER)
+    grid, receiver = Grid.degrees(range(1, 91, 3), range(0, 360, 6)), patch_array(POSE, CARRIER)
     labels = spectra(EMPTY, place(count, 0), receiver, grid, spectrum, CARRIER, BANDWIDTH, 2)
     task = Spectrum(grid.elevations, grid.azimuths, NORMALISATION)
     return links_of(labels, task, receiver, BANDWIDTH if spectrum == "band" else 0.0)
 
 
 @pytest.mark.parametrize(("spectrum", "powers", "waves"), [("band", 0.03, 0.004), ("carrier", 0.08, 0.005)])
-def test_told_the_walls_it_predicts_the_labels(spectrum, powers, waves):
-    """Where powers add what interferes is missing; with phases all but the waves' curvature over the array is there."""
+def test_with_the_rooms_walls_it_predicts_the_labels(spectrum, powers, waves):
+    """Powers lack interference; phases lack the waves' curvature over the array alone."""
     links = room_spectra(spectrum)
-    model = told(build(links))
+    model = walled(build(links))
     batch = links.batch(torch.arange(12))
     with torch.no_grad():
         missing = (model(batch).value - batch.labels).abs().mean()
-        model.placement.sharpen(speed_of_light / CARRIER)
+        model.placement.enable_phases(speed_of_light / CARRIER)
         errors = (model(batch).value - batch.labels).abs()
     assert waves < missing < powers
     assert errors.mean() < waves
@@ -96,13 +98,13 @@ BENT = Array(torch.tensor([[0, 0, 0], [0.02, -0.01, 0.03], [-0.3, 0.2, 0.1], [0.
 
 
 @pytest.mark.parametrize("array", [Array.planar(2, 2, speed_of_light / CARRIER / 2), BENT], ids=["planar", "bent"])
-def test_told_the_walls_it_predicts_channels(array):
+def test_with_the_rooms_walls_it_predicts_channels(array):
     receiver = Receiver("gateway1", POSE, array)
     offsets = FREQUENCIES - CARRIER
     labels = respond(EMPTY, place(12, 0), receiver, CARRIER, offsets, 2).to(torch.complex64)
     links = links_of(labels, Csi(4, FREQUENCIES), receiver)
-    model = told(build(links, pooling={"name": "element_sum", "grid": [6, 12]}))
-    model.placement.sharpen(speed_of_light / CARRIER)
+    model = walled(build(links, pooling="path_csi"))
+    model.placement.enable_phases(speed_of_light / CARRIER)
     with torch.no_grad():
         found = model(links.batch(torch.arange(12))).value
     assert found.dtype == torch.complex64
@@ -127,7 +129,7 @@ def test_channels_start_from_free_space(array, conjugated):
         task=Csi(4, FREQUENCIES),
         split=Split("most", torch.arange(80), torch.arange(80, 100), torch.arange(100, 120)),
     )
-    model = build(links, pooling={"name": "element_sum", "grid": [6, 12]}, placement=MIRRORED | {"obstacles": 9})
+    model = build(links, pooling="path_csi", placement=MIRRORED | {"obstacles": 9})
     model.fit(links)
     free_space = Friis(links.scene)
     split = links.split
@@ -136,46 +138,46 @@ def test_channels_start_from_free_space(array, conjugated):
     with torch.no_grad():
         found, expected = (part(links.batch(split.test)).value for part in (model, free_space))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-3 * expected.abs().max().item())
-    model.placement.furnish()
+    model.placement.enable_reflections()
     with torch.no_grad():
         assert (model(links.batch(split.test)).value - expected).abs().max() > 0.1 * expected.abs().max()
 
 
-def test_told_the_walls_it_predicts_signal_strength():
+def test_with_the_rooms_walls_it_predicts_signal_strength():
     """Relative to that at a metre of free space; paths interfere by a decibel or two."""
     receiver = Receiver("gateway1", POSE)
     offsets = torch.linspace(-BANDWIDTH / 2, BANDWIDTH / 2, 201, dtype=torch.float64)
     rss = rss_dbm(respond(EMPTY, place(12, 0), receiver, CARRIER, offsets, 2)).float()
     links = links_of(rss, Rssi(), receiver, BANDWIDTH)
-    model = told(build(links, pooling={"name": "mean_power", "grid": [4, 8], "channels": 2, "floor_db": -100.0}))
+    model = walled(build(links, pooling={"name": "path_rssi", "floor_db": -100.0}))
     at_a_metre = 20 * math.log10(speed_of_light / CARRIER / (4 * math.pi))
     with torch.no_grad():
         powers = model(links.batch(torch.arange(12))).value + at_a_metre
-        model.placement.sharpen(speed_of_light / CARRIER)
+        model.placement.enable_phases(speed_of_light / CARRIER)
         band = model(links.batch(torch.arange(12))).value + at_a_metre
     assert 0.5 < (powers - rss).abs().mean() < 2
     assert (band - rss).abs().mean() < 0.1
 
 
-@pytest.mark.parametrize("rasterizer", ["torch", "aperture"])
+@pytest.mark.parametrize("draws_map", [True, False])
 @pytest.mark.parametrize("gaussians", [None, PARTS["gaussians"]])
-def test_it_keeps_the_contract_of_models(rasterizer, gaussians):
+def test_it_keeps_the_contract_of_models(draws_map, gaussians):
     placement = MIRRORED | {"planes": 7, "obstacles": 3, "order": 1}
-    parts = {"rasterizer": {"name": rasterizer}, "gaussians": gaussians, "placement": placement}
-    if rasterizer == "torch":  # a map of the whole sphere
-        parts["projection"] = {"name": "mercator"}
+    parts = {"gaussians": gaussians, "placement": placement}
+    if draws_map:
+        parts |= {"projection": "mercator", "rasterizer": "torch", "pooling": "array_response"}
     links = example_links("spectrum", 5e9)
 
     def make(scene):
         torch.manual_seed(1)
-        return Mirrored(scene, **(OPTIONS | parts))
+        return MirroredSplatting(scene, **(OPTIONS | parts))
 
     check_model(make, links)
 
 
 def test_levels_need_no_carrier():
     """Powers of a single element are the same at any frequency."""
-    pooling = {"name": "mean_power", "grid": [4, 8], "channels": 2, "floor_db": -60.0}
+    pooling = {"name": "path_rssi", "floor_db": -60.0}
     unknown, known = example_links("rssi"), example_links("rssi", 5e9)
     model = build(unknown, pooling=pooling)
     other = build(known, pooling=pooling)
@@ -188,44 +190,31 @@ def test_levels_need_no_carrier():
 def test_gradients_reach_all_that_paths_have():
     links = room_spectra("band", count=5)
     model = build(links, placement=MIRRORED | {"obstacles": 5})
-    model.placement.sharpen(speed_of_light / CARRIER)
+    model.placement.enable_phases(speed_of_light / CARRIER)
     value, penalties = model(links.batch(torch.arange(5)))
     assert list(penalties) == ["obstacles"]
     (value.square().mean() + penalties["obstacles"]).backward()
-    silent = {"placement.receiver_gains"}  # which no spectrum from its minimum to its maximum shows
+    silent = {"placement.receiver_gains"}  # spectra are scaled to their range
     for name, parameter in model.named_parameters():
         assert parameter.grad.isfinite().all(), name
         assert parameter.grad.any() or name in silent, name
 
 
-def test_groups_name_what_learning_rates_are_given_for():
-    links = example_links("spectrum", 5e9)
-    assert list(build(links).parameter_groups()) == ["planes", "paths"]
-    groups = build(links, gaussians=PARTS["gaussians"]).parameter_groups()
-    assert list(groups) == ["means", "quats", "log_scales", "opacity_logits", "signal", "planes", "paths"]
-
-
-def test_a_receiver_hears_each_transmitter_as_if_it_were_alone():
-    """Links of two receivers, some of the same place, come out in their order."""
-    links = example_links("spectrum", 5e9)
-    model = build(links)
-    index = torch.tensor([3, 0, 1, 3, 2])
-    together = model(links.batch(index)).value
-    alone = torch.cat([model(links.batch(i[None])).value for i in index])
-    torch.testing.assert_close(together, alone, rtol=0, atol=1e-4)
-
-
-# --- what is refused ---
+# --- refusals ---
 
 
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
         (
-            {"projection": {"name": "mercator"}},
-            "takes projection=direction_cosine and a pooling for it .*, got mercator",
+            {"projection": "mercator"},
+            r"'path_spectrum' takes paths, so there is nothing to project and rasterize\nleave out both \(~projection",
         ),
-        ({"pooling": {"name": "spectrum", "channels": 2}}, "got direction_cosine and spectrum"),
+        (
+            {"pooling": "spectrum"},
+            "'spectrum' takes a map, which needs a projection and a rasterizer\nset proj",
+        ),
+        ({"pooling": "path_rssi"}, r"labels of task 'spectrum', \(18, 36\), and path_rssi gives \(\);"),
         (
             {"placement": {"name": "free"}},
             "model 'mirrored' takes placement=mirrored, got free; take .*experiment=mirrored",
@@ -253,10 +242,53 @@ def test_half_precision_is_refused(dtype):
         model.to(dtype)(batch)
 
 
+# --- revisions ---
+
+
+@torch.no_grad()
+def test_phases_come_with_a_band_that_is_chosen_and_planes_that_move(monkeypatch):
+    receiver, offsets = Receiver("gateway1", POSE), torch.linspace(-BANDWIDTH / 2, BANDWIDTH / 2, 51).double()
+    rss = rss_dbm(respond(EMPTY, place(12, 0), receiver, CARRIER, offsets, 1)).float()
+    links = links_of(rss - 20 * math.log10(speed_of_light / CARRIER / (4 * math.pi)), Rssi(), receiver)
+    pooling = {"name": "path_rssi", "floor_db": -100.0}
+    model = walled(build(links, placement=MIRRORED | {"order": 1}, pooling=pooling))
+    placement, batch = model.placement, links.batch(torch.arange(12))
+    loss = lambda batch: (model(batch).value - batch.labels).abs().mean().item()
+    tried, move = [], search._move
+    monkeypatch.setattr(search, "_move", lambda *arguments: tried.append(arguments[1]) or 0.0)
+    assert model.revise(2, batch, None, loss).startswith("phases count; planes moved by +0.000, ")
+    assert placement.coherent
+    assert tried[:12] == search.by_strength(placement, batch)[:2] * 6, "the two strongest planes, with each bandwidth"
+    bandwidth = placement.log_bandwidth.exp() * placement.diagonal / speed_of_light
+    assert bandwidth.item() == pytest.approx(10), "of 0.01, 1, 3, 10, 30 and 100 the next to 500 MHz in this room"
+    monkeypatch.setattr(search, "_move", move)
+    placement.kept &= placement.sequences_of(torch.tensor([2]))
+    batch = replace(batch, labels=model(batch).value)
+    placement.origin[2, 3] += 0.02
+    wrong = loss(batch)
+    (moved,) = search.move_planes(placement, batch, speed_of_light / CARRIER, 0.0, loss)
+    assert abs(moved + 0.02) < speed_of_light / CARRIER / 10
+    assert loss(batch) < 0.2 * wrong
+    assert model.revise(4, batch, batch, loss).endswith(f"-> {loss(batch):.4f}")
+
+
+def test_fixed_planes_do_not_move_and_unknown_carriers_have_no_phases():
+    links = room_spectra("band", 6)
+    model, batch = build(links, placement=MIRRORED | {"fixed": True}), links.batch(torch.arange(4))
+    before = model.placement.offsets
+    lines = [model.revise(number, batch, None, lambda batch: 1.0) for number in (0, 2)]
+    assert lines == ["planes stay where they were put", "phases count"]
+    torch.testing.assert_close(model.placement.offsets, before)
+    links = example_links("rssi")
+    pooling = {"name": "path_rssi", "floor_db": -60.0}
+    line = build(links, pooling=pooling).revise(2, links.batch(torch.arange(4)), None, lambda batch: 1.0)
+    assert line == "frequencies are unknown, so powers add to the end"
+
+
 def test_a_loaded_model_exports_its_planes(tmp_path):
     links = room_spectra("band")
     model = build(links)
-    model.load_state_dict(told(build(links)).state_dict())
+    model.load_state_dict(walled(build(links)).state_dict())
     model.export(tmp_path)
     vertices = [line.split()[1:] for line in (tmp_path / "planes.obj").read_text().splitlines() if line[:2] == "v "]
     vertices = torch.tensor([[float(value) for value in vertex] for vertex in vertices])

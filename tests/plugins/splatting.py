@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs import configuration, evaluation, runs
+from gaigs import configuration, runs
 from gaigs.registry import registry
 from gaigs.testing import check_model, example_links
 
@@ -61,7 +61,7 @@ def check_task(task, *overrides, carrier=None):
 
 def run(folder, monkeypatch, *overrides):
     """A short training on the built-in room: its configuration, its metrics, and the model of its checkpoint."""
-    monkeypatch.setattr(evaluation, "write_figures", lambda *_: None)  # they take longer than all else
+    monkeypatch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)  # they take longer than all else
     few = [] if any(word.startswith("data.root=") for word in overrides) else ["data.transmitters=40"]
     config = composed(*overrides, *few, *RUN)
     with repository():

@@ -9,11 +9,11 @@ import pytest
 import torch
 from scipy.constants import speed_of_light
 
-from gaigs.directions import Grid, Rays
+from gaigs.antenna import Array
+from gaigs.geometry import Grid, Rays
 from gaigs.propagation import bartlett, min_max
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
-from gaigs.scene import Array
 from gaigs.task.spectrum import Spectrum
 from gaigs.testing import check_model, example_links
 

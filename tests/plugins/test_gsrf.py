@@ -11,9 +11,8 @@ from scipy.special import factorial, lpmv, sph_harm_y
 from splatting import build, check_task, composed, repository, run
 
 from gaigs import density
-from gaigs.directions import Rays
 from gaigs.gaussians import Gaussians
-from gaigs.geometry import from_spherical, to_spherical
+from gaigs.geometry import Rays, from_spherical, to_spherical
 from gaigs.query import Batch, Query
 from gaigs.task.spectrum import Spectrum
 from gaigs.testing import check_loss, check_pooling, example_links

@@ -13,7 +13,7 @@ import torch
 from splatting import build, check_task, composed, run
 from torch import nn
 
-from gaigs.directions import Grid, Rays
+from gaigs.geometry import Grid, Rays
 from gaigs.query import Batch
 from gaigs.task.scalar import Scalar
 from gaigs.testing import example_links

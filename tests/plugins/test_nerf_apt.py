@@ -13,7 +13,7 @@ from scipy.interpolate import RegularGridInterpolator
 from splatting import build, check_task, composed, run
 from torch import nn
 
-from gaigs.directions import Grid, Rays
+from gaigs.geometry import Grid, Rays
 from gaigs.query import Batch
 from gaigs.registry import registry
 from gaigs.task.spectrum import Spectrum

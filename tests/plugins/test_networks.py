@@ -1,24 +1,34 @@
 """The networks: formulas against plain loops in float64, contracts, refusals, and a short run of each on each task."""
 
+import functools
 import json
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import lightning
 import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import CSVLogger
 from omegaconf import OmegaConf
 from scipy.interpolate import BSpline
 
 import gaigs
-from gaigs import configuration, evaluation, runs
+from gaigs import configuration, runs
+from gaigs.loss.absolute import Absolute
+from gaigs.model import Model, Prediction
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
+from gaigs.report.curves import read_curves
 from gaigs.task.scalar import Scalar
-from gaigs.testing import check_model, example_links
+from gaigs.testing import check_model, check_training, example_links
+from gaigs.training.batches import Batches, InOrder
 
 ROOT = Path(__file__).parents[2]
 TASKS = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
@@ -182,7 +192,7 @@ def test_receivers_and_carriers_are_told():
     assert own.tolist() == [[1, 0], [0, 1], [0, 1]]
     assert torch.equal(band[0], band[1])
     assert (band[0] - band[2]).abs().max() > 0.1
-    with pytest.raises(ValueError, match="so a frequency must be given"):
+    with pytest.raises(ValueError, match="a frequency must be given"):
         question(Query(place, torch.tensor([0, 1, 1])))
 
 
@@ -506,7 +516,7 @@ LOSSES = {
 @every_system
 @pytest.mark.parametrize("task", TASKS)
 def test_a_run(name, task, tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluation, "write_figures", lambda *_: None)
+    monkeypatch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
     config = composed(name, task)
     assert config["loss"]["name"] == LOSSES[name][task]
     assert config["training"]["name"] == ("adversarial" if name == "dcgan" else "descent")
@@ -530,3 +540,139 @@ def test_channels_take_half_the_digits(name):
         value = model(links.batch(links.split.train)).value
     assert value.dtype == torch.complex64
     assert torch.view_as_real(value).isfinite().all()
+
+
+# --- adversarial training ---
+
+
+class Forger(Model):
+    """A level with noise on it, from the transmitter's place, and a discriminator that sees level and place."""
+
+    trained_by = "adversarial"
+    learning_rates: Mapping[str, float] = {"network": 0.02, "discriminator": 0.05}
+    penalty_weights: Mapping[str, float] = {"gain": 0.5}
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.network, self.judge = torch.nn.Linear(3, 1), torch.nn.Linear(2, 1)
+
+    def parameter_groups(self):
+        return {"network": [*self.network.parameters()], "discriminator": [*self.judge.parameters()]}
+
+    def forward(self, batch):
+        value = self.network(batch.query.transmitters)[:, 0]
+        noise = 0.01 * torch.randn(value.shape) if self.training else 0.0  # of the global generator, which is kept
+        return Prediction(value + noise, {"gain": value.square().mean()})
+
+    def discriminate(self, batch, values):
+        return self.judge(torch.stack((values, batch.query.transmitters[:, 0]), 1))[:, 0]
+
+
+class Plain(Forger):
+    trained_by = "descent"
+
+
+class Unjudged(Forger):
+    def parameter_groups(self):
+        return {"network": [*self.network.parameters()]}
+
+
+ADVERSARIAL = {
+    "name": "adversarial", "weight": 0.5, "batch_size": 4, "thinning": {}, "jitter": 0.0, "penalties": {},
+    "learning_rates": {}, "optimizer": {"_target_": "torch.optim.SGD"}, "schedule": {"warmup": 0, "final": 0.1},
+    "patience": None, "density": None,
+}  # fmt: skip
+
+
+def adversarial(model=Forger, **options):
+    torch.manual_seed(0)
+    links = LINKS["rssi"]
+    context = {"model": model(links.scene), "loss": Absolute(links.task), "identity": {"who": "the check"}, "seed": 0}
+    return registry("training").build(ADVERSARIAL | options, **context)
+
+
+def test_adversarial_training_keeps_the_contract_of_trainings():
+    """Both learn, a step of both is one step, and a stopped training goes on as if it had never stopped."""
+    check_training(functools.partial(registry("training").build, ADVERSARIAL), Forger, LINKS["rssi"])
+
+
+def test_a_step_is_goodfellows_with_the_gradient_of_its_own_player_alone(tmp_path):
+    module, counted = adversarial(), []
+    forger, links = module.model, LINKS["rssi"]
+
+    class Referee(Callback):
+        def on_train_batch_start(self, trainer, module, batch, _):
+            self.random = torch.random.get_rng_state()
+            self.before = {name: parameter.detach().clone() for name, parameter in forger.named_parameters()}
+            self.rates = [group["lr"] for optimizer in trainer.optimizers for group in optimizer.param_groups]
+
+        def on_train_batch_end(self, trainer, module, outputs, batch, _):
+            factor = 0.1 ** ((trainer.global_step - 1) / 3)
+            assert self.rates == pytest.approx([0.02 * factor, 0.05 * factor]), "both follow the schedule"
+            leaves = {name: value.clone().requires_grad_() for name, value in self.before.items()}
+            torch.random.set_rng_state(self.random)
+            value, penalties = torch.func.functional_call(forger, leaves, (batch,))
+
+            def logits(x, weight, bias):
+                return (torch.stack((x, batch.query.transmitters[:, 0]), 1) @ weight.T + bias)[:, 0]
+
+            judge = [leaves["judge.weight"], leaves["judge.bias"]]
+            real, fake = logits(batch.labels, *judge).sigmoid(), logits(value.detach(), *judge).sigmoid()
+            judged = -(real.log().mean() + (1 - fake).log().mean())
+            steps = zip(judge, torch.autograd.grad(judged, judge), strict=True)
+            moved = [(x - self.rates[1] * g).detach() for x, g in steps]
+            torch.testing.assert_close([forger.judge.weight.detach(), forger.judge.bias.detach()], moved)
+            deceit = -logits(value, *moved).sigmoid().log().mean()
+            loss = (value - batch.labels).abs().mean() + 0.5 * deceit + 0.5 * penalties["gain"]
+            assert outputs["loss"].item() == pytest.approx(loss.item(), rel=1e-5)
+            for name in ("network.weight", "network.bias"):
+                (gradient,) = torch.autograd.grad(loss, leaves[name], retain_graph=True)
+                expected = self.before[name] - self.rates[0] * gradient
+                torch.testing.assert_close(forger.get_parameter(name).detach(), expected)
+            counted.append(trainer.global_step)
+
+    trainer = lightning.Trainer(
+        accelerator="cpu", max_epochs=-1, max_steps=3, val_check_interval=3, enable_progress_bar=False,
+        enable_model_summary=False, enable_checkpointing=False, callbacks=[Referee()], log_every_n_steps=1,
+        check_val_every_n_epoch=None, num_sanity_val_steps=0,
+        logger=CSVLogger(tmp_path, "log"),
+    )  # fmt: skip
+    trainer.fit(module, Batches(links, links.split.train, 4, 0, 3), InOrder(links, links.split.validation, 4))
+    assert counted == [1, 2, 3]
+    curves = read_curves(list(tmp_path.glob("log/*/metrics.csv")))
+    assert all(len({*curves[f"train/{name}"][1].tolist()}) == 3 for name in ("discriminator", "deceit", "mae"))
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "error", "message"),
+    [
+        (Plain, {}, ValueError, "this model is trained by 'descent'; set training=descent"),
+        (Unjudged, {}, ValueError, "adversarial training needs a model with a parameter group 'discriminator'"),
+        (Forger, {"weight": -1.0}, ValueError, r"training\.weight must be at least 0, got -1\.0"),
+        (
+            Forger,
+            {"jiter": 0.1},
+            ValueError,
+            r"'adversarial' has no option 'jiter' \(did you mean 'jitter'\?\)",
+        ),
+        (Forger, {"batch_size": 4.0}, TypeError, "training 'adversarial' option 'batch_size' must be a whole number"),
+        (Forger, {"weight": "much"}, TypeError, "training 'adversarial' option 'weight' must be a number, got 'much'"),
+    ],
+)
+def test_adversarial_training_refuses(model, options, error, message):
+    with pytest.raises(error, match=message):
+        adversarial(model, **options)
+
+
+@pytest.mark.parametrize(
+    ("processes", "scaler", "message"),
+    [
+        (2, None, r"adversarial training takes one process; set trainer\.devices=1"),
+        (1, "a scaler", r"adversarial training does not scale gradients; set trainer\.precision"),
+    ],
+)
+def test_adversarial_training_takes_one_process_and_unscaled_gradients(processes, scaler, message):
+    module = adversarial()
+    module._trainer = SimpleNamespace(world_size=processes, precision_plugin=SimpleNamespace(scaler=scaler))
+    with pytest.raises(ValueError, match=message):
+        module.on_fit_start()

@@ -12,10 +12,10 @@ import pytest
 import torch
 from splatting import build, composed, run
 
+from gaigs.antenna import Array, Receiver
 from gaigs.data.synthetic.image_source import Room, respond
 from gaigs.geometry import Pose
 from gaigs.query import Batch, Query
-from gaigs.scene import Array, Receiver
 from gaigs.task.csi import Csi
 from gaigs.testing import check_model, example_links
 

@@ -418,11 +418,11 @@ def test_an_obj_has_faces_of_many_corners_counted_from_either_end():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("v 0 0", "line 1, must hold numbers x y z, got 'v 0 0'"),
-        ("v 0 0 0\nf 1 2 3", "line 2, must hold a face of three vertices or more of the 1 before it"),
+        ("v 0 0", "line 1: expected numbers x y z, got 'v 0 0'"),
+        ("v 0 0 0\nf 1 2 3", "line 2: expected a face of three vertices or more of the 1 before it"),
         ("v 0 0 0\nf 1 1", "a face of three vertices or more"),
         ("v a b c", "line 1"),
-        ("v 0 0 nan\nv 0 1 0\nv 1 0 0\nf 1 2 3", "line 1, must hold numbers x y z, got 'v 0 0 nan'"),
+        ("v 0 0 nan\nv 0 1 0\nv 1 0 0\nf 1 2 3", "line 1: expected numbers x y z, got 'v 0 0 nan'"),
         ("v 0 0 0", "must hold surfaces, and holds none"),
     ],
 )
@@ -440,7 +440,7 @@ def test_other_files_are_refused(tmp_path, tracer):
     with pytest.raises(FileNotFoundError, match=r"no mesh at nowhere\.ply"):
         rooms.find_meshes("none", "nowhere.ply")
     for name, message in (
-        ("room.ply", r"must be a whole \.ply file of vertices"),
+        ("room.ply", r"expected a \.ply file of vertices"),
         ("room.xml", "must be a scene that Sionna RT"),
     ):
         (tmp_path / name).write_text("no mesh")
@@ -463,7 +463,7 @@ element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n{} 0 
         (
             "wood",
             LEAF.format("ply", '<string name="filename" value="far.ply"/>'),
-            r"shape '.*', must hold positions",
+            r"shape .*: expected positions",
         ),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 import torch
 from splatting import build, check_task, composed, run
 
-from gaigs.directions import Grid
+from gaigs.geometry import Grid
 from gaigs.query import Batch, Query
 from gaigs.task.spectrum import Spectrum
 from gaigs.testing import check_model, example_links

@@ -8,7 +8,7 @@ from splatting import build, check_task, composed, repository, run
 
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed
 from gaigs.query import Query
 from gaigs.testing import check_model, example_links
 

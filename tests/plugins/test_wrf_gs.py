@@ -8,10 +8,9 @@ import torch
 from splatting import build, check_task, composed, run
 from torch.nn.functional import normalize
 
-from gaigs.deformation.two_branch import CLEAR, DARKEST
-from gaigs.directions import Grid
-from gaigs.geometry import semi_axes
-from gaigs.placement import Placed
+from gaigs.deformation.two_branch import INITIAL_ATTENUATION, LEAST_ATTENUATION
+from gaigs.gaussians import Placed
+from gaigs.geometry import Grid, semi_axes
 from gaigs.query import Query
 from gaigs.testing import check_deformation, check_pooling, check_tokenizer, example_links
 from gaigs.testing.rasterizer import rasterize_densely
@@ -85,7 +84,7 @@ def transcribed(network, tokens, placed, query):
             for k in range(3):
                 h = relu(linear(f"behind.{k}", h))
             opaque = 1 / (1 + np.exp(-linear("attenuation", h)[0]))
-            attenuations.append(DARKEST + (1 - DARKEST) * opaque)
+            attenuations.append(LEAST_ATTENUATION + (1 - LEAST_ATTENUATION) * opaque)
             offset = mean - positions[int(query.receivers[q])]
             view = features(offset / np.linalg.norm(offset), 10)
             parts = {
@@ -135,7 +134,7 @@ def test_it_starts_nearly_transparent():
     model = build("model", composed(*SMALL)["model"], scene=LINKS.scene)
     placed, query = Placed(model.gaussians.means.detach()[None]), LINKS.query[:3]
     residuals = model.deformation(model.tokenizer(placed, model.gaussians.opacities, query), placed, query)
-    torch.testing.assert_close(residuals.attenuations, torch.full((3, 40), CLEAR))
+    torch.testing.assert_close(residuals.attenuations, torch.full((3, 40), INITIAL_ATTENUATION))
 
 
 def test_a_gaussian_on_the_receiver_has_finite_gradients(model):

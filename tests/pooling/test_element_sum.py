@@ -8,14 +8,16 @@ import pytest
 import torch
 from scipy.constants import speed_of_light
 
+from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Split
 from gaigs.geometry import Pose
 from gaigs.pooling.element_sum import ElementSum
-from gaigs.propagation import direct_waves, free_space
+from gaigs.pooling.path_csi import PathCsi
+from gaigs.propagation import free_space
 from gaigs.query import Query
-from gaigs.scene import Array, Receiver
+from gaigs.scene import direct_waves
 from gaigs.task.csi import Csi
-from gaigs.testing import check_pooling, example_links
+from gaigs.testing import example_links
 
 FREQUENCIES = torch.tensor([2.40e9, 2.44e9, 2.48e9], dtype=torch.float64)
 POSES = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)), Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0))
@@ -40,8 +42,8 @@ def make(pattern="isotropic", conjugated=False, gain=1.0, random_phases=False):
     return replace(links, labels=waves.to(torch.complex64))
 
 
-def fitted(links, grid=(ROWS, COLUMNS)):
-    pooling = ElementSum(links.scene, list(grid))
+def fitted(links, of_paths=False):
+    pooling = PathCsi(links.scene) if of_paths else ElementSum(links.scene, [ROWS, COLUMNS])
     pooling.fit(links)
     return pooling
 
@@ -96,21 +98,6 @@ def test_the_direct_path_is_one_map_from_everywhere(conjugated, receiver):
     assert ((found - true).abs() / true.abs()).max() < 0.01
 
 
-def test_directions_add_up():
-    pooling = fitted(make())
-    query = Query(torch.tensor([[1.0, 2.0, 0.5]]), torch.tensor([1]))
-    one, other = bright(pooling, 0, 3, [1 + 0j] * 3), bright(pooling, 4, 8, [0.5j] * 3)
-    torch.testing.assert_close(pooling(one + other, query), pooling(one, query) + pooling(other, query))
-
-
-def test_each_link_has_its_own_map():
-    pooling = fitted(make())
-    image = torch.randn(3, 6, ROWS, COLUMNS, generator=torch.Generator().manual_seed(0))
-    query = Query(torch.rand(3, 3), torch.zeros(3, dtype=torch.long))
-    alone = torch.cat([pooling(image[i : i + 1], query[i : i + 1]) for i in range(3)])
-    torch.testing.assert_close(pooling(image, query), alone)
-
-
 @pytest.mark.parametrize("gain", [1e-3, 1.0, 40.0])
 def test_the_strength_is_that_of_the_channels_over_free_space(gain):
     pooling = fitted(make(gain=gain))
@@ -146,10 +133,6 @@ def test_the_zone_is_what_the_elements_hear(pattern):
     assert (low, high) == (0 if pattern == "cosine" else -math.pi / 2, math.pi / 2)
 
 
-def test_it_keeps_the_contract_of_poolings():
-    check_pooling(lambda scene: ElementSum(scene, [4, 8]), example_links("csi"))
-
-
 def test_other_labels_and_arrays_are_refused():
     with pytest.raises(ValueError, match="pooling 'element_sum' gives complex channels, and labels of task 'rssi' are"):
         ElementSum(example_links("rssi").scene, [4, 8])
@@ -161,7 +144,7 @@ def test_other_labels_and_arrays_are_refused():
         ElementSum(links.scene, [4])
 
 
-# --- what the elements hear ---
+# --- paths ---
 
 
 def direct_fields(links, index):
@@ -181,10 +164,10 @@ def direct_fields(links, index):
 def test_a_single_path_is_heard_as_free_space(conjugated, random_phases, gain):
     """Links some hundred metres long, on which waves are plane."""
     links = make(conjugated=conjugated, gain=gain, random_phases=random_phases)
-    pooling = fitted(links)
+    pooling = fitted(links, of_paths=True)
     far = replace(links, query=replace(links.query, transmitters=100 * links.query.transmitters + 100))
     index = (links.query.receivers == 0).nonzero()[:, 0]
-    heard = pooling.hear(direct_fields(far, index), far.query[index])
+    heard = pooling.read(direct_fields(far, index), far.query[index])
     sign = 1 if conjugated else -1
     expected = gain * direct_waves(far.scene, far.query[index], FREQUENCIES, sign)
     if random_phases:  # which are told between elements and subcarriers alone
@@ -196,11 +179,11 @@ def test_a_single_path_is_heard_as_free_space(conjugated, random_phases, gain):
 def test_noise_is_heard_for_what_it_is():
     """Twice the fields are twice the channels, of which each is that of its element and subcarrier alone."""
     links = make()
-    pooling = fitted(links)
+    pooling = fitted(links, of_paths=True)
     query = links.query[torch.tensor([0, 2])]
     fields = torch.randn(2, 4, 3, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
-    channels = pooling.hear(fields, query)
-    torch.testing.assert_close(pooling.hear(2 * fields, query), 2 * channels)
+    channels = pooling.read(fields, query)
+    torch.testing.assert_close(pooling.read(2 * fields, query), 2 * channels)
     assert channels.dtype == torch.complex64
     ratios = channels / fields
     friis = speed_of_light / (4 * math.pi * FREQUENCIES)  # of free space, over 1 / distance

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.directions import Grid
-from gaigs.geometry import Pose, from_spherical
+from gaigs.geometry import Grid, Pose, from_spherical
 from gaigs.projection.mercator import Mercator
 
 HERE = Pose(torch.zeros(3), torch.eye(3))

@@ -7,8 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gaigs.directions import Grid, Rays
-from gaigs.geometry import Pose, from_spherical
+from gaigs.geometry import Grid, Pose, from_spherical
 from gaigs.projection.direction_cosine import DirectionCosine
 from gaigs.projection.equirectangular import Equirectangular
 from gaigs.projection.mercator import Mercator
@@ -128,17 +127,6 @@ def test_around_the_zenith_a_gaussian_at_the_pole_is_seen_in_all_directions(kind
 
 
 @every
-def test_a_hidden_gaussian_changes_nothing(kind):
-    pose = Pose.from_xyzw((1.0, 2.0, 0.5), (0.6, 0, 0, 0.8))
-    means = torch.tensor([[1.0, 2.0, 3.5], [1.0, 2.0, 0.5], [2.0, 3.0, 1.0]])
-    splats = kind(PIXEL).project(means, ball(3, 0.2), pose)
-    assert splats.visible.tolist() == [True, False, True]
-    assert splats.factors.isfinite().all()
-    seen = means[[0, 2]]
-    assert torch.equal(draw(kind(PIXEL), means, ball(3, 0.2), pose), draw(kind(PIXEL), seen, ball(2, 0.2), pose))
-
-
-@every
 def test_a_centre_that_is_nan_is_not_hidden(kind):
     means = torch.tensor([[1.0, 2.0, math.nan], [1.0, 2.0, 3.0]])
     assert kind(PIXEL).project(means, ball(2, 0.2), HERE).visible.all()
@@ -175,38 +163,6 @@ def test_a_limit_at_the_pole_or_beyond_is_refused(kind, limit):
 # --- lists of rays ---
 
 
-def scattered(n, dtype=torch.float32):
-    """Rays all over the upper hemisphere, some of them at its edges and at the seam."""
-    generator = torch.Generator().manual_seed(0)
-    azimuths = math.tau * torch.rand(n, generator=generator, dtype=dtype) - math.pi
-    elevations = math.pi / 2 * torch.rand(n, generator=generator, dtype=dtype)
-    azimuths[:3] = torch.tensor([math.pi, -math.pi, 0], dtype=dtype)
-    elevations[:3] = torch.tensor([0.3, 0.0, math.pi / 2], dtype=dtype)
-    return Rays(elevations, azimuths)
-
-
-@every
-def test_rays_lie_where_their_directions_do(kind):
-    rays = scattered(50, torch.float64)
-    plane = kind(PIXEL).plane(rays)
-    assert plane.shape == (1, 50)
-    u, v = kind(PIXEL).coordinates(rays.vectors()).unbind(-1)
-    torch.testing.assert_close(plane.v[0], v)
-    turns = (plane.u[0] - u) / (plane.period or math.inf)
-    torch.testing.assert_close(turns, turns.round())
-    if plane.period is None:
-        torch.testing.assert_close(plane.u[0], u)
-
-
-@every
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_planes_keep_the_directions_dtype(kind, dtype):
-    grid = Grid.degrees(range(5, 80, 20), range(0, 360, 60)).to(dtype)
-    for directions in (grid, grid.flatten()):
-        plane = kind(PIXEL).plane(directions)
-        assert plane.u.dtype == plane.v.dtype == dtype
-
-
 @every
 def test_a_map_of_rays_is_that_of_the_pixels(kind):
     generator = torch.Generator().manual_seed(0)
@@ -221,8 +177,3 @@ def test_a_map_of_rays_is_that_of_the_pixels(kind):
     assert image.shape == (2, 3, 1, 40)
     torch.testing.assert_close(image[:, :, 0], whole.flatten(2)[:, :, chosen], rtol=0, atol=1e-5)
     torch.testing.assert_close(passed[:, 0], left.flatten(1)[:, chosen], rtol=0, atol=1e-5)
-
-
-@every
-def test_no_rays_have_an_empty_plane(kind):
-    assert kind(PIXEL).plane(scattered(9)[:0]).shape == (1, 0)

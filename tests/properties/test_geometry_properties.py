@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from strategies import normals, points, poses, quaternions, tensors
 
 from gaigs.geometry import (
-    Pose,
     from_spherical,
     quaternions_to_rotations,
     semi_axes,
@@ -65,15 +64,6 @@ def test_angles_lead_back_to_the_point(direction, distance):
 def test_a_pose_takes_back_what_it_gives(pose, point):
     torch.testing.assert_close(pose.world(pose.local(point)), point, rtol=0, atol=1e-10)
     torch.testing.assert_close(pose.local(point).norm(), (point - pose.position).norm(), rtol=1e-9, atol=1e-12)
-
-
-@given(quaternions, points)
-def test_a_pose_of_a_file_is_the_quaternion_turned_round(quat, position):
-    if quat.norm() < 0.1:
-        return
-    w, x, y, z = (quat / quat.norm()).tolist()
-    pose = Pose.from_xyzw(position, (x, y, z, w))
-    assert (pose.rotation - quaternions_to_rotations(quat)).abs().max() < 1e-5
 
 
 @given(normals(), st.integers(0, 5))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import seeds, unit
 
-from gaigs.directions import Grid
+from gaigs.geometry import Grid
 from gaigs.loss.l1_ssim import structural_similarity
 from gaigs.task.csi import HIGHEST, Csi
 from gaigs.task.rssi import Rssi

@@ -1,19 +1,16 @@
 """Splits of any number of links, in rows of any length, anywhere in space."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import seeds
 
+from gaigs.antenna import Receiver
 from gaigs.data import Links
 from gaigs.geometry import Pose
 from gaigs.query import Query
 from gaigs.registry import registry
-from gaigs.scene import Receiver
-from gaigs.split import folds
 from gaigs.task.rssi import Rssi
 
 OPTIONS = {"blocks": {"edge": st.floats(1e-3, 1e3)}, "runs": {"length": st.integers(1, 2**62)}}
@@ -67,17 +64,3 @@ def test_parts_are_disjoint_cover_and_repeat(name, links, data, test, validation
         assert not rows[0] & rows[1]
         assert not rows[0] & rows[2]
         assert not rows[1] & rows[2]
-
-
-@given(links(), st.integers(2, 6), seeds)
-def test_folds_test_each_training_link_once(links, count, seed):
-    try:
-        links = replace(links, split=registry("split").build({"name": "random", "seed": seed}, links=links))
-        parts = folds(links, count, seed)
-    except ValueError:
-        return
-    tested = torch.cat([part.test for part in parts])
-    assert torch.equal(tested.sort().values, links.split.train)
-    for part in parts:
-        assert torch.equal(torch.cat((part.train, part.test)).sort().values, links.split.train)
-        assert torch.equal(part.validation, links.split.validation)

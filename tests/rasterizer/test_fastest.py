@@ -10,7 +10,7 @@ from gaigs.rasterizer.fastest import FastestRasterizer
 from gaigs.rasterizer.torch import TorchRasterizer
 
 opencl = pytest.importorskip("gaigs.rasterizer.opencl", exc_type=ImportError)
-_devices = pytest.importorskip("gaigs.rasterizer.devices", exc_type=ImportError)
+found_devices = pytest.importorskip("gaigs.rasterizer.devices", exc_type=ImportError)
 
 
 def scene(n=12, dtype=torch.float32, channels=2, attenuations=None):
@@ -30,7 +30,7 @@ def fastest():
 @pytest.mark.usefixtures("opencl_works")
 def test_is_opencl_where_that_suits(fastest):
     image, _ = fastest(*scene())
-    assert fastest.used == f"opencl on {opencl.default_device()}"
+    assert fastest.used == f"opencl on {found_devices.default_device()}"
     assert torch.equal(image, opencl.OpenCLRasterizer()(*scene())[0])
 
 
@@ -70,11 +70,11 @@ def test_is_torch_where_a_driver_is_broken(monkeypatch, caplog):
     def fail(*_):
         raise opencl.cl.LogicError("clCreateContext failed: INVALID_DEVICE")
 
-    _devices._open.cache_clear()
+    found_devices._open.cache_clear()
     monkeypatch.setattr(opencl.cl, "Context", fail)
     with caplog.at_level(logging.INFO):
         fastest = FastestRasterizer()
-    assert "rasterizer: torch, as opencl is not to be had here" in caplog.text
+    assert "rasterizer: torch, as opencl does not work here" in caplog.text
     assert "cannot be opened (clCreateContext failed: INVALID_DEVICE); mend its driver" in caplog.text
     fastest(*scene())
     assert fastest.used == "torch"

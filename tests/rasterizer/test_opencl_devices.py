@@ -32,10 +32,10 @@ def afresh():
 
 @pytest.mark.usefixtures("opencl_works")
 def test_lists_a_device_and_takes_it_by_any_part_of_its_name(monkeypatch):
-    name = opencl.devices()[0]
+    name = found_devices.devices()[0]
     opencl.OpenCLRasterizer(device=name[3:-3].upper())
     monkeypatch.setenv("GAIGS_OPENCL_DEVICE", name)
-    assert opencl.OpenCLRasterizer().used == f"opencl on {opencl.default_device()}" == f"opencl on {name}"
+    assert opencl.OpenCLRasterizer().used == f"opencl on {found_devices.default_device()}" == f"opencl on {name}"
 
 
 def test_the_first_processor_is_the_default(monkeypatch):
@@ -45,13 +45,13 @@ def test_the_first_processor_is_the_default(monkeypatch):
     found = [device("one", kind.GPU), device("two", kind.CPU), device("three", kind.CPU)]
     monkeypatch.setattr(found_devices, "_devices", lambda: found)
     monkeypatch.delenv("GAIGS_OPENCL_DEVICE", raising=False)
-    assert opencl.devices() == ["Maker: one (GPU)", "Maker: two (CPU)", "Maker: three (CPU)"]
-    assert opencl.default_device() == "Maker: two (CPU)"
+    assert found_devices.devices() == ["Maker: one (GPU)", "Maker: two (CPU)", "Maker: three (CPU)"]
+    assert found_devices.default_device() == "Maker: two (CPU)"
     monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "gpu")
-    assert opencl.default_device() == "Maker: one (GPU)"
+    assert found_devices.default_device() == "Maker: one (GPU)"
     monkeypatch.delenv("GAIGS_OPENCL_DEVICE")
     del found[1:]
-    assert opencl.default_device() == "Maker: one (GPU)"
+    assert found_devices.default_device() == "Maker: one (GPU)"
 
 
 def test_an_unknown_device_is_an_error_that_lists_those_there_are(monkeypatch):
@@ -68,7 +68,7 @@ def test_no_driver_is_an_error_that_says_what_to_install(monkeypatch):
 
     monkeypatch.setattr(found_devices.cl, "get_platforms", find_no_platform)
     with pytest.raises(RuntimeError, match=r"needs an OpenCL driver: pip install 'pyopencl\[pocl\]'"):
-        opencl.devices()
+        found_devices.devices()
 
 
 def broken(message):
@@ -85,14 +85,14 @@ def test_a_broken_driver_is_an_error_that_names_it(monkeypatch):
         found_devices.cl.get_platforms()[0],
         SimpleNamespace(name="Wreck", get_devices=broken("OUT_OF_HOST_MEMORY")),
     )
-    names = opencl.devices()
+    names = found_devices.devices()
     monkeypatch.setattr(found_devices.cl, "get_platforms", lambda: [bad, good])
-    assert set(opencl.devices()) <= set(names), "beside one that works it hurts nobody"
+    assert set(found_devices.devices()) <= set(names), "beside one that works it hurts nobody"
     monkeypatch.setattr(found_devices.cl, "get_platforms", lambda: [bad])
     with pytest.raises(RuntimeError, match=r"needs an OpenCL driver.*; Wreck lists no devices \(OUT_OF_HOST_MEMORY\)"):
         opencl.OpenCLRasterizer(device="another")
     with pytest.raises(RuntimeError, match="Wreck"):
-        opencl.devices()
+        found_devices.devices()
 
 
 @pytest.mark.parametrize("what", ["Context", "CommandQueue"])
@@ -133,7 +133,7 @@ def test_the_fastest_is_torch_then_and_says_so_and_a_device_is_asked_once(builds
     with caplog.at_level(logging.INFO):
         rasterizers = [FastestRasterizer() for _ in range(3)]
     assert all(rasterizer.opencl is None for rasterizer in rasterizers)
-    assert len(re.findall("rasterizer: torch, as opencl is not to be had here .*unknown target CPU", caplog.text)) == 3
+    assert len(re.findall("rasterizer: torch, as opencl does not work here .*unknown target CPU", caplog.text)) == 3
     assert builds == [found_devices.PROBE]
 
 

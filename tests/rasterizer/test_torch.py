@@ -11,57 +11,32 @@ from fractions import Fraction
 
 import pytest
 import torch
-from reference import margin, rasterize
+from reference import rasterize
 
-from gaigs.directions import Grid
-from gaigs.geometry import Pose, from_spherical
+from gaigs.geometry import Grid, Pose, from_spherical
 from gaigs.projection import Plane, Splats
 from gaigs.projection.direction_cosine import DirectionCosine
-from gaigs.projection.equirectangular import Equirectangular
 from gaigs.projection.mercator import Mercator
 from gaigs.rasterizer import torch as module
 from gaigs.rasterizer.torch import TorchRasterizer
 from gaigs.testing.rasterizer import rasterize_densely
 
 GRID = Grid.degrees(range(1, 91, 3), [0.3 + 6 * k for k in range(60)])
-DIRECTIONS = {
-    "grid": GRID,
-    "rays": GRID.flatten()[torch.randperm(1800, generator=torch.Generator().manual_seed(0))[:70]],
-}
 HERE = Pose(torch.zeros(3), torch.eye(3))
-PLACES = {
-    "anywhere": lambda uniform, n: from_spherical(uniform(0, math.tau, n), uniform(-0.5, 1.57, n)),
-    "at the seam": lambda uniform, n: from_spherical(uniform(-0.2, 0.2, n), uniform(0, 1.5, n)),
-    "at the pole": lambda uniform, n: from_spherical(uniform(0, math.tau, n), uniform(1.45, math.pi / 2, n)),
-    "at the horizon": lambda uniform, n: from_spherical(uniform(0, math.tau, n), uniform(-0.1, 0.1, n)),
-    "on the pole": lambda uniform, n: torch.tensor([[0.0, 0.0, 1.0]]).expand(n, 3),
-}
+PROJECTIONS = {"mercator": Mercator, "direction_cosine": DirectionCosine}
 NAMES = ("means2d", "factors", "signal", "opacities", "attenuations")
-PROJECTIONS = {"mercator": Mercator, "equirectangular": Equirectangular, "direction_cosine": DirectionCosine}
 
 
-def scene(
-    place="anywhere",
-    projection="mercator",
-    n=40,
-    b=2,
-    own=False,
-    attenuations=True,
-    opacity=(0.0, 1.0),
-    size=0.3,
-    directions="grid",
-    channels=2,
-):
-    """Arguments of a rasterizer: Gaussians about a receiver, on its plane."""
+def scene(projection="mercator", n=40, own=False, attenuations=True, size=0.3):
+    """Arguments of a rasterizer: Gaussians all about a receiver, on its plane."""
     generator = torch.Generator().manual_seed(n)
     uniform = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
     projection = PROJECTIONS[projection](GRID.pitch)
-    means = PLACES[place](uniform, n) * uniform(0.5, 4, n, 1)
-    half = size * torch.randn(b if own else 1, n, 3, 3, generator=generator)
-    splats = projection.project(means, half, HERE)
-    plane = projection.plane(DIRECTIONS[directions])
-    signal = torch.randn(b, n, channels, generator=generator)
-    return splats, signal, uniform(*opacity, b, n), uniform(0.2, 1, b, n) if attenuations else None, plane
+    means = from_spherical(uniform(0, math.tau, n), uniform(-0.5, 1.57, n)) * uniform(0.5, 4, n, 1)
+    half = size * torch.randn(2 if own else 1, n, 3, 3, generator=generator)
+    splats, signal = projection.project(means, half, HERE), torch.randn(2, n, 2, generator=generator)
+    lets = uniform(0.2, 1, 2, n) if attenuations else None
+    return splats, signal, uniform(0, 1, 2, n), lets, projection.plane(GRID)
 
 
 def render(rasterizer, arguments, pixels, dtype=torch.float64):
@@ -77,20 +52,6 @@ def render(rasterizer, arguments, pixels, dtype=torch.float64):
     leaves = {name: leaf for name, leaf in zip(NAMES, leaves, strict=True) if leaf is not None}
     gradients = torch.autograd.grad(total, [*leaves.values()])
     return {"image": image.detach(), "left": left.detach(), **dict(zip(leaves, gradients, strict=True))}
-
-
-def assert_agrees(arguments):
-    """With the formula, in both precisions, off the jumps where rounding decides on a splat."""
-    splats, _, opacities, _, plane = arguments
-    pixels = margin(splats, opacities, plane) > 1e-5
-    assert pixels.double().mean() > 0.98
-    truth = render(rasterize_densely, arguments, pixels)
-    for dtype, values, gradients in ((torch.float64, 1e-10, 1e-9), (torch.float32, 1e-5, 1e-4)):
-        found = render(TorchRasterizer(), arguments, pixels, dtype)
-        for (name, true), tolerance in zip(truth.items(), [values] * 2 + [gradients] * 5, strict=False):
-            assert found[name].dtype == dtype
-            tolerance *= max(true.abs().max().item(), 1.0)
-            torch.testing.assert_close(found[name].double(), true, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -128,54 +89,18 @@ def test_narrow_splats_at_the_seam_are_as_good_as_elsewhere():
 @pytest.mark.parametrize("attenuations", [False, True])
 @pytest.mark.parametrize("projection", ["mercator", "direction_cosine"])
 def test_the_formula_is_that_of_the_loop_over_splats(projection, attenuations):
-    arguments = scene("at the seam", projection, n=12, own=True, attenuations=attenuations)
+    arguments = scene(projection, n=12, own=True, attenuations=attenuations)
     pixels = torch.ones(2, *GRID.shape)
     loop = render(rasterize, arguments, pixels)
     for name, found in render(rasterize_densely, arguments, pixels).items():
         torch.testing.assert_close(found, loop[name], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS)
-@pytest.mark.parametrize("place", PLACES)
-def test_values_and_gradients_are_those_of_the_formula(place, projection):
-    assert_agrees(scene(place, projection))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"attenuations": False},
-        {"own": True},
-        {"own": True, "projection": "direction_cosine"},
-        {"n": 1, "b": 1},
-        {"size": 4.0},
-        {"size": 0.01},
-        {"opacity": (1.0, 1.0), "size": 1.0},
-        {"opacity": (0.0, 0.01)},
-        {"n": 120, "size": 0.1},
-        {"channels": 19, "own": True},
-        {"directions": "rays"},
-        {"directions": "rays", "projection": "direction_cosine", "own": True},
-    ],
-    ids=str,
-)
-def test_other_scenes(options):
-    assert_agrees(scene(**options))
-
-
 def test_whole_tiles_of_nothing():
     splats, *others = scene(n=6, size=0.02)
     image, left = TorchRasterizer()(splats, *others)
-    assert_agrees((splats, *others))
     assert (image == 0).double().mean() > 0.8
     assert (left == 1).double().mean() > 0.8
-
-
-@pytest.mark.parametrize(("n", "b"), [(0, 2), (5, 0), (0, 0)])
-def test_nothing_gives_an_empty_map(n, b):
-    image, left = TorchRasterizer()(*scene(n=n, b=b))
-    assert torch.equal(image, torch.zeros(b, 2, *GRID.shape))
-    assert torch.equal(left, torch.ones(b, *GRID.shape))
 
 
 @pytest.mark.parametrize("projection", ["mercator", "direction_cosine"])
@@ -217,50 +142,20 @@ def test_depth_decides_and_among_equals_the_index(depths, order):
     assert left.item() == pytest.approx(1e-3, rel=1e-5)
 
 
-def test_what_is_invisible_does_nothing_and_gets_no_gradient():
-    splats, *others = scene()
-    hidden = torch.arange(40) % 3 == 0
-    splats = replace(splats, visible=~hidden)
-    splats.means2d[hidden], splats.factors[:, hidden] = torch.inf, torch.nan
-    pixels = torch.ones(2, *GRID.shape)
-    found = render(TorchRasterizer(), (splats, *others), pixels)
-    assert found["image"].isfinite().all()
-    assert found["left"].isfinite().all()
-    for name in NAMES:
-        of_hidden = found[name].index_select(int(name != "means2d"), hidden.nonzero().flatten())
-        assert not of_hidden.any()
-        assert found[name].any()
-
-
-@pytest.mark.parametrize("name", ["means2d", "factors", "width", "signal", "opacities", "attenuations"])
-def test_nan_shows_in_the_map(name):
-    splats, signal, opacities, attenuations, plane = scene(own=True)
-    front = int(splats.depths.argmin())
-    opacities[1, front] = 0.5
-    broken = {"width": splats.factors[..., 0], "factors": splats.factors, "signal": signal}
-    broken |= {"opacities": opacities, "attenuations": attenuations, "means2d": splats.means2d.expand(2, -1, -1)}
-    broken[name][1, front] = torch.nan
-    image, left = TorchRasterizer()(splats, signal, opacities, attenuations, plane)
-    assert image[1].isnan().any()
-    if name in ("opacities", "width", "factors"):
-        assert not image[0].isnan().any()
-        assert left[1].isnan().any()
-
-
 MEMORY = """
 import re
 from pathlib import Path
 import torch
-from gaigs.directions import Grid
+from gaigs.geometry import Grid
 from gaigs.gaussians import fibonacci_lattice
 from gaigs.geometry import Pose
 from gaigs.projection.mercator import Mercator
 from gaigs.rasterizer.torch import TorchRasterizer
 
-n, grid = 20_000, Grid.degrees()
+n, grid = 10_000, Grid.degrees()
 projection = Mercator(grid.pitch)
 points = (3 * fibonacci_lattice(n, 0.0, 1.57)).requires_grad_()
-width = 3 * (2 * torch.pi / n) ** 0.5  # to the next Gaussian
+width = 3 * (2 * torch.pi / n) ** 0.5 / 4  # a quarter of the way to the next Gaussian
 semi_axes = (width * torch.eye(3)).expand(1, n, 3, 3)
 splats = projection.project(points, semi_axes, Pose(torch.zeros(3), torch.eye(3)))
 opacities, signal = torch.full((1, n), 0.1, requires_grad=True), torch.randn(1, n, 2, requires_grad=True)
@@ -280,8 +175,4 @@ print(peak() - before)
 def test_memory_does_not_grow_with_pairs_of_splats_and_pixels():
     done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) < 2 * 2**30  # one float32 for each pair of 20,000 splats and 32,400 pixels would be 2.4 GiB
-
-
-def test_what_drew_a_map_is_known():
-    assert TorchRasterizer().used == "torch"
+    assert int(done.stdout) < 2**29  # a float32 for each pair of 10,000 splats and 32,400 pixels would be 1.2 GiB

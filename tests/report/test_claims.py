@@ -1,43 +1,28 @@
 """Runs of variants, as the table of the paper's claims shows them."""
 
-import csv
-import json
-
 import pytest
 import yaml
+from folders import read, write_run
 from hydra import compose, initialize_config_dir
 
 from gaigs.configuration import conf_dir
 from gaigs.registry import registry
-from gaigs.report.claims import interval, read_claims
+from gaigs.report.claims import compare, interval, read_claims
 from gaigs.report.multirun import report
+from gaigs.report.runs import read_runs
 
-EXPERIMENTS = {"claims": "spectrum", "claims_rssi": "rssi"}
 
-
-def write_run(folder, variant, score=None, seed=0, task="spectrum", said="", **overrides):
-    """A run of a variant, or one that has said something and ended without a result."""
-    typed = [f"{key}={value}" for key, value in overrides.items()] + [f"+variant={variant}", f"seed={seed}"]
-    own = folder / ",".join(typed)
-    (own / ".hydra").mkdir(parents=True)
-    (own / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(typed))
-    (own / "gaigs.log").write_text(said)
-    if score is None:
-        return
+def write_variant(folder, variant, score=None, seed=0, task="spectrum", log="", **overrides):
+    """A run of a variant, or one that has logged something and has no result."""
+    typed = [*(f"{key}={value}" for key, value in overrides.items()), f"+variant={variant}", f"seed={seed}"]
     name = next(iter(registry("task").get(task).metrics()))
-    metrics = {"task": task, "split": "official", "seed": seed, "device": "cpu"}
-    metrics |= {"models": {"gaigs": {name: score}, "mean": {name: 0.5}}, "train_seconds": 9.0, "inference_ms": 2.0}
-    (own / "metrics.json").write_text(json.dumps(metrics))
+    models = None if score is None else {"gaigs": {name: score}, "mean": {name: 0.5}}
+    write_run(folder / ",".join(typed), typed, models, task, log, seed=seed)
 
 
-def read(folder):
-    with open(folder / "claims.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def row(folder, better, than):
-    (found,) = (row for row in read(folder) if (row["better"], row["than"]) == (better, than))
-    return found
+def found(folder):
+    """Rows of the table by their variants."""
+    return {(row["better"], row["than"]): row for row in compare(read_runs(folder), read_claims())}
 
 
 # --- intervals ---
@@ -55,11 +40,11 @@ def test_an_interval_of_two_gains_by_hand():
 
 def test_one_seed_has_no_interval(tmp_path):
     assert interval([0.3]) is None
-    write_run(tmp_path, "paper", 0.9)
-    write_run(tmp_path, "ga", 0.6)
+    write_variant(tmp_path, "paper", 0.9)
+    write_variant(tmp_path, "ga", 0.6)
     report(tmp_path)
-    found = row(tmp_path, "paper", "ga")
-    assert (found["low"], found["high"], found["seeds"], found["says"]) == ("", "", "1", "one seed")
+    (row,) = read(tmp_path / "claims.csv")
+    assert (row["low"], row["high"], row["seeds"], row["says"]) == ("", "", "1", "one seed")
 
 
 @pytest.mark.parametrize(
@@ -75,16 +60,15 @@ def test_one_seed_has_no_interval(tmp_path):
 def test_a_word_follows_from_the_differences_of_each_seed(task, paper, other, word, tmp_path):
     """Seeds differ by more than variants do: paired, they do not hide what a variant changes."""
     for seed, (a, b) in enumerate(zip(paper, other, strict=True)):
-        write_run(tmp_path, "paper", a, seed, task)
-        write_run(tmp_path, "euclidean", b, seed, task)
-    report(tmp_path)
-    found = row(tmp_path, "paper", "euclidean")
+        write_variant(tmp_path, "paper", a, seed, task)
+        write_variant(tmp_path, "euclidean", b, seed, task)
+    row = found(tmp_path)["paper", "euclidean"]
     sign = 1 if task == "spectrum" else -1
     gains = [sign * (a - b) for a, b in zip(paper, other, strict=True)]
-    assert float(found["gain"]) == pytest.approx(sum(gains) / 3)
-    assert [float(found["low"]), float(found["high"])] == pytest.approx(interval(gains))
-    assert (found["says"], found["seeds"]) == (word, "3")
-    assert found["published gain"] == ("0.014" if task == "spectrum" else "")
+    assert row["gain"] == pytest.approx(sum(gains) / 3)
+    assert (row["low"], row["high"]) == pytest.approx(interval(gains))
+    assert (row["says"], row["seeds"]) == (word, 3)
+    assert row["published gain"] == (0.014 if task == "spectrum" else None)
 
 
 # --- tables ---
@@ -94,11 +78,11 @@ def test_a_word_follows_from_the_differences_of_each_seed(task, paper, other, wo
 def sweep(tmp_path):
     """Two variants with three seeds and one that has lost a seed, one alone, one that failed."""
     for seed, (both, alone, few) in enumerate([(0.90, 0.60, 0.901), (0.91, 0.62, 0.899), (0.92, 0.61, None)]):
-        write_run(tmp_path, "paper", both, seed)
-        write_run(tmp_path, "ga", alone, seed)
-        write_run(tmp_path, "anchors_4", few, seed, said="gaigs: the disk is full")
-    write_run(tmp_path, "blocks_4", said="gaigs: the disk is full")
-    write_run(tmp_path, "no_such", 0.9)
+        write_variant(tmp_path, "paper", both, seed)
+        write_variant(tmp_path, "ga", alone, seed)
+        write_variant(tmp_path, "anchors_4", few, seed, log="gaigs: the disk is full")
+    write_variant(tmp_path, "blocks_4", log="gaigs: the disk is full")
+    write_variant(tmp_path, "no_such", 0.9)
     return tmp_path
 
 
@@ -128,33 +112,32 @@ def test_runs_of_several_settings_are_not_mixed_and_seeds_in_pieces_are(tmp_path
     for seed in range(3):
         for data, gap in (("room", 0.1), ("rfid", -0.1)):
             part = tmp_path / f"{data}{seed // 2}"  # the last seed came later, elsewhere
-            write_run(part, "paper", 0.8 + 0.01 * seed, seed, data=data)
-            write_run(part, "ga", 0.8 - gap, seed, data=data, threads=1 + seed)  # which changes no result
-    write_run(tmp_path / "run twice", "paper", 0.1, 0, data="room")  # the one first by name counts
-    report(tmp_path)
-    found = {row["setting"]: row for row in read(tmp_path)}
-    assert {setting: (row["says"], row["seeds"]) for setting, row in found.items()} == {
-        "data=rfid": ("contradicted", "3"),
-        "data=room": ("confirmed", "3"),
+            write_variant(part, "paper", 0.8 + 0.01 * seed, seed, data=data)
+            write_variant(part, "ga", 0.8 - gap, seed, data=data, threads=1 + seed)  # which changes no result
+    write_variant(tmp_path / "run twice", "paper", 0.1, 0, data="room")  # the one first by name counts
+    rows = compare(read_runs(tmp_path), read_claims())
+    assert {row["setting"]: (row["says"], row["seeds"]) for row in rows} == {
+        "data=rfid": ("contradicted", 3),
+        "data=room": ("confirmed", 3),
     }
 
 
 def test_claims_of_several_tasks_are_one_table(tmp_path):
     for seed in range(2):
-        for task in EXPERIMENTS.values():
-            write_run(tmp_path / task, "paper", 3.0 + 0.01 * seed, seed, task, data=task)
-            write_run(tmp_path / task, "ga", 4.0, seed, task, data=task)
+        for task in ("spectrum", "rssi"):
+            write_variant(tmp_path / task, "paper", 3.0 + 0.01 * seed, seed, task, data=task)
+            write_variant(tmp_path / task, "euclidean", 4.0, seed, task, data=task)
     (table,) = report(tmp_path).renderables
     assert table.row_count == 2
-    assert {row["score"]: row["says"] for row in read(tmp_path)} == {
+    assert {row["score"]: row["says"] for row in read(tmp_path / "claims.csv")} == {
         "MAE [dB]": "confirmed",
         "median SSIM": "contradicted",
     }
+    assert "- published gain +0.014: 0.91 of GAI-GS" in (tmp_path / "claims.md").read_text()
 
 
 def test_runs_without_variants_make_no_claims(tmp_path):
-    (tmp_path / "a/.hydra").mkdir(parents=True)
-    (tmp_path / "a/.hydra/overrides.yaml").write_text(yaml.safe_dump(["tokenizer=ga"]))
+    write_run(tmp_path / "a", ["tokenizer=ga"])
     report(tmp_path)
     assert not [*tmp_path.glob("claims*")]
 
@@ -178,25 +161,38 @@ def test_claims_are_of_variants_there_are():
         "claims: [{claim: a, better: b, than: c, source: d, published: {spectrum: {gain: much, source: e}}}]",
     ],
 )  # fmt: skip
-def test_a_broken_list_of_claims_is_named(broken, tmp_path):
+def test_a_broken_list_of_claims_is_refused(broken, tmp_path):
     file = tmp_path / "claims.yaml"
     file.write_text(broken)
     with pytest.raises(ValueError, match=r"claims\.yaml must have the form of conf/claims\.yaml: "):
         read_claims(file)
 
 
-@pytest.mark.parametrize(("experiment", "task"), EXPERIMENTS.items())
+PARTS = {"tokenizer", "deformation", "projection", "pooling"}
+
+
+@pytest.mark.parametrize(("experiment", "task"), [("claims", "spectrum"), ("claims_rssi", "rssi")])
 def test_variants_differ_from_the_paper_in_one_thing(experiment, task):
+    """By their files; the last one is composed, too."""
+    params = yaml.safe_load((conf_dir() / "experiment" / f"{experiment}.yaml").read_text())["hydra"]["sweeper"][
+        "params"
+    ]
+    first, *names = "".join(params["+variant"].split()).split(",")
+    assert first == "paper"
+    for name in names:
+        content = yaml.safe_load((conf_dir() / "variant" / f"{name}.yaml").read_text())
+        base, *others = content.pop("defaults")
+        overridden = [
+            key.removeprefix("override /") for entry in (base, *others) if isinstance(entry, dict) for key in entry
+        ]
+        assert (base == "paper") != (name == "static"), "static Gaussians have no heads"
+        assert len([*content, *overridden]) == 1, name
+        assert {*content, *overridden} <= PARTS
+        if "heads" in content.get("deformation", {}):
+            assert len(content["deformation"]["heads"]) == 4
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        params = compose("config", [f"+experiment={experiment}"], return_hydra_config=True).hydra.sweeper.params
-        names = "".join(params["+variant"].split()).split(",")
-        composed = {name: compose("config", [f"+variant={name}", f"+experiment={experiment}"]) for name in names}
-    assert params["seed"] == "0,1,2"
-    assert names[0] == "paper"
-    paper = composed.pop("paper")
+        paper, config = (compose("config", [f"+variant={name}", f"+experiment={experiment}"]) for name in (first, name))
     assert paper.task.name == task
     assert len(paper.deformation.heads) == 5
-    parts = {"tokenizer", "deformation", "projection", "pooling"}
-    for name, config in composed.items():
-        assert {key for key in paper if config[key] != paper[key]} - {"model"} <= parts
-        assert sum(config[part] != paper[part] for part in parts) == 1, name
+    assert len([key for key in paper if config[key] != paper[key] and key in PARTS]) == 1
+    assert {key for key in paper if config[key] != paper[key]} - {"model"} <= PARTS

@@ -1,5 +1,7 @@
 """The room and its Gaussians, read back from their artists."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,9 +9,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from scipy.integrate import quad
 
-from gaigs.geometry import semi_axes
-from gaigs.report.room import DRAWN, Cloud, paths, room
-from gaigs.report.shapes import LearntRoom, Matter, Path, Plane
+from gaigs.gaussians import SH_DC
+from gaigs.geometry import Pose, semi_axes
+from gaigs.placement.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
+from gaigs.report.room import DRAWN, paths, room
 
 
 @pytest.fixture
@@ -17,14 +20,35 @@ def rng():
     return np.random.default_rng(5)
 
 
+def links(train, test=None, receivers=None, rotation=None, edges=None):
+    """Links as far as a figure of the room reads them; receivers with a rotation are arrays."""
+    train, receivers = np.atleast_2d(train), np.atleast_2d(train if receivers is None else receivers)
+    places = np.concatenate((train, train if test is None else np.atleast_2d(test)))
+    parts = SimpleNamespace(train=torch.arange(len(train)), test=torch.arange(len(train), len(places)))
+    turn, elements = (torch.eye(3), "1") if rotation is None else (torch.as_tensor(rotation), "12")
+    return SimpleNamespace(
+        query=SimpleNamespace(transmitters=torch.as_tensor(places)),
+        split=parts,
+        receivers=[SimpleNamespace(pose=Pose(torch.as_tensor(place), turn), array=elements) for place in receivers],
+        edges=torch.zeros(0, 2, 3) if edges is None else torch.as_tensor(edges),
+        task=SimpleNamespace(directions=None),
+    )
+
+
+def gaussians(means, covariances, strengths):
+    signal = torch.as_tensor(strengths)[:, None, None] / SH_DC
+    opacities = torch.ones(len(signal))
+    return SimpleNamespace(
+        means=torch.as_tensor(means), covariances=torch.as_tensor(covariances), signal=signal, opacities=opacities
+    )
+
+
 def test_gaussians_are_ellipses_of_one_standard_deviation():
     generator = torch.Generator().manual_seed(2)
     axes = semi_axes(torch.randn(20, 4, generator=generator), 0.1 + torch.rand(20, 3, generator=generator)).double()
     sigma = axes @ axes.mT
     means, strengths = torch.randn(20, 3, generator=generator), torch.rand(20, generator=generator)
-    cloud = Cloud(means.numpy(), sigma.numpy(), strengths.numpy())
-    point = np.zeros((1, 3))
-    figure = room(point, point, point, np.eye(3)[None], np.zeros((0, 2, 3)), cloud)
+    figure = room(links(np.zeros(3), rotation=np.eye(3)), gaussians(means, sigma, strengths))
     figure.draw_without_rendering()
     order = strengths.argsort()
     for ax, view in zip(figure.axes, ([0, 1], [0, 2]), strict=False):
@@ -42,12 +66,11 @@ def test_gaussians_are_ellipses_of_one_standard_deviation():
 def test_room_shows_the_strongest_gaussians_and_keeps_everyone_in_sight(rng):
     count = DRAWN + 50
     strengths = rng.permutation(count).astype(float)
-    cloud = Cloud(rng.normal(0, 1, (count, 3)), np.tile(0.01 * np.eye(3), (count, 1, 1)), strengths)
-    train, test, receiver = np.array([[4.0, 0, 0]]), np.array([[0, -5.0, 0]]), np.array([[0, 0, 6.0]])
-    edges = np.array([[[-7.0, 0, 0], [-7.0, 1, 0]]])
-    plan, side, bar = room(train, test, receiver, np.eye(3)[None], edges, cloud).axes
+    many = gaussians(rng.normal(0, 1, (count, 3)), np.tile(0.01 * np.eye(3), (count, 1, 1)), strengths)
+    edges = [[[-7.0, 0, 0], [-7.0, 1, 0]]]
+    plan, side, bar = room(links([4.0, 0, 0], [0, -5.0, 0], [0, 0, 6.0], np.eye(3), edges), many).axes
     ellipses = next(artist for artist in plan.collections if isinstance(artist, EllipseCollection))
-    assert ellipses.get_array().min() == 50
+    assert ellipses.get_array().min() == pytest.approx(50)
     assert bar.get_ylabel() == f"|signal| × opacity, {DRAWN} strongest of {count} Gaussians"
     assert plan.get_xlim()[0] < -7 < 4 < plan.get_xlim()[1]
     assert plan.get_ylim()[0] < -5
@@ -57,21 +80,20 @@ def test_room_shows_the_strongest_gaussians_and_keeps_everyone_in_sight(rng):
 
 
 def test_room_draws_the_axes_of_arrays_as_seen_from_above_and_aside():
-    point, rotation = np.array([[1.0, 2, 3]]), np.array([[[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]])
-    plan, side = room(point + 4, point, point, rotation, np.zeros((0, 2, 3))).axes
+    point, rotation = np.array([1.0, 2, 3]), np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
+    plan, side = room(links(point + 4, point, point, rotation)).axes
     arrows = {text.get_text(): np.subtract(text.get_position(), text.xy) for text in plan.texts}
     assert set(arrows) == {"x", "z"}  # y points at the reader
     assert arrows["x"][0] == 0 > arrows["x"][1]
     assert arrows["z"][0] < 0 == arrows["z"][1]
     assert {text.get_text() for text in side.texts} == {"y", "z"}
-    assert not room(point + 4, point, point, rotation[:0], np.zeros((0, 2, 3))).axes[0].texts
+    assert not room(links(point + 4, point, point)).axes[0].texts
 
 
 # --- what was learnt ---
 
 BOX = np.array([6.0, 4.0, 3.0])
-POINT = np.array([[1.0, 1, 1]])
-NO_EDGES = np.zeros((0, 2, 3))
+POINT = np.array([1.0, 1, 1])
 
 
 def face(number, axis, side, share):
@@ -80,7 +102,7 @@ def face(number, axis, side, share):
     corners = np.zeros((4, 3))
     corners[:, axis] = side * BOX[axis]
     corners[:, others] = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * BOX[others]
-    return Plane(number, corners, (2 * side - 1) * np.eye(3)[axis], share)
+    return LearntPlane(number, corners, (2 * side - 1) * np.eye(3)[axis], share)
 
 
 @pytest.fixture
@@ -98,7 +120,7 @@ def labels(ax):
 
 
 def test_planes_are_drawn_edge_on_and_as_wide_as_they_are_strong(walls):
-    plan, side = room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom(walls, None, [])).axes
+    plan, side = room(links(POINT), learnt=LearntRoom(walls, None, [])).axes
     assert labels(plan) == {"0: 40 %", "1: 10 %", "3: 5 %", "4: 2 %"}
     assert labels(side) == {"0: 40 %", "2: 8 %", "3: 5 %"}  # y points at the reader; the floor carries nothing
     for ax, up in ((plan, 1), (side, 2)):
@@ -114,9 +136,9 @@ def test_planes_are_drawn_edge_on_and_as_wide_as_they_are_strong(walls):
 
 def test_an_oblique_plane_is_seen_in_both_views():
     corners = np.array([(0.0, 4, 0), (6, 4, 0), (6, 1, 3), (0, 1, 3)])
-    plane = Plane(7, corners, np.array([0, 1, 1]) / np.sqrt(2), 0.3)
+    plane = LearntPlane(7, corners, np.array([0, 1, 1]) / np.sqrt(2), 0.3)
     for ax, view in zip(
-        room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom([plane], None, [])).axes,
+        room(links(POINT), learnt=LearntRoom([plane], None, [])).axes,
         ([0, 1], [0, 2]),
         strict=True,
     ):
@@ -127,7 +149,7 @@ def test_an_oblique_plane_is_seen_in_both_views():
 def test_labels_of_planes_keep_clear_of_each_other(walls):
     close = [plane._replace(number=plane.number + 6, corners=1.01 * plane.corners) for plane in walls]
     doubled = [*walls, *close]
-    figure = room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom(doubled, None, []))
+    figure = room(links(POINT), learnt=LearntRoom(doubled, None, []))
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     for ax in figure.axes:
@@ -139,7 +161,7 @@ def test_labels_of_planes_keep_clear_of_each_other(walls):
 
 def test_obstacles_are_shown_by_what_they_take_along_the_line_of_sight(walls, rng):
     matter = Matter(rng.uniform(1, 3, (3, 3)), rng.uniform(0.2, 0.6, (3, 3)), np.array([5.0, 10.0, 20.0]))
-    figure = room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom(walls, matter, []))
+    figure = room(links(POINT), learnt=LearntRoom(walls, matter, []))
     plan, side, bar = figure.axes
     assert bar.get_ylabel() == "loss by obstacles along the line of sight [dB]"
 
@@ -162,19 +184,19 @@ def test_obstacles_are_shown_by_what_they_take_along_the_line_of_sight(walls, rn
 
 def test_obstacles_that_take_next_to_nothing_stay_pale(walls):
     matter = Matter(np.full((1, 3), 2.0), np.full((1, 3), 0.5), np.array([0.01]))
-    plan, *_ = room(POINT, POINT, POINT, np.zeros((0, 3, 3)), NO_EDGES, learnt=LearntRoom(walls, matter, [])).axes
+    plan, *_ = room(links(POINT), learnt=LearntRoom(walls, matter, [])).axes
     assert plan.images[0].get_clim() == (0, 1)
 
 
 def test_paths_are_drawn_from_end_to_end_the_strongest_on_top(walls):
     ends = np.array([1.0, 1, 1]), np.array([5.0, 3, 2])
     routes = [
-        Path(np.stack(ends), 0.0),
-        Path(np.stack((ends[0], [6.0, 2.5, 1.75], ends[1])), -9.0),
-        Path(np.stack((ends[0], [2.0, 4, 1.5], [6.0, 3.5, 1.9], ends[1])), -24.0),
+        LearntPath(np.stack(ends), 0.0),
+        LearntPath(np.stack((ends[0], [6.0, 2.5, 1.75], ends[1])), -9.0),
+        LearntPath(np.stack((ends[0], [2.0, 4, 1.5], [6.0, 3.5, 1.9], ends[1])), -24.0),
     ]
-    edges = np.array([[[-7.0, 0, 0], [-7.0, 1, 0]]])
-    plan, side, bar = paths(LearntRoom(walls, None, routes), ends[1][None], edges).axes
+    edges = [[[-7.0, 0, 0], [-7.0, 1, 0]]]
+    plan, side, bar = paths(links(POINT, receivers=ends[1], edges=edges), LearntRoom(walls, None, routes)).axes
     assert plan.get_title() == "The 3 strongest paths of a transmitter at (1.00, 1.00, 1.00) m"
     assert bar.get_ylabel() == "power over that of the strongest path [dB]"
     assert plan.get_xlim()[0] < -7
@@ -192,8 +214,8 @@ def test_paths_are_drawn_from_end_to_end_the_strongest_on_top(walls):
 
 
 def test_a_single_path_has_a_scale_of_its_own():
-    route = Path(np.array([[1.0, 1, 1], [2, 2, 2]]), 0.0)
-    figure = paths(LearntRoom([], None, [route]), POINT, NO_EDGES)
+    route = LearntPath(np.array([[1.0, 1, 1], [2, 2, 2]]), 0.0)
+    figure = paths(links(POINT), LearntRoom([], None, [route]))
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["receivers", "transmitter"]
     plan, *_ = figure.axes
     folded = [artist for artist in plan.collections if isinstance(artist, LineCollection)][-1]

@@ -1,29 +1,29 @@
-"""All figures of a run, as its task asks for them."""
+"""All figures of a run: files, and what they are drawn from."""
 
 import csv
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from matplotlib import image
-from matplotlib.figure import Figure
 
-from gaigs import evaluation
+from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Split
-from gaigs.directions import Grid
-from gaigs.evaluation import write_figures
 from gaigs.gaussians import Gaussians
-from gaigs.geometry import Pose
+from gaigs.geometry import Grid, Pose
+from gaigs.placement.learnt_room import LearntPath, LearntRoom
 from gaigs.query import Query
 from gaigs.radio_maps import RadioMap
-from gaigs.report import channels, curves, radio_map, room, shapes, spectra, style
-from gaigs.scene import Array, Receiver
+from gaigs.report import csi, figures, run_figures, scalar, spectrum
+from gaigs.report.run_figures import figures_of, write_figures
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
 
 GRID = Grid.degrees(range(10, 91, 10), range(0, 360, 15))
+LOOK_UP = SimpleNamespace()
+"""A model that says nothing of itself."""
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def rng():
 
 @pytest.fixture
 def spy(monkeypatch):
-    """Notes the arguments and the figure of a function that tasks import when they draw."""
+    """Notes the arguments and the figure of a drawing function."""
 
     def watch(module, name):
         shown, original = [], getattr(module, name)
@@ -48,6 +48,15 @@ def spy(monkeypatch):
     return watch
 
 
+def written(folder, links, model=LOOK_UP):
+    """Names of the figures; each has something drawn on white."""
+    files = write_figures(folder, links, model)
+    for file in files:
+        assert file.parent == folder / "figures"
+        assert image.imread(file)[..., :3].std() > 0.02
+    return {file.stem for file in files}
+
+
 @pytest.fixture
 def spectrum_links():
     generator = torch.Generator().manual_seed(1)
@@ -60,37 +69,31 @@ def spectrum_links():
 
 
 def write_losses(path, steps=30):
+    path.parent.mkdir(parents=True)
     with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, ["epoch", "step", "train/loss", "validation/ssim"])
         writer.writeheader()
         writer.writerows({"epoch": 0, "step": k, "train/loss": 1 / (k + 1), "validation/ssim": k} for k in range(steps))
 
 
-def test_a_run_is_drawn_into_its_folder(spectrum_links, tmp_path, rng):
+def test_a_run_is_drawn_into_its_folder(pixels, spectrum_links, tmp_path, rng):
     test = spectrum_links.split.test
     labels = spectrum_links.labels[test].numpy().astype(np.float16)
     ssim = {f"ssim_{model}": rng.random(4) for model in ("gaigs", "mean", "knn")}
     np.savez(tmp_path / "predictions.npz", labels=labels, prediction=labels[::-1], link=test, **ssim)
-    (tmp_path / "log" / "version_0").mkdir(parents=True)
     write_losses(tmp_path / "log" / "version_0" / "metrics.csv")
     torch.manual_seed(0)
     start = {"count": 30, "near": 0.5, "far": 3, "spread": 1, "opacity": 0.5, "signal": 0.1}
-    gaussians = Gaussians(spectrum_links.scene, zone=(0.1, 1.5), channels=2, **start)
-    files = write_figures(tmp_path, spectrum_links, gaussians)
-    assert {file.stem for file in files} == {"room", "loss", "spectra", "spectra_polar", "ssim_cdf"}
-    for file in files:
-        pixels = image.imread(file)
-        assert file.parent == tmp_path / "figures"
-        assert pixels[..., :3].std() > 0.02  # something is drawn on the white
-        assert pixels.shape[1] >= 600  # a column at 200 dpi
+    model = SimpleNamespace(primitives=Gaussians(spectrum_links.scene, zone=(0.1, 1.5), channels=2, **start))
+    assert written(tmp_path, spectrum_links, model) == {"room", "loss", "spectra", "spectra_polar", "ssim_cdf"}
 
 
 def test_examples_are_at_their_percentiles_of_the_own_model(spectrum_links, tmp_path, rng, spy):
     labels = rng.random((41, 9, 24)).astype(np.float16)
     own = rng.permutation(np.linspace(0, 0.8, 41))
     np.savez(tmp_path / "predictions.npz", labels=labels, prediction=1 - labels, ssim_gaigs=own, ssim_knn=own[::-1])
-    shown = spy(spectra, "spectra")
-    spectrum_links.task.figures(tmp_path, spectrum_links)
+    shown = spy(spectrum, "spectra")
+    figures_of(Spectrum).of_run(spectrum_links.task, tmp_path, spectrum_links)
     drawn_labels, drawn_predictions, ssim, names = shown[0][0][:4]
     assert dict(zip(names, ssim, strict=True)) == pytest.approx(
         {"10th percentile": 0.08, "median": 0.4, "90th percentile": 0.72}
@@ -99,27 +102,18 @@ def test_examples_are_at_their_percentiles_of_the_own_model(spectrum_links, tmp_
     np.testing.assert_array_equal(drawn_predictions, 1 - drawn_labels)
 
 
-def test_what_was_learnt_of_the_room_is_drawn(spectrum_links, tmp_path, spy, monkeypatch):
+def test_what_was_learnt_of_the_room_is_drawn(spectrum_links, tmp_path, spy):
     labels = spectrum_links.labels[spectrum_links.split.test].numpy().astype(np.float16)
     np.savez(tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_mirrored=np.ones(1))
-    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: Path(path).touch())
-    seen, folded = spy(room, "room"), spy(room, "paths")
-    route = shapes.Path(np.array([[1.0, 1, 1], [3, 0, 1]]), 0.0)
-    learnt = shapes.LearntRoom([], None, [route])
-    names = {file.stem for file in write_figures(tmp_path, spectrum_links, None, learnt)}
+    seen, folded = spy(run_figures, "room"), spy(run_figures, "paths")
+    learnt = LearntRoom([], None, [LearntPath(np.array([[1.0, 1, 1], [3, 0, 1]]), 0.0)])
+    model = SimpleNamespace(primitives=None, learnt_room=lambda links: learnt)
+    names = {file.stem for file in write_figures(tmp_path, spectrum_links, model)}
     assert names == {"room", "paths", "spectra", "spectra_polar", "ssim_cdf"}
-    assert seen[0][0][-1] is learnt
-    assert folded[0][0][0] is learnt
-    np.testing.assert_array_equal(folded[0][0][1], [[3, 0, 1]])
-    names = {file.stem for file in write_figures(tmp_path, spectrum_links, None, learnt._replace(paths=[]))}
-    assert "paths" not in names  # of a transmitter that nobody hears
-
-
-def test_a_baseline_has_neither_losses_nor_gaussians(spectrum_links, tmp_path):
-    labels = spectrum_links.labels[spectrum_links.split.test].numpy().astype(np.float16)
-    np.savez(tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_knn=np.ones(1))
-    names = {file.stem for file in write_figures(tmp_path, spectrum_links, None)}
-    assert names == {"room", "spectra", "spectra_polar", "ssim_cdf"}
+    assert seen[0][0] == (spectrum_links, None, learnt)
+    assert folded[0][0] == (spectrum_links, learnt)
+    model.learnt_room = lambda links: learnt._replace(paths=[])  # of a transmitter that nobody hears
+    assert "paths" not in {file.stem for file in write_figures(tmp_path, spectrum_links, model)}
 
 
 @pytest.fixture
@@ -150,22 +144,11 @@ def rssi_run(tmp_path):
     return links, tmp_path, errors
 
 
-def test_an_rssi_run_is_drawn_into_its_folder(rssi_run, monkeypatch):
-    links, folder, _ = rssi_run
-    monkeypatch.setattr(style, "DPI", 50)  # small ones are written sooner
-    files = write_figures(folder, links, None)
-    paged = ("predicted_against_measured", "radio_map")
-    assert {file.stem for file in files} == {"room", "error_cdf", *paged, *(f"{name}_2" for name in paged)}
-    for file in files:
-        assert file.parent == folder / "figures"
-        assert image.imread(file)[..., :3].std() > 0.02  # something is drawn on the white
-
-
-def test_figures_show_the_run(rssi_run, spy, monkeypatch):
+def test_an_rssi_run_is_drawn_into_its_folder(pixels, rssi_run, spy):
     links, folder, errors = rssi_run
-    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: Path(path).touch())
-    distributed, mapped, seen = spy(curves, "cdf"), spy(radio_map, "radio_maps"), spy(room, "room")
-    evaluation.write_figures(folder, links, None)
+    distributed, mapped, seen = spy(scalar, "cdf"), spy(scalar, "radio_maps"), spy(run_figures, "room")
+    paged = ("predicted_against_measured", "radio_map")
+    assert written(folder, links) == {"room", "error_cdf", *paged, *(f"{name}_2" for name in paged)}
     (absolute, *_), drawn = distributed[0]
     assert list(absolute) == ["gaigs", "mean", "knn"]
     np.testing.assert_allclose(absolute["mean"], np.abs(errors["mean"]))
@@ -173,7 +156,7 @@ def test_figures_show_the_run(rssi_run, spy, monkeypatch):
     assert ax.get_xlim() == (0, pytest.approx(np.quantile(np.abs(errors["mean"]), 0.99)))
     assert ax.get_xlabel() == "|error| [dB], split random"
     assert ax.get_ylabel() == "share of test readings"
-    _, gateways, readings, _ = mapped[0][0]
+    _, gateways, readings, *_ = mapped[0][0]
     assert gateways["g3"].tolist() == [3, 0, 2]
     third = links.split.test[links.split.test % 8 == 3]
     np.testing.assert_allclose(readings["g3"][:, :2], links.query.transmitters[third, :2])
@@ -181,17 +164,13 @@ def test_figures_show_the_run(rssi_run, spy, monkeypatch):
     plan = seen[0][1].axes[0]
     assert not plan.texts  # gateways have no axes to show
     assert len(plan.lines[2].get_xdata()) == 8
-
-
-def test_a_missing_map_is_told(rssi_run):
-    links, folder, _ = rssi_run
     (folder / "radio_map.npz").unlink()
     with pytest.raises(FileNotFoundError, match=r"radio_map\.npz"):
-        write_figures(folder, links, None)
+        write_figures(folder, links, LOOK_UP)
 
 
-@pytest.mark.parametrize("subcarriers", [1, 2, 16])
-def test_a_run_of_channels_is_drawn(tmp_path, rng, spy, monkeypatch, subcarriers):
+@pytest.mark.parametrize("subcarriers", [1, 16])
+def test_a_run_of_channels_is_drawn(pixels, tmp_path, rng, spy, subcarriers):
     frequencies = 2.4e9 + 1e6 * torch.arange(subcarriers, dtype=torch.float64)
     task = Csi(4, frequencies)
     pose, array = Pose.from_xyzw([3.0, 0, 1], [0.0, 0, 0, 1]), Array.planar(2, 2, 0.06)
@@ -205,12 +184,9 @@ def test_a_run_of_channels_is_drawn(tmp_path, rng, spy, monkeypatch, subcarriers
     for name, error in (("gaigs", 2.0), ("gaigs_trend", 1.0), ("knn", 3.0), ("mean", 4.0)):
         stored |= {f"error_power_{name}": np.full(21, error), f"label_power_{name}": np.full(21, 20.0)}
     np.savez(tmp_path / "predictions.npz", labels=test, prediction=1j * test, **stored)
-    errors = spy(channels, "error_against_power")
-    shown = spy(channels, "magnitudes_and_phases")
-    monkeypatch.setattr(style, "DPI", 50)
-    files = write_figures(tmp_path, links, None)
+    errors, shown = spy(csi, "error_against_power"), spy(csi, "magnitudes_and_phases")
     responses = {"impulse_response"} if subcarriers > 1 else set()
-    assert {file.stem for file in files} == {"room", "channels", "snr_cdf", "error_power"} | responses
+    assert written(tmp_path, links) == {"room", "channels", "snr_cdf", "error_power"} | responses
     (ax,) = errors[0][1].axes
     assert [text.get_text() for text in ax.get_legend().get_texts()] == [
         "SNR 0 dB", "gaigs, NMSE -10.0 dB", "knn, NMSE -8.2 dB"
@@ -222,3 +198,24 @@ def test_a_run_of_channels_is_drawn(tmp_path, rng, spy, monkeypatch, subcarriers
     np.testing.assert_array_equal(drawn_labels[2], test[np.argsort(own)[18]])
     np.testing.assert_array_equal(drawn_predictions, 1j * drawn_labels)
     np.testing.assert_array_equal(drawn_frequencies, frequencies)
+
+
+class Level(Rssi):
+    """A plug-in's task of its own."""
+
+
+class Direction(Spectrum.__base__):
+    """A task without figures."""
+
+
+def test_figures_are_registered_for_a_task_and_its_subclasses(monkeypatch):
+    assert type(figures_of(Level)) is scalar.ScalarFigures
+    assert figures_of(Direction).of_run(None, None, None) == figures_of(Direction).of_systems(None, {}, "") == {}
+    monkeypatch.setattr(figures, "registered", {})
+
+    @figures.register(Level)
+    class LevelFigures(figures.TaskFigures):
+        pass
+
+    assert type(figures_of(type("Louder", (Level,), {}))) is LevelFigures
+    assert type(figures_of(Rssi)) is scalar.ScalarFigures

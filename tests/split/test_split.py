@@ -10,13 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
+from gaigs.antenna import Receiver
 from gaigs.configuration import conf_dir
 from gaigs.data import Links
 from gaigs.geometry import Pose
 from gaigs.query import Query
 from gaigs.registry import registry
-from gaigs.scene import Receiver
-from gaigs.split import folds
 from gaigs.task.rssi import Rssi
 from gaigs.testing import check_split
 
@@ -61,37 +60,11 @@ def test_a_split_keeps_the_contract(links, options):
 
 
 @each_split
-@pytest.mark.parametrize("validation", [0, 0.2])
-def test_parts_are_disjoint_and_ascending(links, options, validation):
-    result = part(links, validation=validation, **options)
-    parts = [result.train, result.validation, result.test]
-    numbers = torch.cat(parts).tolist()
-    assert len(numbers) == len(set(numbers))
-    assert all(p.tolist() == sorted(p.tolist()) and p.dtype == torch.int64 for p in parts)
-    assert len(result.train)
-    assert len(result.test)
-    kept = {"official": 300, "sparse": 160}.get(options["name"], N)
-    assert len(numbers) == kept
-    training = len(result.train) + len(result.validation)
-    assert len(result.validation) == pytest.approx(validation * training, abs=10)
-    assert bool(len(result.validation)) == bool(validation)
-
-
-@each_split
 def test_validation_takes_training_links_only(links, options):
     with_validation, without = (part(links, validation=v, **options) for v in (0.2, 0))
     assert torch.equal(with_validation.test, without.test)
     training = torch.cat((with_validation.train, with_validation.validation)).sort().values
     assert torch.equal(training, without.train)
-
-
-@each_split
-def test_a_split_repeats_with_its_seed_alone(links, options):
-    first, again, other = (part(links, seed=seed, **options) for seed in (3, 3, 4))
-    assert torch.equal(first.train, again.train)
-    assert torch.equal(first.test, again.test)
-    assert not torch.equal(first.train, other.train)
-    assert first.name == again.name != other.name
 
 
 def test_official_parts_are_those_given(links):
@@ -142,12 +115,6 @@ def test_cubes_stay_whole(seed, edge, far):
     parts = [{tuple(cubes[i]) for i in p.tolist()} for p in (result.train, result.validation, result.test)]
     assert all(parts)
     assert sum(map(len, parts)) == len(set.union(*parts))
-
-
-def test_cubes_hold_out_about_the_fraction(links):
-    result = part(links, name="blocks", edge=0.5, test=0.2, validation=0)
-    largest = torch.unique((links.query.transmitters / 0.5).floor(), dim=0, return_counts=True)[1].max()
-    assert len(result.test) == pytest.approx(0.2 * N, abs=2 * int(largest))
 
 
 @pytest.mark.parametrize(
@@ -232,21 +199,6 @@ def heard():
     return links_at(3 * torch.rand(120, 3, generator=generator)[rows], rows, official)
 
 
-@each_split
-@pytest.mark.parametrize("seed", range(3))
-def test_links_of_a_row_are_never_parted(heard, options, seed):
-    rows = heard.rows
-    result = part(heard, seed=seed, validation=0.2, **options)
-    parts = [set(rows[part].tolist()) for part in result.parts().values()]
-    assert all(parts)
-    assert sum(map(len, parts)) == len(set.union(*parts))
-    training = len(result.train) + len(result.validation)
-    if options["name"] != "blocks":
-        assert len(result.validation) == pytest.approx(0.2 * training, abs=40)
-    if options["name"] != "sparse":
-        assert training + len(result.test) == len(rows)
-
-
 def test_sparse_counts_rows(heard):
     rows = heard.rows
     few, more = (part(heard, name="sparse", train=count, validation=0) for count in (5, 40))
@@ -276,12 +228,6 @@ def test_official_validation_in_runs_of_rows(heard):
     assert torch.equal(result.test, official[1])
 
 
-@pytest.mark.parametrize("options", SPLITS[1:], ids=lambda options: options["name"])
-def test_each_link_is_a_row_of_its_own_unless_given(links, options):
-    plain, numbered = (part(each, **options) for each in (links, replace(links, rows=torch.arange(N))))
-    assert all(torch.equal(a, b) for a, b in zip(plain.parts().values(), numbered.parts().values(), strict=True))
-
-
 # --- configuration ---
 
 
@@ -295,32 +241,3 @@ def test_a_configuration_has_every_option_with_its_default(file):
     assert mandatory == {name for name, p in parameters.items() if p.default is p.empty} - {"links"}
     defaults = {name: parameters[name].default for name in options}
     assert options == defaults | ({"length": 100} if file.stem == "official_runs" else {})
-
-
-# --- folds ---
-
-
-@pytest.mark.parametrize("count", [2, 5])
-def test_folds_part_the_training_links_by_whole_rows(links, count):
-    rows = torch.arange(N) // 3
-    links = replace(links, rows=rows)
-    links = replace(links, split=part(links, name="random", validation=0.2))
-    parts = folds(links, count, seed=0)
-    split = links.split
-    assert [one.name for one in parts] == [f"{split.name}, fold {i + 1} of {count}" for i in range(count)]
-    assert torch.equal(torch.cat([one.test for one in parts]).sort().values, split.train)
-    for one in parts:
-        assert torch.equal(torch.cat((one.train, one.test)).sort().values, split.train)
-        assert torch.equal(one.validation, split.validation)
-        assert not np.intersect1d(rows[one.train], rows[one.test]).size
-        assert len(rows[one.test].unique()) == pytest.approx(len(rows[split.train].unique()) / count, abs=1)
-    again, others = folds(links, count, seed=0), folds(links, count, seed=1)
-    assert all(torch.equal(a.test, b.test) for a, b in zip(parts, again, strict=True))
-    assert not all(torch.equal(a.test, b.test) for a, b in zip(parts, others, strict=True))
-
-
-def test_more_folds_than_rows_are_refused(links):
-    links = replace(links, rows=torch.arange(N) // 100)
-    links = replace(links, split=part(links, name="random", test=0.25, validation=0.0))
-    with pytest.raises(ValueError, match="kriging_folds must be at most 3, the rows of training links, got 4"):
-        folds(links, 4, seed=0)

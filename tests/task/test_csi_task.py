@@ -174,6 +174,7 @@ def test_nothing_to_summarise_is_refused():
         (1, [1e9, -1e9], "positive, finite frequencies"),
         (1, [float("nan")], "positive, finite frequencies"),
         (1, [float("inf")], "positive, finite frequencies"),
+        (1, [1e9, 1e9], "different frequencies"),
     ],
 )
 def test_impossible_options_are_refused(elements, frequencies, message):

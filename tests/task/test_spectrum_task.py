@@ -5,7 +5,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from gaigs.directions import Grid, Rays
+from gaigs.geometry import Grid, Rays
 from gaigs.query import Batch, Query
 from gaigs.task.spectrum import Spectrum
 

@@ -5,12 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gaigs.antenna import Receiver
 from gaigs.data import Split
-from gaigs.directions import Rays
-from gaigs.geometry import Pose
+from gaigs.geometry import Pose, Rays
 from gaigs.query import Query
 from gaigs.registry import registry
-from gaigs.scene import Receiver
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
@@ -165,12 +164,12 @@ def forgetful(seed):
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (taking(lambda g: torch.randperm(24, generator=g)[:6].sort().values), "links of one row must come into one"),
+        (taking(lambda g: torch.randperm(24, generator=g)[:6].sort().values), "links of one row must be in one"),
         (taking(lambda g: whole_rows(g).flip(0)), "test must ascend"),
         (taking(lambda g: torch.arange(4)), "another seed must give another split"),
         (overlapping, "no link may stand twice in train, validation, test"),
-        (unnamed, "a split's name must tell seeds apart"),
-        (forgetful, "the same seed must give the same split, whatever was drawn before"),
+        (unnamed, "a split's name must differ between seeds"),
+        (forgetful, "the same seed must give the same split in any random state"),
     ],
 )
 def test_a_broken_split_is_found(build, message):
@@ -259,16 +258,16 @@ SPECTRUM = GRID.elevations, GRID.azimuths, "none"
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        (Biased(), "what is right must score best"),
-        (Upside(), "what is right must score best"),
+        (Biased(), "true values must score best"),
+        (Upside(), "true values must score best"),
         (Pooled(), "the score mae_db must not depend on the other samples"),
         (Trusting(), "values of different number must be a ValueError"),
         (Blind(2, torch.tensor([1e9, 2e9])), "values that are NaN must be a ValueError"),
         (Cheerful(), "a summary of no samples must be a ValueError"),
         (Renamed(), "summarise must give mae_db, median_ae_db, rmse_db, got mae_db_db"),
-        (Amnesic(*SPECTRUM), "the task must come back from its state as it was"),
+        (Amnesic(*SPECTRUM), "the task's state must restore it"),
         (Parted(*SPECTRUM), "labels and directions must be thinned together"),
-        (Careless(*SPECTRUM), "the generator alone must decide what is looked at"),
+        (Careless(*SPECTRUM), "only the generator may decide the thinning"),
     ],
 )
 def test_a_broken_task_is_found(task, message, monkeypatch):

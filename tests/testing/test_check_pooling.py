@@ -4,35 +4,36 @@ import pytest
 import torch
 
 from gaigs.pooling import Pooling, sphere
-from gaigs.pooling.spectrum import Spectrum
+from gaigs.pooling.path_rssi import PathRssi
+from gaigs.pooling.spectrum import SpectrumPooling
 from gaigs.testing import check_pooling, example_links
 
 LINKS = {task: example_links(task) for task in ("spectrum", "rssi", "csi")}
 
 
-class Root(Spectrum):
+class Root(SpectrumPooling):
     def forward(self, image, query):
         return image.square().sum(1).sqrt()
 
 
-class Relative(Spectrum):
+class Relative(SpectrumPooling):
     def forward(self, image, query):
         return super().forward(image, query) / image.abs().max()
 
 
-class Flattened(Spectrum):
+class Flattened(SpectrumPooling):
     def forward(self, image, query):
         return super().forward(image, query).flatten(1)
 
 
-class Windowed(Spectrum):
+class Windowed(SpectrumPooling):
     """Weighs the pixels of a grid by their row, and so those of a list alike."""
 
     def forward(self, image, query):
         return super().forward(image, query) * torch.linspace(1, 2, image.shape[2]).to(image)[:, None]
 
 
-class Upended(Spectrum):
+class Upended(SpectrumPooling):
     zone = (1.0, -1.0)
 
 
@@ -93,11 +94,11 @@ class Forgetful(Floored):
         (lambda scene: Windowed(2), "spectrum", "a list of rays must have the values of their pixels"),
         (lambda scene: Upended(2), "spectrum", "zone must be two elevations"),
         (
-            lambda scene: Spectrum(2),
+            lambda scene: SpectrumPooling(2),
             "rssi",
             "labels of task 'rssi' have no directions, so the pooling must have a grid",
         ),
-        (lambda scene: Power(), "rssi", "the gradient of a silent map must be finite"),
+        (lambda scene: Power(), "rssi", "the value of silence must be finite"),
         (lambda scene: Clamped(), "rssi", "the gradient of a silent map must be finite"),
         (lambda scene: Narrow(), "rssi", "the value of 12 decades in float16 must be finite"),
         (
@@ -114,38 +115,27 @@ def test_a_broken_pooling_is_found(build, task, message):
         check_pooling(build, LINKS[task])
 
 
-class Hearing(Floored):
-    """What an element hears is the power, lag 0."""
-
-    takes = "lags"
-
-    def hear(self, heard, query, directions=None):
-        return 10 * (heard[:, heard.shape[1] // 2].real + 1e-2).log10()
+class Unfloored(PathRssi):
+    def read(self, received, query, directions=None):
+        return 10 * received[:, received.shape[1] // 2].real.log10()
 
 
-class Echoing(Floored):
-    takes = "echoes"
+class Loudest(PathRssi):
+    def read(self, received, query, directions=None):
+        return super().read(received / received.abs().max(), query)
 
 
-class Unfloored(Hearing):
-    def hear(self, heard, query, directions=None):
-        return 10 * heard[:, heard.shape[1] // 2].real.log10()
+class Whispering(PathRssi):
+    def read(self, received, query, directions=None):
+        return super().read(received, query)[:, None]
 
 
-class Loudest(Hearing):
-    def hear(self, heard, query, directions=None):
-        return super().hear(heard / heard.abs().max(), query)
-
-
-class Whispering(Hearing):
-    def hear(self, heard, query, directions=None):
-        return super().hear(heard, query)[:, None]
+class Single(PathRssi):
+    channels = 1
 
 
 class Beamed(Pooling):
-    """The real part of a spectrum's lags, the same in all directions but the last."""
-
-    channels, takes = 2, "lags"
+    """The power of a map of its own, spread over the directions of a spectrum."""
 
     def __init__(self, scene, asks=True):
         super().__init__()
@@ -161,23 +151,19 @@ class Beamed(Pooling):
     def forward(self, image, query, directions=None):
         return self.spread(image.square().mean((1, 2, 3)), directions)
 
-    def hear(self, heard, query, directions=None):
-        return self.spread(heard.real.mean(1), directions)
-
 
 @pytest.mark.parametrize(
     ("pooling", "message"),
     [
-        (Echoing, "takes must be lags, fields or None, got 'echoes'"),
         (Unfloored, "the value of silence must be finite"),
-        (Loudest, "a value must not depend on what others hear"),
-        (Whispering, r"the value of lags must be of shape \(3,\), got \(3, 1\)"),
+        (Loudest, "a value must not depend on the other paths"),
+        (Whispering, r"the value must be of shape \(3,\), got \(3, 1\)"),
+        (Single, "paths have 2 channels, real and imaginary part, got 1"),
     ],
 )
-def test_a_pooling_that_hears_wrongly_is_found(pooling, message):
-    check_pooling(lambda scene: Hearing(), LINKS["rssi"])
+def test_a_broken_pooling_of_paths_is_found(pooling, message):
     with pytest.raises(AssertionError, match=message):
-        check_pooling(lambda scene: pooling(), LINKS["rssi"])
+        check_pooling(pooling, LINKS["rssi"])
 
 
 def test_a_pooling_with_a_map_of_its_own_gives_the_directions_asked_for():

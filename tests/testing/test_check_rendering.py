@@ -10,7 +10,6 @@ from gaigs.projection import Plane
 from gaigs.projection.direction_cosine import DirectionCosine
 from gaigs.projection.equirectangular import Equirectangular
 from gaigs.projection.mercator import Mercator
-from gaigs.rasterizer.aperture import Aperture
 from gaigs.rasterizer.torch import TorchRasterizer
 from gaigs.testing import check_projection, check_rasterizer
 
@@ -138,69 +137,5 @@ class Nameless(TorchRasterizer):
     ],
 )
 def test_a_broken_rasterizer_is_found(rasterizer, message):
-    with pytest.raises(AssertionError, match=message):
-        check_rasterizer(rasterizer())
-
-
-class Elsewhere(Aperture):
-    """Puts what stands on the array's middle somewhere else."""
-
-    def fields(self, points, *others):
-        return super().fields(points + (points == 0).all(-1, keepdim=True), *others)
-
-
-class Flat(Aperture):
-    """Has waves as strong at all elements as in the middle."""
-
-    def fields(self, points, semi_axes, amplitudes, lengths, *others):
-        return super().fields(1e3 * points, 1e3 * semi_axes, amplitudes, lengths, *others)
-
-
-class Pointed(Aperture):
-    def lags(self, splats, *others):
-        return super().lags(replace(splats, factors=0 * splats.factors), *others)
-
-
-class Narrowband(Aperture):
-    def lags(self, splats, amplitudes, lengths, coherences, bandwidth, *others):
-        return super().lags(splats, amplitudes, lengths, coherences, None, *others)
-
-
-class Unlearnt(Aperture):
-    def lags(self, splats, amplitudes, lengths, coherences, *others):
-        return super().lags(splats, amplitudes, lengths, coherences.detach(), *others)
-
-
-class Conjugated(Aperture):
-    def fields(self, *arguments):
-        return super().fields(*arguments).conj()
-
-
-class Silenced(Aperture):
-    def fields(self, points, semi_axes, amplitudes, *others):
-        told = torch.view_as_complex(torch.view_as_real(amplitudes).nan_to_num())
-        return super().fields(points, semi_axes, told, *others)
-
-
-class Averaged(Aperture):
-    def lags(self, *arguments):
-        lags = super().lags(*arguments)
-        return lags + 1e-2 * (len(lags) - 2)
-
-
-@pytest.mark.parametrize(
-    ("rasterizer", "message"),
-    [
-        (Elsewhere, "fields must be that of the formula"),
-        (Flat, "random: fields must be that of the formula"),
-        (Pointed, "random: lags must be that of the formula"),
-        (Narrowband, "random: lags must be that of the formula"),
-        (Unlearnt, "random: gradient of lags by coherences must be that of the formula"),
-        (Conjugated, "random: fields must be that of the formula"),
-        (Silenced, "NaN in amplitudes must show as NaN in the fields"),
-        (Averaged, "random: lags must not depend on other queries"),
-    ],
-)
-def test_a_broken_aperture_is_found(rasterizer, message):
     with pytest.raises(AssertionError, match=message):
         check_rasterizer(rasterizer())

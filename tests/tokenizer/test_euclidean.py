@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed
 from gaigs.query import Query
 from gaigs.task.rssi import Rssi
 from gaigs.testing import example_links
 from gaigs.tokenizer.euclidean import (
     BAND_FREQUENCIES,
-    PERIOD,
     EuclideanTokenizer,
     fourier_features,
     learnable_octaves,
@@ -58,36 +57,12 @@ def test_a_gaussians_token_is_its_features_about_the_receivers_middle(scene):
     assert tokens.scene.shape == (2, tokenizer.scene_width) == (2, 0)
 
 
-def test_moving_the_whole_scene_changes_no_token(scene):
-    shift = torch.tensor([8.0, -4, 2])
-    receivers = tuple(replace(r, pose=replace(r.pose, position=r.pose.position + shift)) for r in scene.receivers)
-    moved = replace(scene, receivers=receivers, lower=scene.lower + shift, upper=scene.upper + shift)
-    here, there = EuclideanTokenizer(scene, **OPTIONS), EuclideanTokenizer(moved, **OPTIONS)
-    there.network.load_state_dict(here.network.state_dict())
-    means, opacities, transmitters = torch.randn(7, 3), torch.rand(7), torch.rand(2, 3)
-    expected = here(Placed(means[None]), opacities, ask(transmitters))
-    found = there(Placed(means[None] + shift), opacities, ask(transmitters + shift))
-    for token, other in zip(expected, found, strict=True):
-        torch.testing.assert_close(other, token, rtol=0, atol=1e-4)
-
-
 def test_a_checkpoint_brings_the_middles_along(scene):
     moved = replace(scene, lower=scene.lower + 1, receivers=scene.receivers[:1])
     tokenizer, other = EuclideanTokenizer(scene, **OPTIONS), EuclideanTokenizer(moved, **OPTIONS)
     other.load_state_dict(tokenizer.state_dict())
     inputs = Placed(torch.randn(1, 7, 3)), torch.rand(7), ask(torch.rand(2, 3))
     assert all(map(torch.equal, tokenizer(*inputs), other(*inputs)))
-
-
-def test_an_empty_range_of_octaves_is_refused(scene):
-    with pytest.raises(ValueError, match=r"octaves must be \[lowest, highest\] within -30..30, got \[3, 2\]"):
-        EuclideanTokenizer(scene, **(OPTIONS | {"transmitter_octaves": (3, 2)}))
-
-
-@pytest.mark.parametrize("option", ["hidden", "width"])
-def test_networks_without_width_are_refused(scene, option):
-    with pytest.raises(ValueError, match=f"{option} must be at least 1, got 0"):
-        EuclideanTokenizer(scene, **(OPTIONS | {option: 0}))
 
 
 def test_without_a_network_the_transmitters_token_is_its_features(scene):
@@ -100,19 +75,13 @@ def test_without_a_network_the_transmitters_token_is_its_features(scene):
     assert not [*tokenizer.parameters()]
 
 
-@pytest.mark.parametrize("option", ["hidden", "width"])
-def test_a_network_has_both_widths_or_is_none(scene, option):
-    with pytest.raises(ValueError, match="hidden and width must both be given, or both be null"):
-        EuclideanTokenizer(scene, **(OPTIONS | {option: None}))
-
-
 @pytest.mark.parametrize("spacing", [0.001, 0.03, 0.2, 5.0])
 @pytest.mark.parametrize("edge", [0.5, 3.0, 40.0])
 def test_octaves_span_the_box_and_stop_well_above_the_spacing(scene, spacing, edge):
     upper = scene.lower + torch.tensor([0.3, 1.0, 0.2]) * edge
     lowest, highest = learnable_octaves(replace(scene, upper=upper, spacing=spacing))
     shortest, longest = 2.0**-highest, 2.0**-lowest
-    assert 0.7 < shortest / (PERIOD * spacing) < 1.42
+    assert 0.7 < shortest / (16 * spacing) < 1.42
     assert longest == shortest or 2 * edge <= longest < 4 * edge + 1e-3
     assert longest >= 2 * edge * (1 - 1e-6)
 
@@ -123,22 +92,6 @@ def test_octaves_span_the_box_and_stop_well_above_the_spacing(scene, spacing, ed
 def test_labels_that_scatter_bear_out_wide_features_alone(scene, spacing, edge, expected):
     upper = scene.lower + torch.tensor([0.3, 1.0, 0.2]) * edge
     assert learnable_octaves(replace(scene, upper=upper, spacing=spacing, task=Rssi())) == expected
-
-
-def test_octaves_not_given_are_those_that_can_be_learnt(scene):
-    free = EuclideanTokenizer(scene, **(OPTIONS | {"transmitter_octaves": None}))
-    given = octaves("transmitter_octaves", *learnable_octaves(scene))
-    assert torch.equal(free.transmitter_frequencies, given)
-
-
-def test_gaussians_that_stand_elsewhere_for_each_query_have_tokens_of_their_own(scene):
-    tokenizer = EuclideanTokenizer(scene, **OPTIONS)
-    means, query = torch.randn(2, 7, 3), ask(torch.rand(2, 3))
-    tokens = tokenizer(Placed(means), torch.rand(7), query)
-    assert tokens.gaussians.shape == (2, 7, 39)
-    for i in range(2):
-        alone = tokenizer(Placed(means[i : i + 1]), torch.rand(7), query[i : i + 1])
-        torch.testing.assert_close(alone.gaussians, tokens.gaussians[i])
 
 
 # --- the carrier ---
@@ -158,14 +111,6 @@ def test_a_band_is_seen_through_features_of_its_logarithm(scene):
     assert seen[0].shape == (3, 3 * 15 + expected.shape[1])
 
 
-def test_carriers_tell_transmitters_of_one_place_apart(scene):
-    scene = replace(scene, frequencies=torch.tensor([2.4e9, 5e9]))
-    tokenizer = EuclideanTokenizer(scene, **OPTIONS)
-    places = torch.rand(1, 3).expand(2, 3)
-    tokens = tokenizer(Placed(torch.randn(1, 7, 3)), torch.rand(7), ask(places, torch.tensor([2.4e9, 5e9])))
-    assert (tokens.transmitters[0] - tokens.transmitters[1]).abs().max() > 1e-3
-
-
 def test_a_single_carrier_changes_nothing(scene):
     torch.manual_seed(1)
     plain = EuclideanTokenizer(scene, **OPTIONS)
@@ -179,5 +124,5 @@ def test_a_single_carrier_changes_nothing(scene):
 
 def test_a_band_needs_a_frequency(scene):
     tokenizer = EuclideanTokenizer(replace(scene, frequencies=torch.tensor([2.4e9, 5e9])), **OPTIONS)
-    with pytest.raises(ValueError, match="so a frequency must be given"):
+    with pytest.raises(ValueError, match="a frequency must be given"):
         tokenizer(Placed(torch.randn(1, 7, 3)), torch.rand(7), ask(torch.rand(2, 3)))

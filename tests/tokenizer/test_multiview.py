@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed
 from gaigs.query import Query
-from gaigs.registry import registry
 from gaigs.testing import example_links
 from gaigs.tokenizer.multiview import MultiviewTokenizer
 
@@ -38,18 +37,3 @@ def test_it_takes_the_scene_of_the_one_and_the_positions_of_the_other(tokenizer)
     assert torch.equal(tokens.gaussians, tokenizer.euclidean(*inputs).gaussians)
     assert torch.equal(tokens.transmitters, tokenizer.euclidean(*inputs).transmitters)
     assert (tokenizer.scene_width, tokenizer.gaussian_width, tokenizer.transmitter_width) == (5, 39, 8)
-
-
-def test_both_are_trained(tokenizer):
-    tokens = tokenizer(*draw())
-    sum(token.square().sum() for token in tokens).backward()
-    assert all(parameter.grad.any() for parameter in tokenizer.parameters())
-
-
-def test_an_unknown_part_is_refused():
-    scene = example_links().scene
-    with pytest.raises(ValueError, match=r"unknown tokenizer 'euclid' \(did you mean 'euclidean'\?\)"):
-        MultiviewTokenizer(scene, ga=GA, euclidean={"name": "euclid"})
-    config = {"name": "multiview", "ga": {**GA, "depth": 1}, "euclidean": EUCLIDEAN}
-    with pytest.raises(ValueError, match="tokenizer 'ga' has no option 'depth'"):
-        registry("tokenizer").build(config, scene=scene)

@@ -1,33 +1,34 @@
 """A model of two parameter groups, made-up links that it learns, and a short training."""
 
+from collections.abc import Mapping
+
 import lightning
 import torch
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers import CSVLogger
 from torch import nn
 
+from gaigs.antenna import Receiver
 from gaigs.data import Links, Split
-from gaigs.directions import Grid
-from gaigs.geometry import Pose
+from gaigs.geometry import Grid, Pose
 from gaigs.loss.absolute import Absolute
 from gaigs.loss.l1_ssim import L1Ssim
 from gaigs.model import Model, Prediction
 from gaigs.query import Query
-from gaigs.scene import Receiver
 from gaigs.task.spectrum import Spectrum
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS
 from gaigs.training.descent import Descent
 
 PLACES = 12
-"""Where transmitters stand: 8 train, 3 validate, 1 tests."""
+"""Transmitters: 8 to train, 3 to validate, 1 to test."""
 
 OPTIONS = {
     "batch_size": 4,
     "thinning": {"stride": 3},
     "jitter": 0.0,
-    "penalties": {"gain": 0.5},
-    "learning_rates": {"means": 1.0, "slope": 0.01, "network": 0.02},
+    "penalties": {},
+    "learning_rates": {},
     "optimizer": {"_target_": "torch.optim.AdamW", "weight_decay": 0.3},
     "schedule": {"warmup": 4, "final": 0.1},
     "patience": None,
@@ -36,7 +37,10 @@ OPTIONS = {
 
 
 class Plane(Model):
-    """A label that rises with elevation and azimuth, times what the network makes of the transmitter."""
+    """A label that rises with elevation and azimuth, times a gain that a network gives for the transmitter."""
+
+    learning_rates: Mapping[str, float] = {"slope": 0.01, "network": 0.02}
+    penalty_weights: Mapping[str, float] = {"gain": 0.5}
 
     def __init__(self, scene):
         super().__init__(scene)
@@ -80,7 +84,7 @@ def make_module(links, model=None, loss=None, seed=0, kind=Descent, **options):
 
 
 def fit(module, links, folder, steps, *callbacks, resume=None, at_a_time=2, **options):
-    """Trains, validating so many links at a time behind every fifth step, and logging every second."""
+    """Trains with a validation after every fifth step, and a row of the log every second."""
     options = {"val_check_interval": 5, "log_every_n_steps": 2} | options
     trainer = lightning.Trainer(
         accelerator="cpu", max_epochs=-1, max_steps=steps, num_sanity_val_steps=0, check_val_every_n_epoch=None,

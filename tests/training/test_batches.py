@@ -3,20 +3,19 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gaigs.antenna import Receiver
 from gaigs.data import Links, Split
-from gaigs.directions import Grid
-from gaigs.geometry import Pose
+from gaigs.geometry import Grid, Pose
 from gaigs.query import Query
-from gaigs.scene import Receiver
 from gaigs.task.spectrum import Spectrum
 from gaigs.training import batches as module
 from gaigs.training.batches import Batches, InOrder, process
 
 PLACES = 22
-"""Where transmitters train; links 22 to 25 test."""
+"""Training places; links 22 to 25 test."""
 
 PASS = -(-PLACES // 5)
-"""Batches of 5 that a pass takes."""
+"""Batches of 5 in a pass."""
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +49,17 @@ def numbers(batch):
 def draw(links, steps, size=5, seed=0, start=0):
     batches = Batches(links, links.split.train, size, seed, steps)
     batches.load_state_dict({"position": start})
-    return list(batches)
+    drawn = list(batches)
+    assert (len(batches), batches.state_dict()) == (steps, {"position": steps})
+    return drawn
 
 
 def test_a_pass_goes_through_every_link_once(links):
     for passed in range(3):
         drawn = draw(links, (passed + 1) * PASS)[passed * PASS :]
         assert sorted(n for batch in drawn for n in numbers(batch)) == links.split.train.tolist()
+    first, second, other = draw(links, PASS), draw(links, 2 * PASS)[PASS:], draw(links, PASS, seed=1)
+    assert len({str([numbers(batch) for batch in own]) for own in (first, second, other)}) == 3
 
 
 def test_receivers_and_labels_belong_to_their_transmitters(links):
@@ -69,17 +72,6 @@ def test_receivers_and_labels_belong_to_their_transmitters(links):
         assert batch.directions.shape == (4, 6)
         assert batch.shares == (1.0, 1.0)
         assert len(held) <= 5
-
-
-def test_links_of_one_transmitter_come_together(links):
-    """Each place is heard three times, the last one once."""
-    drawn = draw(at(links, torch.arange(len(links)) // 3), 2)
-    assert [len(batch) for batch in drawn] in ([13, 9], [15, 7])
-    for batch in drawn:
-        assert len(batch.query.transmitters.unique(dim=0)) <= 5
-        held = numbers(batch)
-        places = {n // 3 for n in held}
-        assert sorted(held) == [n for n in range(PLACES) if n // 3 in places]
 
 
 def test_a_place_is_a_position_and_a_frequency(links):
@@ -97,31 +89,11 @@ def test_a_place_is_a_position_and_a_frequency(links):
     assert any(a & b for a in apart for b in apart if a is not b), "carriers of one position need not come together"
 
 
-def test_passes_differ_and_so_do_seeds(links):
-    both, other = ([numbers(batch) for batch in draw(links, 2 * PASS, seed=seed)] for seed in (0, 1))
-    assert both[:PASS] != both[PASS:]
-    assert both != other
-
-
-@pytest.mark.parametrize("start", range(2 * PASS + 2))
+@pytest.mark.parametrize("start", [1, PASS, 2 * PASS + 1])
 def test_a_batch_depends_on_its_step_alone(links, start):
     torch.manual_seed(start)  # the global generator has no say
     whole, rest = draw(links, 2 * PASS + 1), draw(links, 2 * PASS + 1, start=start)
     assert [numbers(batch) for batch in rest] == [numbers(batch) for batch in whole[start:]]
-
-
-def test_the_position_counts_the_batches_handed_out(links):
-    batches = Batches(links, links.split.train, 5, 0, PASS + 3)
-    assert len(batches) == PASS + 3
-    iterator = iter(batches)
-    for step in range(PASS + 2):
-        assert batches.state_dict() == {"position": step}
-        next(iterator)
-
-
-def test_one_batch_may_hold_all(links):
-    for batch in draw(links, 2, size=100):
-        assert sorted(numbers(batch)) == links.split.train.tolist()
 
 
 def test_a_pass_for_scores_keeps_the_order(links):
@@ -133,6 +105,7 @@ def test_a_pass_for_scores_keeps_the_order(links):
     assert all(batch.shares == (1.0, 1.0) for batch in drawn)
     none = InOrder(links, links.split.validation, 5)
     assert len(none) == len(list(none)) == 0
+    assert process() == (0, 1)
 
 
 @pytest.mark.parametrize(("size", "steps", "option"), [(0, 1, "training.batch_size"), (1, -1, "trainer.max_steps")])
@@ -145,16 +118,12 @@ def test_refuses(links, size, steps, option):
 
 
 def on_each(monkeypatch, processes, work):
-    """What each of several pretended processes makes."""
+    """The results of several pretended processes."""
     results = []
     for rank in range(processes):
         monkeypatch.setattr(module, "process", lambda rank=rank: (rank, processes))
         results.append(work())
     return results
-
-
-def test_alone_there_is_one_process():
-    assert process() == (0, 1)
 
 
 PLACED = {
@@ -165,14 +134,14 @@ PLACED = {
 
 
 @pytest.mark.parametrize("processes", [2, 3])
-@pytest.mark.parametrize("size", [1, 2, 4, 5, 100])  # 1 and 2: fewer places than processes, 4 and 5: an uneven rest
+@pytest.mark.parametrize("size", [1, 5, 100])  # 1: fewer places than processes, 5: an uneven rest
 @pytest.mark.parametrize("places", PLACED)
 def test_processes_share_each_batch_and_their_mean_is_that_of_the_batch(links, monkeypatch, processes, size, places):
     links = at(links, PLACED[places])
     steps = 2 * -(-len(links.query.transmitters[:PLACES].unique(dim=0)) // size)
     whole = draw(links, steps, size)
     shared = on_each(monkeypatch, processes, lambda: draw(links, steps, size))
-    # Of each link a value, and of each place: what a loss and a penalty are means of.
+    # A value of each link, and of each place, as a loss and a penalty are means of them.
     of_link = torch.randn(PLACES + 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     of_place = torch.randn(PLACES + 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     of_places = lambda batch: of_place[batch.query.transmitters[:, 0].unique().long()].mean()
@@ -191,16 +160,7 @@ def test_processes_share_each_batch_and_their_mean_is_that_of_the_batch(links, m
 
 
 @pytest.mark.parametrize("processes", [2, 3])
-@pytest.mark.parametrize("start", [0, 1, PASS])
-def test_each_process_goes_on_with_its_own_share(links, monkeypatch, processes, start):
-    whole = on_each(monkeypatch, processes, lambda: draw(links, 2 * PASS))
-    rest = on_each(monkeypatch, processes, lambda: draw(links, 2 * PASS, start=start))
-    for own, later in zip(whole, rest, strict=True):
-        assert [numbers(batch) for batch in later] == [numbers(batch) for batch in own[start:]]
-
-
-@pytest.mark.parametrize("processes", [2, 3])
-@pytest.mark.parametrize("size", [1, 2, 5, 100])
+@pytest.mark.parametrize("size", [1, 5, 100])
 def test_processes_share_what_is_scored(links, monkeypatch, processes, size):
     """Every link counts once, and all processes go through as many batches, none of them empty."""
     drawn = on_each(monkeypatch, processes, lambda: list(InOrder(links, links.split.train, size)))

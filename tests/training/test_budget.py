@@ -6,21 +6,22 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from fitting import Plane, fit, make_links, make_module
-from lightning.pytorch.callbacks import Callback, Timer
+from fitting import Plane, fit, make_module
+from lightning.pytorch.callbacks import Callback
 
+from gaigs.training import budget as budget_module
 from gaigs.training.budget import ENDLESS, make_budget, share_done
-from gaigs.training.callbacks import Interrupted, KeepBest, KeepLast, ProgressLine
+from gaigs.training.checkpoints import Interrupted, KeepBest, KeepLast
 from gaigs.training.revision import Revision
 
 
 class Clock(Callback):
-    """A second a step and, where it is told so, some a validation; notes what happens when; stops behind one step.
+    """A second a step; records losses, rates and validations; stops after one step.
 
     Args:
-        start: What it shows first [s]; another process's clock shows something else.
-        validation: Of each [s].
-        at: The step behind which the training is interrupted.
+        start: Its first time [s]; another process's clock shows another.
+        validation: Time of each validation [s].
+        at: The step after which the training is interrupted.
     """
 
     def __init__(self, start=0.0, validation=0.0, at=None):
@@ -45,7 +46,7 @@ class Clock(Callback):
 
 
 class Turned(Plane):
-    """A plane that is turned now and then, and notes when."""
+    """A plane that turns now and then, and records when."""
 
     revisions = (0.0, 0.3, 0.35, 0.9)
 
@@ -59,68 +60,49 @@ class Turned(Plane):
         return "turned"
 
 
-@pytest.fixture(scope="module")
-def links():
-    return make_links()
-
-
 @pytest.fixture
 def train(links, tmp_path, monkeypatch):
     """Trains by a clock; gives the trainer."""
 
     def train(clock, module=None, steps=-1, resume=None, **options):
-        monkeypatch.setattr("lightning.pytorch.callbacks.timer.time", clock)
-        timer = Timer()
+        monkeypatch.setattr(budget_module, "time", clock)
         given = {"max_steps": steps, "max_time": "00:00:00:10", "val_check_interval": "00:00:00:04"} | options
-        given, budget = make_budget(given, timer)
+        given, budget = make_budget(given)
         del given["max_steps"]
         module = module or make_module(links)
         keep = KeepBest(tmp_path / "best.ckpt", None), KeepLast(tmp_path / "last.ckpt", every=math.inf)
-        callbacks = [clock, timer, budget, Revision(links, 0), *keep]
+        callbacks = [clock, budget, Revision(links, 0), *keep]
         return fit(module, links, tmp_path, steps, *callbacks, resume=resume, **given)
 
     return train
 
 
-def test_it_ends_with_its_time_and_the_last_step_is_validated_once(train):
-    clock = Clock()
-    trainer = train(clock, val_check_interval=3)
-    assert trainer.global_step == 10
-    assert clock.validated == [3, 6, 9, 10]
-
-
-def test_time_that_validations_take_counts(train):
-    clock = Clock(validation=2.0)
-    trainer = train(clock, val_check_interval=3)
-    assert clock.validated == [3, 6]
-    assert trainer.global_step == 6, "3 s, 2 s to validate, 3 s, 2 s to validate"
-
-
-@pytest.mark.parametrize(("spent", "validated"), [(0.0, [4, 8, 10]), (1.0, [4, 8])])
-def test_validations_come_by_time_from_the_end_of_one_to_the_next(train, spent, validated):
+@pytest.mark.parametrize(
+    ("spent", "options", "validated"),
+    [
+        (0.0, {"val_check_interval": 3}, [3, 6, 9, 10]),  # the last step once
+        (2.0, {"val_check_interval": 3}, [3, 6]),  # 3 s, 2 s to validate, 3 s, 2 s to validate
+        (0.0, {}, [4, 8, 10]),  # every 4 s from the end of a validation
+        (1.0, {}, [4, 8]),
+        (3.0, {"max_time": "00:00:00:40"}, [4, 16, 28, 31]),  # slow ones take a fifth of the time
+        (0.0, {"steps": 6, "max_time": None}, [4]),  # steps may end it
+    ],
+)
+def test_a_training_ends_and_validates_by_time(train, tmp_path, spent, options, validated):
     clock = Clock(validation=spent)
-    train(clock)
+    trainer = train(clock, **options)
     assert clock.validated == validated
-
-
-def test_slow_validations_take_a_fifth_of_the_time(train):
-    clock = Clock(validation=3.0)
-    train(clock, max_time="00:00:00:40")
-    assert clock.validated == [4, 16, 28, 31], "4 s, 3 s to validate, four times as long, ..., the end"
-
-
-def test_steps_may_end_what_validates_by_time(train, tmp_path):
-    clock = Clock()
-    trainer = train(clock, steps=6, max_time=None)
-    assert (trainer.global_step, clock.validated) == (6, [4])
-    assert torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] in (4, 6)
+    last = options.get("steps", validated[-1])
+    assert trainer.global_step == last
+    assert trainer.callbacks[1].seconds == last + spent * len(validated)
+    assert torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] in (*validated, last)
 
 
 def test_rates_fall_with_the_time(train, links):
     clock = Clock()
     module = make_module(links, learning_rates={"slope": 1.0, "network": 0.5}, schedule={"warmup": 0, "final": 0.01})
     train(clock, module)
-    share = [0, *(k / 10 for k in range(9))]  # as told behind the step before
+    share = [0, *(k / 10 for k in range(9))]  # as of the end of the step before
     assert clock.rates == pytest.approx([0.01**done for done in share])
 
 
@@ -131,7 +113,7 @@ def test_of_steps_and_time_the_larger_share_counts(train, links):
     assert clock.rates == pytest.approx([0.01 ** (k / 5) for k in range(5)])
     trainer = SimpleNamespace(max_steps=50, callbacks=[SimpleNamespace()])
     assert share_done(trainer)(20) == 20 / 50
-    _, budget = make_budget({"max_steps": 50, "max_time": "00:00:00:10"}, Timer())
+    _, budget = make_budget({"max_steps": 50, "max_time": "00:00:00:10"})
     trainer.callbacks.append(budget)
     budget.share = 0.5
     assert [share_done(trainer)(step) for step in (20, 30)] == [0.5, 0.6]
@@ -141,18 +123,15 @@ def test_revisions_come_after_their_shares_of_the_time(train, links, caplog):
     caplog.set_level("INFO")
     module = make_module(links, Turned(links.scene))
     train(Clock(), module)
-    told = [record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"]
-    assert told == ["step 0: turned", "step 3: turned", "step 4: turned", "step 9: turned"]
+    lines = [record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"]
+    assert lines == ["step 0: turned", "step 3: turned", "step 4: turned", "step 9: turned"]
     assert module.model.turns == [0, 1, 2, 3]
-
-
-def test_a_revision_that_steps_brought_is_not_made_again_by_time(train, links):
     module = make_module(links, Turned(links.scene))
     train(Clock(), module, steps=8)
-    assert module.model.turns == [0, 1, 2, 3]
+    assert module.model.turns == [0, 1, 2, 3], "steps and time bring each once"
 
 
-@pytest.mark.parametrize("at", [1, 3, 4, 6, 8])
+@pytest.mark.parametrize("at", [3, 4])
 def test_a_training_that_goes_on_has_the_time_that_was_spent(train, links, tmp_path, at):
     """Stopped between validations and at one, it sees what an uninterrupted one sees, whatever the clock shows now."""
     make = lambda: make_module(links, Turned(links.scene), learning_rates={"slope": 0.05, "network": 0.02})
@@ -185,8 +164,8 @@ def test_a_training_whose_time_is_up_takes_no_step_more(train, tmp_path):
 
 def test_the_clock_of_the_first_process_decides():
     """This process's clock is ahead, the first one's is not."""
-    timer = SimpleNamespace(time_elapsed=lambda stage: 99.0)
-    _, budget = make_budget({"max_time": "00:00:00:10", "val_check_interval": "00:00:00:05"}, timer)
+    _, budget = make_budget({"max_time": "00:00:00:10", "val_check_interval": "00:00:00:05"})
+    budget.spent = 99.0
     asked = []
     strategy = SimpleNamespace(broadcast=lambda value: asked.append(value) or first)
     trainer = SimpleNamespace(strategy=strategy, should_stop=False, global_step=7, val_check_batch=None)
@@ -217,59 +196,40 @@ def test_the_clock_of_the_first_process_decides():
 )
 def test_options(options, max_time, every):
     before = dict(options)
-    rest, budget = make_budget(options, Timer())
+    rest, budget = make_budget(options)
     assert options == before
     assert "max_time" not in rest
     assert rest["max_steps"] == options["max_steps"]
     assert rest["val_check_interval"] == (2 if every is None else ENDLESS)
-    assert (budget is None) == (max_time is every is None)
-    if budget is not None:
-        assert (budget.max_time, budget.every) == (max_time, every)
-
-
-@pytest.mark.parametrize("time", ["3 min", "00:03:00", 180, "00:00:00:00", {"minuets": 3}, {"seconds": 0.5}])
-@pytest.mark.parametrize("option", ["max_time", "val_check_interval"])
-def test_a_time_that_cannot_be_read_is_refused(option, time):
-    if option == "val_check_interval" and time == 180:
-        return  # steps
-    message = rf"trainer\.{option} must be a time of at least a second as 'DD:HH:MM:SS', .*got {re.escape(repr(time))}"
-    with pytest.raises(ValueError, match=message):
-        make_budget({"max_steps": 10, option: time}, Timer())
+    assert (budget.max_time, budget.every) == (max_time, every)
 
 
 @pytest.mark.parametrize(
     ("option", "value", "error", "message"),
     [
+        *(
+            (
+                "max_time",
+                time,
+                ValueError,
+                f"a time of at least a second .*got {re.escape(repr(time))}",
+            )
+            for time in ("3 min", "00:03:00", 180, "00:00:00:00", {"minuets": 3}, {"seconds": 0.5})
+        ),
+        (
+            "val_check_interval",
+            "00:03:00",
+            ValueError,
+            "a time of at least a second as 'DD.*got '00:03:00'",
+        ),
         ("val_check_interval", 0, ValueError, "at least 1 step, got 0"),
         ("val_check_interval", None, TypeError, "a whole number, got None"),
-        ("val_check_interval", 0.5, TypeError, "a whole number, got 0.5"),
-        ("log_every_n_steps", 0, ValueError, "at least 1 step, got 0"),
-        ("log_every_n_steps", None, TypeError, "a whole number, got None"),
+        ("log_every_n_steps", 0.5, TypeError, "a whole number, got 0.5"),
         ("max_epochs", 3, ValueError, "-1, as steps or time count, got 3"),
         ("check_val_every_n_epoch", 1, ValueError, "null, as steps or time count, got 1"),
+        ("max_steps", -1, ValueError, r"at least 1, got -1; time alone ends it with trainer\.max_time"),
     ],
 )
-def test_steps_count_and_are_whole(option, value, error, message):
+def test_options_that_cannot_be_are_refused(option, value, error, message):
     with pytest.raises(error, match=rf"^trainer\.{option} must be {message}$"):
-        make_budget({"max_steps": 10, option: value}, Timer())
-
-
-@pytest.mark.parametrize("options", [{"max_steps": -1}, {}])
-def test_something_must_end_it(options):
-    with pytest.raises(ValueError, match=r"max_steps must be at least 1, got -1; time alone ends it with trainer\.max"):
-        make_budget(options, Timer())
-
-
-def test_the_progress_line_tells_the_share_of_the_time(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    _, budget = make_budget({"max_steps": -1, "max_time": "00:00:03:00"}, Timer())
-    trainer = SimpleNamespace(global_step=40, max_steps=-1, progress_bar_metrics={}, is_global_zero=True)
-    trainer.callbacks = [budget]
-    line, module = ProgressLine(), SimpleNamespace(task=SimpleNamespace(monitor="ssim"))
-    line.on_train_start(trainer, None)
-    trainer.global_step, budget.share = 1499, 0.25
-    line.on_train_batch_end(trainer, module)
-    assert [task.percentage for task in line.line.tasks] == [25.0]
-    line.on_train_end(trainer, module)
-    (shown,) = capsys.readouterr().out.strip().splitlines()
-    assert re.fullmatch(r"training \S+ +1499 steps [\d.]+ steps/s \S+", shown), shown
+        make_budget({"max_steps": 10, option: value})

@@ -1,11 +1,10 @@
-"""The check that authors of a training call: it passes both of ours, and finds what is broken."""
+"""The check for authors of a training: it passes ours, and finds each defect."""
 
 from functools import partial
 
 import pytest
 import torch
-from fitting import OPTIONS, Plane, make_links
-from test_adversarial import RATES, Forger
+from fitting import OPTIONS, Plane
 from torch import nn
 
 from gaigs.model import Model, Prediction
@@ -13,7 +12,7 @@ from gaigs.registry import registry
 from gaigs.testing import check_training, example_links
 from gaigs.training.descent import Descent
 
-SIMPLE = OPTIONS | {"name": "descent", "thinning": {}, "penalties": {}, "learning_rates": {"network": 0.05}}
+SIMPLE = OPTIONS | {"name": "descent", "thinning": {}}
 
 
 class Linear(Model):
@@ -36,25 +35,15 @@ class Linear(Model):
         return Prediction(value.reshape(-1, *[1] * len(shape)).expand(-1, *shape), {})
 
 
-@pytest.fixture(scope="module")
-def links():
-    return make_links()
-
-
-@pytest.mark.parametrize("options", [{}, {"thinning": {"rays": 40}}, {"jitter": 0.05}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"thinning": {"rays": 40}, "jitter": 0.05}], ids=str)
 def test_descent_is_as_the_contract_says(links, options):
     build = partial(registry("training").build, {"name": "descent", **OPTIONS, **options})
     check_training(build, Plane, links)
 
 
-@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_descent_is_as_the_contract_says_for_every_task(task):
+@pytest.mark.parametrize("task", ["rssi", "csi"])
+def test_descent_is_as_the_contract_says_for_other_tasks(task):
     check_training(partial(registry("training").build, SIMPLE), Linear, example_links(task))
-
-
-def test_adversarial_training_is_as_the_contract_says(links):
-    config = OPTIONS | {"name": "adversarial", "weight": 0.5, "learning_rates": RATES}
-    check_training(partial(registry("training").build, config), Forger, links)
 
 
 class Forgetful(Descent):
@@ -126,14 +115,14 @@ class Flattering(Descent):
     ("kind", "rule"),
     [
         (Forgetful, "a checkpoint must hold the identity as its entry 'gaigs'"),
-        (Careless, "a model that is trained otherwise must be a ValueError"),
+        (Careless, "a model of another training must be a ValueError"),
         (Erratic, "the same seed must give the same training"),
-        (Stateful, "a training must go on as if it had never stopped"),
-        (Lazy, "the parameters of group network must be trained, and stay as they were"),
+        (Stateful, "a resumed training must equal an uninterrupted one"),
+        (Lazy, "the parameters of group network must change in training"),
         (Twice, "6 batches must be as many steps, got"),
         (Unheard, "each step must log a finite train/loss for the progress bar"),
         (Blind, "a validation must log validation/ssim, got .*validation/score"),
-        (Flattering, "validation/ssim must be the mean over the validation links of what the model evaluates"),
+        (Flattering, "validation/ssim must be the mean score of the validation links"),
     ],
 )
 def test_what_is_broken_is_found(links, kind, rule):

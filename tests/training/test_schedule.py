@@ -34,8 +34,8 @@ def rates(schedule, optimizer, steps):
 def test_each_group_has_its_rate_and_the_network_alone_decays(groups):
     optimizer = make_optimizer(ADAM, groups, RATES | {"signal": 9.0})
     assert type(optimizer) is torch.optim.AdamW
-    told = [(group["name"], group["lr"], group["weight_decay"]) for group in optimizer.param_groups]
-    assert told == [("means", 0.5, 0.0), ("network", 0.1, 0.3)]
+    settings = [(group["name"], group["lr"], group["weight_decay"]) for group in optimizer.param_groups]
+    assert settings == [("means", 0.5, 0.0), ("network", 0.1, 0.3)]
     held = [[id(parameter) for parameter in group["params"]] for group in optimizer.param_groups]
     assert held == [[id(parameter) for parameter in group] for group in groups.values()]
 
@@ -51,16 +51,6 @@ def test_a_decay_that_torch_has_by_default_is_not_that_of_positions(groups):
     assert (groups["network"][0] < 1).all()
 
 
-def test_momentum_is_torchs_own(groups):
-    """Two steps of SGD with momentum, by its formula."""
-    optimizer = make_optimizer({"_target_": "torch.optim.SGD", "momentum": 0.9}, groups, RATES)
-    (x,) = groups["means"]
-    x.grad = torch.tensor([1.0, -2.0])
-    optimizer.step()
-    optimizer.step()
-    torch.testing.assert_close(x.detach(), 1 - 0.5 * (1 + 1.9) * x.grad)
-
-
 @pytest.mark.parametrize(
     ("target", "options", "fused"),
     [
@@ -74,52 +64,22 @@ def test_momentum_is_torchs_own(groups):
 def test_a_step_is_fused_where_torch_can(groups, target, options, fused):
     optimizer = make_optimizer({"_target_": f"torch.optim.{target}", **options}, groups, RATES)
     assert optimizer.defaults.get("fused") is fused
-
-
-def test_parameters_of_another_kind_are_not_fused(groups):
-    groups["means"] = [torch.nn.Parameter(torch.ones(2, dtype=torch.complex64))]
-    assert make_optimizer(ADAM, groups, RATES).defaults["fused"] is False
-
-
-def test_a_fused_step_is_the_plain_one(groups):
-    start = {name: [parameter.detach().clone() for parameter in group] for name, group in groups.items()}
-    ends = []
-    for fused in (False, True):
-        own = {name: [torch.nn.Parameter(x.double()) for x in group] for name, group in start.items()}
-        optimizer = make_optimizer(ADAM | {"fused": fused}, own, RATES)
-        torch.manual_seed(0)
-        for _ in range(5):
-            for parameter in (parameter for group in own.values() for parameter in group):
-                parameter.grad = torch.randn_like(parameter)
-            optimizer.step()
-        ends.append([parameter.detach() for group in own.values() for parameter in group])
-    for plain, fused in zip(*ends, strict=True):
-        torch.testing.assert_close(fused, plain, rtol=1e-12, atol=1e-14)
-
-
-ELSEWHERE = ("os.system", "AdamW", "torch.nn.Linear", "torch.optim.AdanW", "torch.optim.lr_scheduler.StepLR")
-
-
-@pytest.mark.parametrize("target", [*ELSEWHERE, None])
-def test_an_optimizer_from_elsewhere_is_refused(groups, target):
-    with pytest.raises(ValueError, match=rf"optimizer\._target_ must be a class of torch\.optim, got {target!r}"):
-        make_optimizer({"_target_": target}, groups, RATES)
-
-
-def test_an_optimizer_needs_a_target(groups):
-    with pytest.raises(ValueError, match=r"training\.optimizer\._target_ must be a class of torch\.optim, got None"):
-        make_optimizer({"weight_decay": 0.1}, groups, RATES)
+    groups["means"] = [nn.Parameter(torch.ones(2, dtype=torch.complex64))]
+    assert make_optimizer(ADAM, groups, RATES).defaults["fused"] is False, "which takes real numbers alone"
 
 
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
+        *(
+            ({"_target_": target}, ValueError, rf"_target_ must be a class of torch\.optim, got '{target}'")
+            for target in ("os.system", "AdamW", "torch.nn.Linear", "torch.optim.AdanW", None)
+        ),
         ({"momentun": 0.9}, ValueError, r"training\.optimizer has no option 'momentun' \(did you mean 'momentum'\?\)"),
         ({"lr": 0.1}, ValueError, r"takes no lr, as each group has its own; set training\.learning_rates"),
         ({"params": []}, ValueError, "training.optimizer has no option 'params'"),
         ({"nesterov": "yes"}, TypeError, r"training\.optimizer option 'nesterov' must be true or false, got 'yes'"),
-        ({"momentum": -1.0}, ValueError, r"training\.optimizer cannot be made with .* Invalid momentum value: -1\.0"),
-        ({"weight_decay": -1.0}, ValueError, r"training\.optimizer cannot be made with .* Invalid weight_decay value"),
+        ({"momentum": -1.0}, ValueError, r"training\.optimizer cannot be made \(.* Invalid momentum value: -1\.0"),
         ({"weight_decay": float("nan")}, TypeError, r"option 'weight_decay' must be a finite number, got nan"),
     ],
 )
@@ -156,14 +116,11 @@ def test_a_schedule_of_torch_is_stepped_once_a_step(groups):
     [
         ({"warmup": -1, "final": 0.1}, ValueError, r"training\.schedule\.warmup must be at least 0 steps, got -1"),
         ({"warmup": 0, "final": 0.0}, ValueError, r"training\.schedule\.final must be in \(0, 1\], got 0\.0"),
-        ({"warmup": 0, "final": 1.5}, ValueError, r"training\.schedule\.final must be in \(0, 1\], got 1\.5"),
         ({"warmup": 0.5, "final": 1.0}, TypeError, r"schedule option 'warmup' must be a whole number, got 0\.5"),
         ({"warmpu": 5, "final": 1.0}, ValueError, r"has no option 'warmpu' \(did you mean 'warmup'\?\)"),
-        ({"warmup": 5, "final": 1.0, "steps": 3}, ValueError, r"training\.schedule has no option 'steps'"),
         ({"warmup": 5}, ValueError, r"training\.schedule needs option final"),
         (CONSTANT | {"warmup": 5}, ValueError, r"training\.schedule has no option 'warmup'.* it has: factor"),
         (CONSTANT | {"_target_": "torch.optim.SGD"}, ValueError, r"must be a class of torch\.optim\.lr_scheduler, got"),
-        (CONSTANT | {"_target_": "os.system"}, ValueError, r"must be a class of torch\.optim\.lr_scheduler, got"),
     ],
 )
 def test_a_schedule_refuses(groups, config, error, message):

@@ -16,32 +16,34 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.data.sionna import tracing
-from gaigs.data.sionna.meshes import Room
+from gaigs.data.sionna.meshes import MeshRoom
 from gaigs.data.synthetic.image_source import Paths
 
 log = logging.getLogger(__name__)
 
 VERSION = 1
-"""Of the files; to be raised with every change of ``tracing`` that changes its paths."""
+"""Version of the files; to be raised with every change of ``tracing`` that changes its paths."""
 
 
 def folder() -> Path:
-    """Where the files lie: gaigs/sionna in the user's folder of caches."""
+    """Folder of the files: gaigs/sionna in the user's folder of caches."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "gaigs" / "sionna"
 
 
-def find_paths(room: Room, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float) -> Paths:
+def find_paths(
+    room: MeshRoom, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
+) -> Paths:
     """The paths in a room, traced the first time and read afterwards.
 
     Args:
         room: Walls and furniture.
         receiver: Position [m].
         transmitters: Positions [m].
-        frequency: Of the carrier [Hz].
+        frequency: Carrier [Hz].
 
     Raises:
-        ImportError, RuntimeError: As for ``tracing.trace``; the packages have to be there in any case, since paths
-            belong to their versions.
+        ImportError, RuntimeError: As for ``tracing.trace``; the packages are needed in any case, since paths belong
+            to their versions.
         ValueError: The frequency is out of range, or the file is damaged.
     """
     key = {
@@ -61,13 +63,13 @@ def find_paths(room: Room, receiver: Float[Tensor, "3"], transmitters: Float[Ten
     return Paths(torch.from_numpy(arrays["images"]).double(), torch.from_numpy(arrays["gains"]).to(torch.complex128))
 
 
-def keep(key: Mapping[str, object], make: Callable[[], dict[str, np.ndarray]], what: str) -> dict[str, np.ndarray]:
+def keep(key: Mapping[str, object], make: Callable[[], dict[str, np.ndarray]], task: str) -> dict[str, np.ndarray]:
     """Arrays by name, made the first time and read afterwards.
 
     Args:
-        key: All that they depend on beside the packages that trace, as JSON takes it.
-        make: Makes them.
-        what: Is done the first time, for the log.
+        key: Everything that the arrays depend on beside the packages that trace, as JSON takes it.
+        make: Function that makes them.
+        task: Description of the making, for the log.
 
     Raises:
         ImportError: A package that traces is not installed.
@@ -76,29 +78,18 @@ def keep(key: Mapping[str, object], make: Callable[[], dict[str, np.ndarray]], w
     key = {"version": VERSION, "packages": tracing.find_packages(), **key}
     file = folder() / f"{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:32]}.npz"
     if not file.is_file():
-        log.info("%s; next time they are read from %s", what, file)
+        log.info("%s; next time they are read from %s", task, file)
         arrays = make()
-        if not file.is_file():  # two tracings are not quite alike: that of a process which was faster stays
-            _write(file, arrays)
-    return _read(file)  # in its precision, so that the first time gives what every other gives
-
-
-def _read(file: Path) -> dict[str, np.ndarray]:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        # Another process may make the same file at the same time: each writes a file of its own, and the first stays,
+        # since two tracings differ a little.
+        with tempfile.TemporaryDirectory(dir=file.parent) as own:
+            with open(f"{own}/paths.npz", "wb") as stream:
+                np.savez_compressed(stream, **arrays)
+            if not file.is_file():
+                os.replace(f"{own}/paths.npz", file)
     try:
-        with file.open("rb") as stream:  # numpy would not close a file that it cannot read
+        with file.open("rb") as stream:  # numpy leaves a damaged file open
             return dict(np.load(stream, allow_pickle=False))
     except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{file} must be a whole file of paths, and is damaged ({error}); delete it") from error
-
-
-def _write(file: Path, arrays: dict[str, np.ndarray]) -> None:
-    """In one go: whoever reads meanwhile finds a whole file or none."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            np.savez_compressed(stream, **arrays)
-        os.replace(name, file)
-    except BaseException:
-        os.unlink(name)
-        raise
+        raise ValueError(f"cannot parse {file}: {error}; delete it") from error

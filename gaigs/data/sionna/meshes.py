@@ -1,6 +1,5 @@
 """Rooms that are no boxes, as meshes of planar faces: an L, one with a leaning wall, one full of furniture."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gaigs.geometry import Pose
+from gaigs.io.meshes import triangles
 
 THICKNESS = {
     "concrete": 0.2,
@@ -21,13 +21,10 @@ THICKNESS = {
     "ceiling_board": 0.02,
     "metal": 0.002,
 }
-"""Of the slab that a face of each material stands for [m]; furniture is hollow, of boards."""
-
-HEIGHTS = 0.3, 2.0
-"""Of the transmitters [m]."""
+"""Thickness of the slab behind a face of each material [m]; furniture is hollow, of boards."""
 
 WALL_MARGIN, FURNITURE_MARGIN = 0.3, 0.05
-"""How far transmitters stand from walls and from furniture, at least [m]."""
+"""Least distance of transmitters from walls and from furniture [m]."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class Mesh:
     """One object of one material.
 
     Attributes:
-        name: What it is.
+        name: Name of the object.
         material: One of ``THICKNESS``.
         vertices: Corners, world frame [m].
         faces: Corners of each planar convex face, counted from 0, around it.
@@ -47,19 +44,19 @@ class Mesh:
     faces: tuple[tuple[int, ...], ...]
 
     def triangles(self) -> list[tuple[int, int, int]]:
-        """The faces cut into triangles, as fans about their first corners."""
-        return [(face[0], *pair) for face in self.faces for pair in itertools.pairwise(face[1:])]
+        """Faces cut into triangles."""
+        return triangles(self.faces)
 
 
 @dataclass(frozen=True)
 class Cuboid:
-    """A piece of furniture, or a part of one, upright but turned at will.
+    """An upright piece of furniture, or a part of one.
 
     Attributes:
-        name: What it is.
-        material: Of its sides, one of ``THICKNESS``.
-        lower, upper: Opposite corners before it is turned, world frame [m].
-        turn: About the vertical through its middle, counterclockwise [deg].
+        name: Kind of furniture.
+        material: Material of its sides, one of ``THICKNESS``.
+        lower, upper: Opposite corners before the rotation, world frame [m].
+        turn: Rotation about the vertical through its middle, counterclockwise [deg].
     """
 
     name: str
@@ -81,8 +78,8 @@ class Cuboid:
         sides = (0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)
         return Mesh(self.name, self.material, tuple(corners), sides)
 
-    def contains(self, points: Float[Tensor, "k 3"], margin: float) -> Bool[Tensor, "k"]:
-        """Whether points [m] lie within it or less than a margin [m] from it, measured along its axes."""
+    def contains(self, points: Float[Tensor, "k 3"], margin: float) -> Bool[Tensor, " k"]:
+        """True for points [m] within it, or less than a margin [m] from it along its axes."""
         (cos, sin), middle = self._axes(), points.new_tensor(self._middle())
         x, y, z = (points - middle).unbind(-1)
         own = torch.stack((cos * x + sin * y, cos * y - sin * x, z), -1).abs()
@@ -97,19 +94,19 @@ class Cuboid:
 
 
 @dataclass(frozen=True)
-class Room:
-    """A room between a floor and a ceiling with as many corners, its furniture, and who listens there.
+class MeshRoom:
+    """A room between a floor and a ceiling with as many corners, with furniture and receivers.
 
     Attributes:
         floor: Corners (x, y) of the floor, counterclockwise [m].
         ceiling: Corners of the ceiling, each above that of the floor [m]; where they differ walls lean.
-        height: Of the ceiling [m].
-        convex: Corners of the convex parts that floor and ceiling are cut into.
+        height: Height of the ceiling [m].
+        convex: Corners of the convex parts of floor and ceiling.
         walls: Material of each wall, from a corner to the next.
         slabs: Materials of floor and ceiling.
-        furniture: What stands in the room.
-        antenna: Position of the receiver with the array [m], the point that it faces [m], and how far it is turned
-            about its normal [deg].
+        furniture: Cuboids in the room.
+        antenna: Position of the receiver with the array [m], the point that it faces [m], and its rotation about its
+            normal [deg].
         gateways: Positions of the receivers with a single antenna, by name [m].
     """
 
@@ -137,15 +134,15 @@ class Room:
         return [*map(_compact, shell), *(cuboid.mesh() for cuboid in self.furniture)]
 
     def pose(self) -> Pose:
-        """Of the receiver with the array: its normal points at what it faces."""
+        """Pose of the receiver with the array: its normal points at the point that it faces."""
         position, target, turn = self.antenna
         normal = torch.tensor(target, dtype=torch.float64) - torch.tensor(position, dtype=torch.float64)
         azimuth, depression = torch.atan2(normal[1], normal[0]), torch.atan2(-normal[2], normal[:2].norm())
         angles = [azimuth.item(), math.pi / 2 + depression.item(), math.radians(turn)]
         return Pose.from_xyzw(position, Rotation.from_euler("ZYZ", angles).as_quat())
 
-    def is_free(self, points: Float[Tensor, "k 3"]) -> Bool[Tensor, "k"]:
-        """Whether points [m] lie inside, with the margins from walls and furniture."""
+    def is_free(self, points: Float[Tensor, "k 3"]) -> Bool[Tensor, " k"]:
+        """True for points [m] inside, with the margins from walls and furniture."""
         share = points[:, 2:] / self.height
         outline = torch.lerp(points.new_tensor(self.floor), points.new_tensor(self.ceiling), share[..., None])
         start, end = outline, outline.roll(-1, 1)  # of each wall, at the height of each point
@@ -163,7 +160,7 @@ class Room:
 
 
 def _compact(mesh: Mesh) -> Mesh:
-    """The same without corners that no face has."""
+    """The mesh without corners that no face has."""
     used = sorted({corner for face in mesh.faces for corner in face})
     faces = tuple(tuple(used.index(corner) for corner in face) for face in mesh.faces)
     return Mesh(mesh.name, mesh.material, tuple(mesh.vertices[k] for k in used), faces)

@@ -1,6 +1,6 @@
 """The rooms that are simulated: an L, one with a leaning wall, one full of furniture."""
 
-from gaigs.data.sionna.meshes import Cuboid, Room
+from gaigs.data.sionna.meshes import Cuboid, MeshRoom
 
 
 def _table(name: str, x: float, y: float, length: float, width: float) -> tuple[Cuboid, ...]:
@@ -38,7 +38,7 @@ def _shelves(name: str, lower: tuple[float, float], upper: tuple[float, float], 
     return tuple(parts)
 
 
-L_SHAPE = Room(
+L_SHAPE = MeshRoom(
     floor=((0, 0), (8, 0), (8, 3.4), (3.8, 3.4), (3.8, 6.6), (0, 6.6)),
     ceiling=((0, 0), (8, 0), (8, 3.4), (3.8, 3.4), (3.8, 6.6), (0, 6.6)),
     height=2.8,
@@ -59,9 +59,9 @@ L_SHAPE = Room(
         ("west", (0.1, 2.6, 1.8)),
     ),
 )
-"""An L of 8 x 6.6 m: one arm is heard around the corner alone."""
+"""An L of 8 x 6.6 m: waves from one arm arrive around the corner alone."""
 
-SLANTED = Room(
+SLANTED = MeshRoom(
     floor=((0, 0), (6.8, 0), (6.0, 5.2), (0, 5.2)),
     ceiling=((0, 0), (5.2, 0), (4.4, 5.2), (0, 5.2)),
     height=2.9,
@@ -85,7 +85,7 @@ SLANTED = Room(
 )
 """A room under a roof of 6.8 x 5.2 m: its east wall leans inwards by 29 degrees and is oblique in plan by 9."""
 
-FURNISHED = Room(
+FURNISHED = MeshRoom(
     floor=((0, 0), (7.6, 0), (7.6, 5.6), (0, 5.6)),
     ceiling=((0, 0), (7.6, 0), (7.6, 5.6), (0, 5.6)),
     height=2.7,
@@ -125,6 +125,6 @@ FURNISHED = Room(
         ("north", (3.7, 5.5, 2.0)),
     ),
 )
-"""A flat of one room, 7.6 x 5.6 m, with 22 pieces of furniture: much is heard through something."""
+"""A flat of one room, 7.6 x 5.6 m, with 22 pieces of furniture that block many paths."""
 
 ROOMS = {"l_shape": L_SHAPE, "slanted": SLANTED, "furnished": FURNISHED}

@@ -1,4 +1,4 @@
-"""Paths in a room of meshes by the ray tracer Sionna RT, on the processor, and what an array receives along them."""
+"""Paths in a room of meshes by the ray tracer Sionna RT, on the processor, and the fields of an array along them."""
 
 import math
 import os
@@ -14,16 +14,17 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
+from gaigs.antenna import Receiver
+from gaigs.data.simulation import sample_band
 from gaigs.data.sionna.meshes import THICKNESS, Mesh
 from gaigs.data.synthetic.image_source import MATERIALS, Paths
 from gaigs.propagation import free_space
-from gaigs.scene import Receiver
 
 DEPTH = 3
 """Largest number of reflections, passages through surfaces and diffractions of a path; a wardrobe is two passages."""
 
 CHUNK = 10
-"""Transmitters traced at a time. Chains of surfaces to all of them share a table in which some are lost to others."""
+"""Transmitters traced at a time. Chains of surfaces to all of them share a table, in which some displace others."""
 
 RAYS, CANDIDATES = 500_000, 1_000_000
 """Rays shot from a receiver for each chunk, and chains tried, which is the size of that table too. For 50 transmitters
@@ -31,15 +32,6 @@ with 4,000 chains, 80 to each, 1 to 6 dB of the power would be missing at one pl
 
 WEAKEST = 1e-4
 """Share of a transmitter's power that its weakest paths may have together to be left out, two in three of them."""
-
-PART = 16
-"""Transmitters whose waves are added up at a time."""
-
-OLDEST_LLVM = 17
-"""With 15 and 16 the process aborts at the first kernel."""
-
-FREQUENCIES = 0.3e9, 40e9
-"""Range of carriers [Hz]: below, furniture is no larger than the wavelength; above, materials are not tabulated."""
 
 
 def find_packages() -> dict[str, str]:
@@ -55,30 +47,31 @@ def find_packages() -> dict[str, str]:
 
 
 def find_llvm() -> str:
-    """The file of libLLVM that is to compile the ray tracer's kernels: that of DRJIT_LIBLLVM_PATH, else the newest.
+    """The file of libLLVM to compile the ray tracer's kernels: that of DRJIT_LIBLLVM_PATH, else the newest.
 
     Raises:
-        RuntimeError: There is none, or none that is new enough.
+        RuntimeError: There is no libLLVM, or no new one.
     """
+    oldest = 17  # with 15 and 16 the process aborts at the first kernel
     chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
     folders = f"{sys.prefix}/lib", "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib/llvm-*/lib", "/usr/local/lib"
     names = "libLLVM.so*", "libLLVM-[0-9]*.so*", "libLLVM.dylib"
     files = [chosen] if chosen else [file for folder in folders for name in names for file in glob(f"{folder}/{name}")]
     versions = {file: llvm_version(file) for file in dict.fromkeys(map(os.path.realpath, files))}
     newest = max(versions, key=versions.get, default=None)
-    if newest is None or versions[newest] < OLDEST_LLVM:
+    if newest is None or versions[newest] < oldest:
         found = ", ".join(f"{file} ({version or 'no libLLVM of 16 or later'})" for file, version in versions.items())
         raise RuntimeError(
-            f"the ray tracer needs libLLVM {OLDEST_LLVM} or later, got {found or 'none'}; install it (Debian: apt-get "
+            f"the ray tracer needs libLLVM {oldest} or later, got {found or 'none'}; install it (Debian: apt-get "
             "install libllvm19), or set DRJIT_LIBLLVM_PATH to its file"
         )
     return newest
 
 
 def llvm_version(file: str) -> int:
-    """Major version of a libLLVM; 0 where it has none to tell, as before 16, or cannot be loaded.
+    """Major version of a libLLVM; 0 if it is older than 16 or cannot be loaded.
 
-    Another process loads it, because one that is too old must not come into this one.
+    Another process loads it, because an old one would make this process abort.
     """
     code = (
         "import ctypes, sys; number = ctypes.c_uint(); "
@@ -93,20 +86,19 @@ def trace(
 ) -> Paths:
     """The paths from transmitters to a receiver point, by shooting and bouncing rays and the image method.
 
-    By reciprocity the rays leave the receiver, of which there is one. Both ends have an antenna that is alike in all
-    directions and vertically polarised: its field runs along the meridians about the vertical. A path that is reflected
-    and passes through surfaces comes as if straight from an image of the transmitter, which lies at the path's length
-    in the direction in which it is heard. Of a diffracted path length and direction are true at the receiver point, and
-    its wave is more curved than that of its image.
+    By reciprocity the rays leave the single receiver. Both ends have an isotropic, vertically polarised antenna: its
+    field runs along the meridians about the vertical. A path that is reflected and passes through surfaces equals a
+    straight one from an image of the transmitter, at the path's length in the direction of arrival. Length and
+    direction of a diffracted path are exact at the receiver point, and its wave is more curved than that of its image.
 
     Args:
-        meshes: What stands there.
+        meshes: Surfaces of the room.
         receiver: Position [m].
         transmitters: Positions [m].
-        frequency: Of the carrier [Hz].
+        frequency: Carrier [Hz].
 
     Returns:
-        Paths by falling strength; where a transmitter has fewer than another its last gains are 0.
+        Paths by falling strength; gains are padded with 0.
 
     Raises:
         ImportError: Sionna RT is not installed.
@@ -157,18 +149,19 @@ def find_sionna():
 
 
 def make_scene(meshes: Sequence[Mesh], frequency: float):
-    """A scene of Sionna RT, on the processor, between antennas that are alike in all directions and vertically
-    polarised. The object of mesh k is called ``mesh <k>``.
+    """A scene of Sionna RT, on the processor, with isotropic, vertically polarised antennas.
+
+    The object of mesh k is called ``mesh <k>``.
 
     Args:
-        meshes: What stands there.
-        frequency: Of the carrier [Hz].
+        meshes: Surfaces of the room.
+        frequency: Carrier [Hz].
 
     Raises:
         ImportError, RuntimeError: As for ``find_sionna``.
         ValueError: The frequency is out of range.
     """
-    low, high = FREQUENCIES
+    low, high = 0.3e9, 40e9  # below, furniture is no larger than the wavelength; above, materials are not tabulated
     if not low <= frequency <= high:
         raise ValueError(f"frequency must lie in {low:g}..{high:g} Hz, got {frequency:.6g}")
     rt = find_sionna()
@@ -180,7 +173,7 @@ def make_scene(meshes: Sequence[Mesh], frequency: float):
 
 
 def _furnish(scene, meshes: Sequence[Mesh], frequency: float) -> None:
-    """Adds meshes to a scene, their materials by numbers: Sionna's own table of them refuses what lies below 1 GHz."""
+    """Adds meshes to a scene, with numbers for materials: Sionna's own table refuses frequencies below 1 GHz."""
     import mitsuba
     from sionna import rt
 
@@ -216,15 +209,15 @@ def _strongest(paths, receiver: np.ndarray, wavelength: float) -> list[tuple[np.
         order = np.argsort(-np.abs(field), kind="stable")
         power = np.abs(field[order]) ** 2
         order = order[np.cumsum(power[::-1])[::-1] > WEAKEST * power.sum()]
-        # What remains without the spreading of free space, wavelength / (4 pi length), is the path's gain.
+        # The path's gain has no spreading of free space, wavelength / (4 pi length).
         found.append((images[k, order], field[order] * 4 * math.pi * lengths[k, order] / wavelength))
     return found
 
 
 def respond(
-    paths: Paths, receiver: Receiver, frequency: float, offsets: Float[Tensor, "f"]
+    paths: Paths, receiver: Receiver, frequency: float, offsets: Float[Tensor, " f"]
 ) -> Complex[Tensor, "b elements f"]:
-    """What each element of a receiver's array receives along paths from unit-power transmitters.
+    """Field at each element of a receiver's array along paths from unit-power transmitters.
 
     The phase is that of a spherical wave from each image to each element; gains are those at the carrier, and so are
     the elements' pattern at the array's centre.
@@ -232,7 +225,7 @@ def respond(
     Args:
         paths: To the array's centre, at the carrier.
         receiver: Pose and array.
-        frequency: Of the carrier [Hz].
+        frequency: Carrier [Hz].
         offsets: Frequencies to evaluate, relative to the carrier [Hz].
 
     Raises:
@@ -243,8 +236,8 @@ def respond(
         raise ValueError(f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth")
     position, rotation = receiver.pose.position.double(), receiver.pose.rotation.double()
     found = []
-    # In parts, because the waves of all paths at all elements and frequencies are many times what they add up to.
-    for images, gains in zip(paths.images.split(PART), paths.gains.split(PART), strict=True):
+    # 16 transmitters at a time, because the waves of all paths take many times the memory of their sums.
+    for images, gains in zip(paths.images.split(16), paths.gains.split(16), strict=True):
         local = (images - position) @ rotation
         gains = gains * receiver.array.gain(local / local.norm(dim=-1, keepdim=True))
         distances = (local[:, :, None] - receiver.array.elements.double()).norm(dim=-1)
@@ -252,19 +245,11 @@ def respond(
     return torch.cat(found)
 
 
-def frequency_offsets(meshes: Sequence[Mesh], bandwidth: float) -> Float[Tensor, "f"]:
-    """Frequencies that sample a band, relative to its middle [Hz]; so dense that no two paths' beat is aliased.
-
-    Args:
-        meshes: What stands there.
-        bandwidth: Of the band [Hz].
+def frequency_offsets(meshes: Sequence[Mesh], bandwidth: float) -> Float[Tensor, " f"]:
+    """Frequencies that sample a band, relative to its middle [Hz]; dense enough to alias no beat of two paths.
 
     Raises:
         ValueError: The bandwidth is not positive.
     """
-    if not 0 < bandwidth < math.inf:
-        raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
     corners = torch.tensor([corner for mesh in meshes for corner in mesh.vertices], dtype=torch.float64)
-    longest = (DEPTH + 1) * (corners.amax(0) - corners.amin(0)).norm().item()
-    count = math.ceil(bandwidth * longest / speed_of_light) + 1
-    return torch.linspace(-bandwidth / 2, bandwidth / 2, count, dtype=torch.float64)
+    return sample_band(bandwidth, (DEPTH + 1) * (corners.amax(0) - corners.amin(0)).norm().item())

@@ -2,23 +2,25 @@
 
 import itertools
 from collections.abc import Sequence
-from functools import partial
 
 import torch
-from jaxtyping import Float, Int
-from scipy.constants import speed_of_light
+from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.data import Links, Parts
-from gaigs.data.nerf2_spectrum import NORMALISATION
+from gaigs.antenna import Receiver
+from gaigs.data import Links
+from gaigs.data.readings import gateway
+from gaigs.data.simulation import (
+    PART,
+    SimulatedRoom,
+    check_spectrum,
+    draw_places,
+    simulate_spectra,
+    to_spectra,
+)
 from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond
-from gaigs.directions import Grid
-from gaigs.geometry import Pose
-from gaigs.propagation import bartlett, min_max
-from gaigs.query import Query, check_carrier
-from gaigs.registry import check_type, register
-from gaigs.scene import Array, Receiver
-from gaigs.task.spectrum import Spectrum
+from gaigs.geometry import Grid, Pose
+from gaigs.registry import register
 
 ROOM = Room(
     size=(7.0, 5.0, 3.0),
@@ -36,10 +38,15 @@ ROOM = Room(
 """The default room; its corner is the world's origin, z points up."""
 
 POSE = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.15403, 0.87354, 0.23087, 0.39989))
-"""Of the receiver: high in the corner at the origin, facing down into the room, and turned about its normal."""
+"""Pose of the array: high in the corner at the origin, facing down into the room, and turned about its normal."""
 
-SIDE = 4
-"""Elements along each side of its square array, as in the NeRF² spectra."""
+GATEWAYS = {
+    "west": (0.1, 2.6, 2.4),
+    "south": (1.7, 0.1, 1.2),  # the partition stands between it and most of the room
+    "east": (6.9, 1.4, 1.6),
+    "north": (2.4, 4.9, 2.0),
+}
+"""Positions by the wall that the gateway hangs on, world frame [m]."""
 
 REGION = (0.3, 0.3, 0.3), (6.7, 4.7, 2.0)
 """Corners of the box in which transmitters stand [m]."""
@@ -60,11 +67,11 @@ def furnished_room(
 
     Args:
         spectrum: ``band`` or ``carrier``, see ``spectra``.
-        transmitters: How many places.
-        frequency: Of the carrier, or of several [Hz]. The array is that of the highest, see ``patch_array``.
-        bandwidth: Of the band around each carrier [Hz].
+        transmitters: Number of places.
+        frequency: One carrier or several [Hz]. The elements are half a wavelength of the highest apart.
+        bandwidth: Width of the band around each carrier [Hz].
         order: Largest number of reflections of a path.
-        seed: Of the transmitters' places.
+        seed: Seed of the places.
 
     Raises:
         TypeError: A frequency is no number.
@@ -72,61 +79,28 @@ def furnished_room(
 
     Source: the defaults for frequency and bandwidth are those of channel 5 of IEEE 802.15.4 (ultra-wideband).
     """
-    carriers = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
-    for carrier in carriers:
-        check_type("frequency", carrier, float)
-        check_carrier("frequency", carrier)
-    if not carriers or len(set(carriers)) < len(carriers):
-        raise ValueError(f"frequency must be a carrier or several different ones [Hz], got {frequency}")
-    positions = place(transmitters, seed)
-    receiver = patch_array(max(carriers))
-    grid = Grid.degrees()
-    labels = [spectra(ROOM, positions, receiver, grid, spectrum, carrier, bandwidth, order) for carrier in carriers]
-    rows = torch.arange(transmitters).repeat_interleave(len(carriers))
-    frequencies = torch.tensor(carriers, dtype=torch.float32).repeat(transmitters)
-    return Links(
-        query=Query(positions[rows], torch.zeros_like(rows), frequencies),
-        receivers=(receiver,),
-        labels=torch.stack(labels, 1).flatten(0, 1),
-        task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
-        rows=rows,
-        official=partial(last_fifth, transmitters, rows),
-        bandwidth=bandwidth if spectrum == "band" else 0.0,
+    return simulate_spectra(default_room(order), spectrum, transmitters, frequency, bandwidth, seed)
+
+
+def default_room(order: int) -> SimulatedRoom:
+    """The default room with paths of at most ``order`` reflections."""
+    return SimulatedRoom(
+        pose=POSE,
+        gateways=tuple(gateway(name, position) for name, position in GATEWAYS.items()),
         edges=edges(ROOM),
+        place=place,
+        frequency_offsets=lambda bandwidth: frequency_offsets(ROOM, bandwidth, order),
+        respond=lambda places, *rest: (respond(ROOM, part, *rest, order) for part in places.split(PART)),
     )
 
 
-def patch_array(frequency: float) -> Receiver:
-    """The default room's receiver: a square array of patches, half a wavelength of the frequency [Hz] apart.
-
-    Raises:
-        ValueError: The frequency is out of range.
-    """
-    check_carrier("frequency", frequency)
-    return Receiver("gateway1", POSE, Array.planar(SIDE, SIDE, speed_of_light / frequency / 2, "cosine"))
-
-
-def last_fifth(transmitters: int, rows: Int[Tensor, "n"]) -> Parts:
-    """The official parts of links from so many transmitters, given that of each: the last fifth of them tests."""
-    training = transmitters - max(1, round(transmitters / 5))
-    return (rows < training).nonzero()[:, 0], (rows >= training).nonzero()[:, 0]
-
-
 def place(count: int, seed: int) -> Float[Tensor, "count 3"]:
-    """Random places in the default room [m], uniform over what the furniture leaves free of ``REGION``.
+    """Random places in the default room [m], uniform over the part of ``REGION`` that is free of furniture.
 
     Raises:
         ValueError: There are fewer than 2.
     """
-    if count < 2:
-        raise ValueError(f"transmitters must be at least 2, one to train and one to test on, got {count}")
-    lower, upper = torch.tensor(REGION)
-    generator = torch.Generator().manual_seed(seed)
-    positions = torch.zeros(0, 3)
-    while len(positions) < count:
-        tries = lower + (upper - lower) * torch.rand(count, 3, generator=generator)
-        positions = torch.cat((positions, tries[is_free(ROOM, tries)]))
-    return positions[:count]
+    return draw_places(*torch.tensor(REGION), lambda points: is_free(ROOM, points), count, seed)
 
 
 def spectra(
@@ -149,25 +123,17 @@ def spectra(
         spectrum: ``band``: power averaged over the band, as a channel sounder reports it; paths whose lengths differ by
             more than speed of light / bandwidth do not interfere, so lobes follow the room's geometry. ``carrier``: one
             frequency, with all of the small-scale fading.
-        frequency: Of the carrier [Hz].
-        bandwidth: Of the band around the carrier [Hz].
+        frequency: Carrier [Hz].
+        bandwidth: Width of the band around the carrier [Hz].
         order: Largest number of reflections of a path.
 
     Raises:
         ValueError: An option is out of range, or a transmitter does not stand free in the room.
     """
-    if spectrum not in ("band", "carrier"):
-        raise ValueError(f"spectrum must be 'band' or 'carrier', got {spectrum!r}")
+    check_spectrum(spectrum)
     offsets = frequency_offsets(room, bandwidth, order) if spectrum == "band" else torch.zeros(1)
-    # In parts, because the float64 spectra of all transmitters would need several times the memory of the labels.
-    return torch.cat(
-        [
-            min_max(
-                bartlett(respond(room, part, receiver, frequency, offsets, order), grid, receiver.array, frequency)
-            ).float()
-            for part in transmitters.split(64)
-        ]
-    )
+    responses = (respond(room, part, receiver, frequency, offsets, order) for part in transmitters.split(PART))
+    return to_spectra(responses, grid, receiver.array, frequency)
 
 
 def edges(room: Room) -> Float[Tensor, "k 2 3"]:

@@ -1,6 +1,6 @@
-"""The image-source method in a furnished box room: paths, responses of antenna arrays, spectra and signal strength.
+"""The image-source method in a furnished box room: paths and responses of antenna arrays, in float64.
 
-Everything is computed in float64. The formulas and what they leave out stand in docs/data.md.
+docs/data.md has the formulas and their limits.
 """
 
 import itertools
@@ -12,8 +12,9 @@ from jaxtyping import Complex, Float, Int
 from scipy.constants import epsilon_0, speed_of_light
 from torch import Tensor
 
+from gaigs.antenna import Receiver
+from gaigs.data.simulation import sample_band
 from gaigs.propagation import fresnel
-from gaigs.scene import Receiver
 
 MATERIALS = {
     "concrete": (5.24, 0.0462, 0.7822),
@@ -32,7 +33,7 @@ class Box:
     """A piece of furniture: a cuboid along the room's axes that dims every wave passing through it.
 
     Attributes:
-        name: What it is.
+        name: Kind of furniture.
         lower, upper: Opposite corners, world frame [m].
         loss_db: Penetration loss of one passage, however short [dB].
     """
@@ -50,7 +51,7 @@ class Room:
     Attributes:
         size: Extent along x, y and z [m].
         walls: Materials of the walls at x = 0, x = size, y = 0, y = size, of the floor and of the ceiling.
-        furniture: What stands in the room.
+        furniture: Cuboids in the room.
     """
 
     size: tuple[float, float, float]
@@ -75,7 +76,7 @@ def permittivity(material: str, frequency: float) -> complex:
 
 
 def cells(order: int) -> Int[Tensor, "p 3"]:
-    """Copies of the room, mirrored at its walls, that a path of at most ``order`` reflections ends in; the room first.
+    """Mirrored copies of the room at the ends of paths with at most ``order`` reflections; the room itself is first.
 
     Cell (i, j, k) lies i rooms along x, j along y and k along z; |i| + |j| + |k| is the number of reflections.
     """
@@ -85,7 +86,7 @@ def cells(order: int) -> Int[Tensor, "p 3"]:
 
 
 def mirror(points: Float[Tensor, "*batch 3"], cell: Int[Tensor, "*batch 3"], size: Float[Tensor, "3"]) -> Tensor:
-    """Where points of the room [m] lie in a mirrored copy of it."""
+    """Positions of the room's points [m] in a mirrored copy of it."""
     return cell * size + torch.where(cell % 2 == 0, points, size - points)
 
 
@@ -95,10 +96,10 @@ def passes(
     lower: Float[Tensor, "*batch 3"],
     upper: Float[Tensor, "*batch 3"],
 ) -> Tensor:
-    """Whether the segments from ``start`` to ``end`` pass through the inside of cuboids along the axes; exact.
+    """True for segments from ``start`` to ``end`` that pass through the inside of cuboids along the axes; exact.
 
     A segment meets each pair of faces' planes at two fractions of its length; it is inside between the last entry and
-    the first exit. One that only runs in a face has 0 / 0 there, hence NaN, and does not pass.
+    the first exit. A segment within a face has 0 / 0 there, hence NaN, and does not pass.
     """
     ray = end - start
     first, second = (lower - start) / ray, (upper - start) / ray
@@ -132,7 +133,7 @@ def trace(
         room: Walls and furniture.
         transmitters: Positions [m].
         receiver: Position [m].
-        frequency: At which the walls reflect [Hz].
+        frequency: Frequency of the reflections [Hz].
         order: Largest number of reflections.
 
     Raises:
@@ -181,24 +182,20 @@ def check_free(room: Room, points: Float[Tensor, "k 3"]) -> None:
 
 
 def is_free(room: Room, points: Float[Tensor, "*batch 3"]) -> Tensor:
-    """Whether points lie inside the room and outside its furniture."""
+    """True for points inside the room and outside its furniture."""
     free = ((points > 0) & (points < points.new_tensor(room.size))).all(-1)
     for box in room.furniture:
         free &= ~((points >= points.new_tensor(box.lower)) & (points <= points.new_tensor(box.upper))).all(-1)
     return free
 
 
-def frequency_offsets(room: Room, bandwidth: float, order: int) -> Float[Tensor, "f"]:
-    """Frequencies that sample a band, relative to its middle [Hz]; so dense that no two paths' beat is aliased.
+def frequency_offsets(room: Room, bandwidth: float, order: int) -> Float[Tensor, " f"]:
+    """Frequencies that sample a band, relative to its middle [Hz]; dense enough to alias no beat of two paths.
 
     Raises:
         ValueError: The bandwidth is not positive.
     """
-    if not 0 < bandwidth < math.inf:
-        raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}; one frequency is the spectrum 'carrier'")
-    longest = (order + 1) * math.hypot(*room.size)
-    count = math.ceil(bandwidth * longest / speed_of_light) + 1
-    return torch.linspace(-bandwidth / 2, bandwidth / 2, count, dtype=torch.float64)
+    return sample_band(bandwidth, (order + 1) * math.hypot(*room.size))
 
 
 def respond(
@@ -206,10 +203,10 @@ def respond(
     transmitters: Float[Tensor, "b 3"],
     receiver: Receiver,
     frequency: float,
-    offsets: Float[Tensor, "f"],
+    offsets: Float[Tensor, " f"],
     order: int,
 ) -> Complex[Tensor, "b elements f"]:
-    """What each element of a receiver's array receives from a unit-power isotropic transmitter.
+    """Field at each element of a receiver's array from a unit-power isotropic transmitter.
 
     The phase is that of a spherical wave from each image to each element; reflection, penetration and the elements'
     pattern are those at the array's centre.
@@ -218,7 +215,7 @@ def respond(
         room: Walls and furniture.
         transmitters: Positions [m].
         receiver: Pose and array.
-        frequency: Of the carrier [Hz].
+        frequency: Carrier [Hz].
         offsets: Frequencies to evaluate, relative to the carrier [Hz].
         order: Largest number of reflections.
 
@@ -240,8 +237,3 @@ def respond(
     # Friis: wavelength / (4 pi distance), which is 1 / (2 phase).
     waves = torch.polar(0.5 / phases, -phases)
     return torch.einsum("bp,bpnf->bnf", paths.gains * array.gain(directions), waves)
-
-
-def rss_dbm(responses: Complex[Tensor, "b elements f"], tx_power_dbm: float = 0.0) -> Float[Tensor, "b"]:
-    """Received signal strength [dBm]: power averaged over elements and frequencies."""
-    return tx_power_dbm + 10 * torch.log10(responses.abs().square().mean((1, 2)))

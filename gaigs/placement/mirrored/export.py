@@ -12,70 +12,52 @@ from numpy import ndarray
 from gaigs.data import Links
 from gaigs.gaussians import write_ply
 from gaigs.io.files import write_text
-from gaigs.placement.mirrored import Mirrored
+from gaigs.placement.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
+from gaigs.placement.mirrored.paths import Mirrored
 from gaigs.placement.mirrored.reflections import fold, images
 from gaigs.propagation import fresnel
 from gaigs.query import Query
-from gaigs.report import shapes
 from gaigs.scene import Scene
 
 NEPER = 20 / math.log(10)
-"""Of a field [dB]."""
-
-LOOKED_AT = 256
-"""Most links that shares of power are means over."""
-
-AT_ONCE = 64
-"""Links worked on at a time."""
+"""One neper of a field [dB]."""
 
 SEEN = 0.01
-"""Share of a link's power from which on a bounce says how far the room reaches."""
-
-BEYOND = 0.1
-"""By how much the room's box is longer at each end than what it holds, in diagonals: planes meet within it."""
+"""Share of a link's power from which a bounce tells how far the room reaches."""
 
 TOLERANCE = 0.02
-"""By how much places may lie behind a wall, in diagonals: places and walls are known to some centimetres."""
-
-EDGE = 2.0
-"""Where a plane's window ends, in its standard deviations: there it reflects 17 dB less than in its middle."""
-
-ALIKE = 0.9
-"""Cosine from which on two planes face the same way, such as a wall and one behind it, and do not cut each other."""
-
-PATHS, FAINTEST_DB = 20, 30.0
-"""Most paths of a transmitter that are drawn, and how far below the strongest [dB]."""
+"""Distance that places may lie behind a wall [diagonals]: places and walls are known to some centimetres."""
 
 
 class Planes(NamedTuple):
     """All learnt planes; float64.
 
     Attributes:
-        normals: Of unit length, out of the room.
-        offsets: Along them, from the world's origin [m].
-        losses: Of a reflection at normal incidence, where the plane reflects best [dB].
-        middles: Where that is [m].
+        normals: Unit normals, out of the room.
+        offsets: Offsets along them, from the world's origin [m].
+        losses: Loss of a reflection at normal incidence, in the plane's middle [dB].
+        middles: Points where the planes reflect best [m].
         extents: Standard deviations of their windows along the world's axes [m].
     """
 
     normals: Float[ndarray, "w 3"]
-    offsets: Float[ndarray, "w"]
-    losses: Float[ndarray, "w"]
+    offsets: Float[ndarray, " w"]
+    losses: Float[ndarray, " w"]
     middles: Float[ndarray, "w 3"]
     extents: Float[ndarray, "w 3"]
 
 
 class Survey(NamedTuple):
-    """What the kept paths of some links carry, and where they run.
+    """Powers and courses of the kept paths of some links.
 
     Attributes:
-        words: Of the kept paths.
-        powers: Received by each, free space included; 0 where there is no path.
-        bounces: At the planes of each word; NaN where it has none [m].
-        transmitters, receivers: Where the links begin and end [m].
+        sequences: Planes of each kept path.
+        powers: Received powers, free space included; 0 where there is no path.
+        bounces: Points on the planes of each sequence; NaN in place of a plane [m].
+        transmitters, receivers: Ends of the links [m].
     """
 
-    words: Int[ndarray, "n order"]
+    sequences: Int[ndarray, "n order"]
     powers: Float[ndarray, "b n"]
     bounces: Float[ndarray, "b n order 3"]
     transmitters: Float[ndarray, "b 3"]
@@ -83,7 +65,7 @@ class Survey(NamedTuple):
 
     @property
     def shares(self) -> Float[ndarray, "b n"]:
-        """Of each link's power; 0 where it hears nothing."""
+        """Share of each path in its link's power; 0 for a link without power."""
         total = self.powers.sum(1, keepdims=True)
         return self.powers / np.where(total > 0, total, 1)
 
@@ -94,15 +76,15 @@ class Survey(NamedTuple):
 
 
 def some(query: Query) -> Query:
-    """At most ``LOOKED_AT`` of the links, evenly spread."""
+    """At most 256 of the links, evenly spread."""
     count = len(query)
-    return query[torch.linspace(0, count - 1, min(LOOKED_AT, count)).long()]
+    return query[torch.linspace(0, count - 1, min(256, count)).long()]
 
 
 def all_over(scene: Scene) -> Query:
     """Links evenly spread over the training transmitters' box, the receivers and the carriers."""
-    number = torch.arange(LOOKED_AT)
-    shares = torch.quasirandom.SobolEngine(3).draw(LOOKED_AT).to(scene.lower)
+    number = torch.arange(256)
+    shares = torch.quasirandom.SobolEngine(3).draw(len(number)).to(scene.lower)
     known = scene.frequencies
     return Query(
         scene.lower + (scene.upper - scene.lower) * shares,
@@ -113,25 +95,22 @@ def all_over(scene: Scene) -> Query:
 
 @torch.no_grad()
 def survey(placement: Mirrored, query: Query) -> Survey:
-    """Follows the kept paths of some links.
-
-    Powers are those of the mirrored Gaussians as they are placed, before a deformation or a rasterizer changes them.
-    """
-    device = placement.words.device
-    words, normals, offsets = placement.words[placement.kept], placement.normals, placement.offsets
+    """Powers and courses of the kept paths of some links, before a deformation or a rasterizer changes them."""
+    device = placement.sequences.device
+    sequences, normals, offsets = placement.sequences[placement.kept], placement.normals, placement.offsets
     positions = placement.scene.positions(normals)
     powers, bounces, receivers = [], [], []
-    for part in query.parts(AT_ONCE):
+    for part in query.parts(64):  # links at a time
         part = part.to(device)
         powers.append(placement(None, part).gains.abs().square())
         receivers.append(positions[part.receivers])
-        seen = images(part.transmitters, words, normals, offsets)
-        folded = fold(seen, receivers[-1], words, normals, offsets)
-        points = normals.new_full((len(part), *words.shape, 3), torch.nan)
+        seen = images(part.transmitters, sequences, normals, offsets)
+        folded = fold(seen, receivers[-1], sequences, normals, offsets)
+        points = normals.new_full((len(part), *sequences.shape, 3), torch.nan)
         for back, met in enumerate(folded.bounces, 1):
             points[:, met.first :, -back] = met.points
         bounces.append(points)
-    parts = words, torch.cat(powers).double(), torch.cat(bounces), query.transmitters, torch.cat(receivers)
+    parts = sequences, torch.cat(powers).double(), torch.cat(bounces), query.transmitters, torch.cat(receivers)
     return Survey(*(part.cpu().numpy() for part in parts))
 
 
@@ -139,16 +118,16 @@ def survey(placement: Mirrored, query: Query) -> Survey:
 
 
 def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
-    """What ``metrics.json`` says of the room.
+    """Tables of planes and paths for ``metrics.json``.
 
     Args:
-        placement: Its planes and paths.
+        placement: The planes and paths.
         query: Links over which shares of the received power are means.
 
     Returns:
         ``planes``, the strongest first: number, unit normal out of the room, offset along it from the world's origin
-        [m], loss of a reflection at normal incidence [dB], share of the power that comes by way of it, and how many
-        kept paths do. And ``paths``, by their number of bounces: how many are kept, and their share.
+        [m], loss of a reflection at normal incidence [dB], and share of the power and number of the kept paths by way
+        of it. ``paths``, by their number of bounces: number kept, and share.
     """
     found = survey(placement, query)
     all_planes = _planes(placement, found)
@@ -160,11 +139,11 @@ def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
             "offset_m": round(all_planes.offsets[number].item(), 4),
             "loss_db": round(all_planes.losses[number].item(), 2),
             "share": round(shares[number], 5),
-            "paths": int((found.words == number).any(1).sum()),
+            "paths": int((found.sequences == number).any(1).sum()),
         }
         for number in shares
     ]
-    counts = (found.words >= 0).sum(1)
+    counts = (found.sequences >= 0).sum(1)
     means = found.shares.mean(0)
     paths = [
         {
@@ -172,7 +151,7 @@ def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
             "kept": int((counts == bounces).sum()),
             "share": round(means[counts == bounces].sum().item(), 5),
         }
-        for bounces in range(found.words.shape[1] + 1)
+        for bounces in range(found.sequences.shape[1] + 1)
     ]
     return {"planes": planes, "paths": paths}
 
@@ -184,7 +163,7 @@ def _planes(placement: Mirrored, found: Survey) -> Planes:
     gains = reflected.abs().log() + placement.plane_gains
     parts = placement.normals, placement.offsets, gains, placement.middles, placement.log_extents.exp()
     normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
-    # A window's middle need not lie on its plane: where it is widest there, and what it takes even there [Np].
+    # A window's middle need not lie on its plane: the point of the plane with the least loss, and that loss [Np].
     steep = extents**2 * normals
     spread = (steep * normals).sum(1)
     apart = offsets - (normals * middles).sum(1)
@@ -196,23 +175,23 @@ def _planes(placement: Mirrored, found: Survey) -> Planes:
 
 
 def _plane_shares(found: Survey) -> dict[int, float]:
-    """Share of the power by way of each plane that a path uses, the largest first."""
+    """Share of the power by way of each used plane, the largest first."""
     means = found.shares.mean(0)
-    numbers = np.unique(found.words[found.words >= 0]).tolist()
-    shares = {number: means[(found.words == number).any(1)].sum().item() for number in numbers}
+    numbers = np.unique(found.sequences[found.sequences >= 0]).tolist()
+    shares = {number: means[(found.sequences == number).any(1)].sum().item() for number in numbers}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
 # --- shapes ---
 
 
-def outlines(placement: Mirrored, found: Survey) -> list[shapes.Plane]:
+def outlines(placement: Mirrored, found: Survey) -> list[LearntPlane]:
     """The planes as convex polygons, the strongest first.
 
-    A wall has all transmitters and receivers on one side. It reaches to the other walls, to where it no longer
-    reflects, or to the box around what was surveyed, whichever is nearest. A plane that cuts through the room, as
-    furniture does, is the rectangle in which paths bounce off it, as far as walls and box allow. One that no path
-    meets, or that lies far off and carries next to nothing, is left out.
+    A wall has all transmitters and receivers on one side. It reaches to the other walls, to the edge of its window, or
+    to the box around the surveyed points, whichever is nearest. A plane that cuts through the room, as furniture does,
+    is the rectangle in which paths bounce off it, within walls and box. Planes that no path meets, or that lie outside
+    the box, are left out.
     """
     normals, offsets, _, middles, extents = _planes(placement, found)
     shares = _plane_shares(found)
@@ -221,21 +200,23 @@ def outlines(placement: Mirrored, found: Survey) -> list[shapes.Plane]:
     seen = seen[~np.isnan(seen).any(1)]
     lower, upper = seen.min(0), seen.max(0)
     diagonal = np.linalg.norm(upper - lower)
-    box = _sides(lower - BEYOND * diagonal, upper + BEYOND * diagonal)
+    box = _sides(lower - 0.1 * diagonal, upper + 0.1 * diagonal)  # so large that planes meet within it
     walls = [k for k in shares if (found.ends @ normals[k] - offsets[k] <= TOLERANCE * diagonal).all()]
     drawn = []
     for number, share in shares.items():
         normal, offset = normals[number], offsets[number]
-        link, path, step = np.nonzero((found.words == number) & (weights > 0)[..., None])
+        link, path, step = np.nonzero((found.sequences == number) & (weights > 0)[..., None])
         if not len(link):
             continue
         basis = _basis(normal)
-        sides = box + [(normals[k], offsets[k]) for k in walls if k != number and normals[k] @ normal < ALIKE]
+        # Walls that face the same way, such as one behind another, do not cut each other.
+        sides = box + [(normals[k], offsets[k]) for k in walls if k != number and normals[k] @ normal < 0.9]
         if number in walls:
             middle = (lower + upper) / 2
             middle = middle - (middle @ normal - offset) * normal
             corners = _rectangle(middle, basis, np.full(2, -2 * diagonal), np.full(2, 2 * diagonal))
-            sides += _sides(middles[number] - EDGE * extents[number], middles[number] + EDGE * extents[number])
+            edge = 2 * extents[number]  # there it reflects 17 dB less than in its middle
+            sides += _sides(middles[number] - edge, middles[number] + edge)
         else:
             own = weights[link, path]
             points = found.bounces[link, path, step][own >= SEEN * own.max()]
@@ -245,7 +226,7 @@ def outlines(placement: Mirrored, found: Survey) -> list[shapes.Plane]:
         for side in sides:
             corners = _cut(corners, *side)
         if len(corners):
-            drawn.append(shapes.Plane(number, corners, normal, share))
+            drawn.append(LearntPlane(number, corners, normal, share))
     return drawn
 
 
@@ -270,7 +251,7 @@ def _rectangle(origin, basis, low, high) -> Float[ndarray, "4 3"]:
 
 
 def _cut(corners: Float[ndarray, "c 3"], normal: Float[ndarray, "3"], offset: float) -> Float[ndarray, "k 3"]:
-    """What of a convex polygon lies where normal . x <= offset.
+    """The part of a convex polygon with normal . x <= offset.
 
     Source: Sutherland and Hodgman, Reentrant polygon clipping, 1974.
     """
@@ -287,8 +268,8 @@ def _cut(corners: Float[ndarray, "c 3"], normal: Float[ndarray, "3"], offset: fl
 
 
 @torch.no_grad()
-def learnt_room(placement: Mirrored, links: Links) -> shapes.LearntRoom:
-    """What figures show: the room by the training links, and the strongest paths of the first test transmitter."""
+def learnt_room(placement: Mirrored, links: Links) -> LearntRoom:
+    """The room by the training links, and the strongest paths of the first test transmitter, for figures."""
     found = survey(placement, some(links.query[links.split.train]))
     test = links.query[links.split.test]
     first = (test.transmitters == test.transmitters[:1]).all(1)
@@ -298,21 +279,21 @@ def learnt_room(placement: Mirrored, links: Links) -> shapes.LearntRoom:
     if placement.obstacles is not None:
         blobs = placement.obstacles
         parts = blobs.centres, blobs.widths, NEPER * blobs.densities
-        matter = shapes.Matter(*(part.cpu().double().numpy() for part in parts))
-    return shapes.LearntRoom(outlines(placement, found), matter, strongest(survey(placement, test[first])))
+        matter = Matter(*(part.cpu().double().numpy() for part in parts))
+    return LearntRoom(outlines(placement, found), matter, strongest(survey(placement, test[first])))
 
 
-def strongest(found: Survey) -> list[shapes.Path]:
-    """The strongest paths of all links, at most ``PATHS`` and no fainter than ``FAINTEST_DB`` below the strongest."""
+def strongest(found: Survey) -> list[LearntPath]:
+    """The strongest paths of all links, at most 20, and within 30 dB of the strongest."""
     powers = found.powers / found.powers.max(initial=np.finfo(float).tiny)
-    order = np.argsort(-powers, axis=None)[:PATHS]
+    order = np.argsort(-powers, axis=None)[:20]
     paths = []
     for link, path in zip(*np.unravel_index(order, powers.shape), strict=True):
-        if powers[link, path] < 10 ** (-FAINTEST_DB / 10):
+        if powers[link, path] < 1e-3:
             break
-        bounces = found.bounces[link, path][found.words[path] >= 0]
+        bounces = found.bounces[link, path][found.sequences[path] >= 0]
         points = np.concatenate((found.transmitters[link, None], bounces, found.receivers[link, None]))
-        paths.append(shapes.Path(points, 10 * math.log10(powers[link, path])))
+        paths.append(LearntPath(points, 10 * math.log10(powers[link, path])))
     return paths
 
 
@@ -323,9 +304,9 @@ def export(placement: Mirrored, query: Query, folder: Path) -> None:
     """Writes ``planes.obj``, and ``obstacles.ply`` where there are obstacles.
 
     Args:
-        placement: What is written.
-        query: Links whose paths say how far planes reach.
-        folder: To write into.
+        placement: The planes and obstacles.
+        query: Links whose paths tell how far planes reach.
+        folder: Folder of the files.
     """
     found = survey(placement, query)
     write_text(folder / "planes.obj", wavefront_obj(placement, found))
@@ -357,9 +338,9 @@ def wavefront_obj(placement: Mirrored, found: Survey) -> str:
 
 @torch.no_grad()
 def save_obstacles(placement: Mirrored, path: Path) -> None:
-    """Writes the obstacles as a .ply that 3-D Gaussian splatting viewers open: grey, and opaque as they are lossy.
+    """Writes the obstacles as a .ply for viewers of 3-D Gaussian splatting.
 
-    The opacity is the share of power that the middle of an obstacle takes, for its mean width.
+    They are grey, and as opaque as the share of power lost through the middle of an obstacle of its mean width.
     """
     blobs = placement.obstacles
     depths = blobs.densities * math.sqrt(2 * math.pi) * blobs.widths.log().mean(1).exp()

@@ -1,4 +1,4 @@
-"""Obstacles: Gaussians that stand in the room and dim every path that passes through them, as in tomography."""
+"""Obstacles: Gaussians of matter in the room that attenuate every path through them, as in tomography."""
 
 import math
 
@@ -6,21 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-WIDTH = 0.05
-"""Standard deviation at the start, in diagonals of the room: a piece of furniture is some tenths of a room wide."""
-
-DENSITY = 0.8
-"""At the centre, at the start [Np] a diagonal of the room: a path through one is dimmed by a fraction of a decibel."""
-
-UNIT = 0.12
-"""What a step of 1 in their places is, in diagonals of the room, so that learning rates suit rooms of any size."""
-
-MARGIN = 0.05
-"""By how much their box is longer than that of transmitters and receivers at each end, in its edges."""
-
 
 class Obstacles(nn.Module):
-    """Gaussians of matter: along a segment the field falls by exp(-depth).
+    """Gaussians of matter: along a segment the field is attenuated by exp(-depth).
 
     depth = sum_i rho_i integral exp(-|S_i^-1 (x - c_i)|² / 2) dx along the segment, S_i = diag(widths), a closed form:
     with the ray a + t (b - a) in units of the widths, A = |ray|², B = ray . offset, C = |offset|²,
@@ -28,7 +16,7 @@ class Obstacles(nn.Module):
         depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B / sqrt(2 A)))
 
     Args:
-        count: How many.
+        count: Number of Gaussians.
         lower, upper: Corners of the box that holds transmitters and receivers [m].
 
     Source: the integral of a Gaussian along a line; Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
@@ -38,12 +26,13 @@ class Obstacles(nn.Module):
         super().__init__()
         edges = upper - lower
         diagonal = float(edges.norm())
-        low, high = lower - MARGIN * edges, upper + MARGIN * edges
+        low, high = lower - 0.05 * edges, upper + 0.05 * edges
         self.register_buffer("origin", (low + high) / 2)
-        self.register_buffer("unit", torch.tensor(diagonal * UNIT))
+        self.register_buffer("unit", torch.tensor(diagonal * 0.12))  # so that learning rates suit rooms of any size
         self.places = nn.Parameter((torch.rand(count, 3) - 0.5) * (high - low) / self.unit)
-        self.log_widths = nn.Parameter(torch.full((count, 3), math.log(WIDTH * diagonal)))
-        self.log_densities = nn.Parameter(torch.full((count,), math.log(DENSITY / diagonal)))
+        # The size of furniture, and so thin that a path through one is attenuated by a fraction of a decibel.
+        self.log_widths = nn.Parameter(torch.full((count, 3), math.log(0.05 * diagonal)))
+        self.log_densities = nn.Parameter(torch.full((count,), math.log(0.8 / diagonal)))
 
     def __len__(self) -> int:
         return len(self.places)
@@ -59,7 +48,7 @@ class Obstacles(nn.Module):
         return self.log_widths.exp()
 
     @property
-    def densities(self) -> Float[Tensor, "k"]:
+    def densities(self) -> Float[Tensor, " k"]:
         """At the centres [Np/m]."""
         return self.log_densities.exp()
 
@@ -69,7 +58,7 @@ class Obstacles(nn.Module):
 
 
 class _Depth(torch.autograd.Function):
-    """The depth with its gradient written by hand, in half the time of the recorded one.
+    """The depth with its gradient in closed form, in half the time of the recorded one.
 
     With r = sqrt(1 / (2 A)), g = exp(-(C - B²/A) / 2), E = erf((A + B) r) - erf(B r), depth = rho l sqrt(pi) r g E, and
     d E = 2 / sqrt(pi) (e1 d((A + B) r) - e0 d(B r)) with e1 = exp(-((A + B) r)²), e0 = exp(-(B r)²).
@@ -122,10 +111,10 @@ class _Depth(torch.autograd.Function):
 
 
 SHORTEST = 1e-8
-"""Smallest squared length of a ray in widths: a tenth of a thousandth of a width, within which nothing changes."""
+"""Smallest squared length of a ray [squared widths]: within 1e-4 of a width nothing changes."""
 
 FAINTEST = -80.0
-"""Smallest exponent: exp(-80) is nothing, and float32's exponential takes four times as long where it underflows."""
+"""Smallest exponent: exp(-80) is negligible, and float32's exponential takes four times as long at an underflow."""
 
 
 def _parts(start, end, centres, log_widths):

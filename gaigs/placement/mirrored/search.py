@@ -1,83 +1,62 @@
-"""Which planes a room has: those whose reflections explain what the others leave."""
+"""Search for planes: new planes, their offsets by the phases, and planes and paths to drop."""
 
 import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
+from scipy.constants import speed_of_light
 from torch import Tensor
 from torch.nn import functional
 
-from gaigs.directions import Grid
 from gaigs.gaussians import fibonacci_lattice
-from gaigs.placement.mirrored import CONDUCTIVITY, PERMITTIVITY
+from gaigs.geometry import Grid
+from gaigs.placement.mirrored.paths import CONDUCTIVITY, PERMITTIVITY, Mirrored
 from gaigs.placement.mirrored.reflections import reflect
 from gaigs.projection import Splats
 from gaigs.propagation import NEAREST, fresnel
 from gaigs.query import Batch
 
-SLANTS, OFFSETS = 24, 24
-"""Normals over the sphere, beside the axes and the normals there are, and offsets across the room, of the first try."""
-
-CLOSER, ROUNDS = 96, 3
-"""Planes about the best one that are tried next, and how often, each time at a third of the distance."""
-
-TURN = 0.15
-"""Standard deviation of their normals the first time [rad]."""
-
-MARGIN = 0.1
-"""How far beyond the box of transmitters and receivers a plane may be, in its diagonals."""
-
-GAIN = 0.01
-"""By how much a plane must lower the loss to be taken in: less is the chance of the links looked at."""
-
-ROWS = 12
-"""Rows of the labels that searches look at: a search takes hundreds of looks."""
-
-FEW = 6
-"""Rows where only powers are looked at, which change slowly with direction."""
-
-AT_ONCE = 4000
-"""Pairs of a link and a plane worked on at a time."""
+Loss = Callable[[Batch], float]
+"""Loss of the model as it stands, on a batch."""
 
 
-def find_planes(model, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
-    """Takes in one plane after the other, wherever its reflection lowers the loss most, as long as it does.
+def find_planes(model, train: Batch, validation: Batch | None, loss: Loss) -> str:
+    """Adds one plane after the other, where its reflection lowers the loss most, as long as it lowers the loss.
 
     Where powers add, so do lags: those of one more reflection are added to what the model hears already, for hundreds
     of planes at a time.
 
     Args:
-        model: ``gaigs.model.mirrored.Mirrored``.
+        model: ``gaigs.model.mirrored.MirroredSplatting``.
         train, validation: Links to look at.
-        loss: Of the model as it stands, on a batch.
+        loss: As of ``Model.revise``.
 
     Returns:
-        What was found, in words.
+        A sentence for the log.
     """
     placement = model.placement
-    if model.pooling.takes != "lags" or model.draws_map:
-        return "planes stay those of the box of transmitters and receivers"
     batches = [batch for batch in (train, validation) if batch is not None]
-    before, told = loss(train), []
+    before, found = loss(train), []
     while len(placement.used) < len(placement.origin):
         used = placement.used
         plane = next(k for k in range(len(placement.origin)) if k not in used)
         kept, losses = placement.kept.clone(), [loss(batch) for batch in batches]
         normal, offset = _best(model, train)
         placement.place(plane, normal, offset)
-        placement.kept |= placement.words_of(torch.cat((used, used.new_tensor([plane]))))
+        placement.kept |= placement.sequences_of(torch.cat((used, used.new_tensor([plane]))))
         after = [loss(batch) for batch in batches]
-        if any(new > (1 - GAIN) * old for new, old in zip(after, losses, strict=True)):
+        # By less than a hundredth a plane may lower the loss by chance.
+        if any(new > 0.99 * old for new, old in zip(after, losses, strict=True)):
             placement.kept.copy_(kept)
             break
         numbers = ", ".join(f"{value:.2f}" for value in (*normal.tolist(), offset))
-        told.append(f"plane ({numbers})")
-    return f"{' and '.join(told) or 'no plane'} found; loss {before:.4f} -> {loss(train):.4f}"
+        found.append(f"plane ({numbers})")
+    return f"{' and '.join(found) or 'no plane'} found; loss {before:.4f} -> {loss(train):.4f}"
 
 
-def fewer(batch: Batch, rows: int = ROWS) -> Batch:
-    """A batch with some of its labels' rows and columns, where these have a grid."""
+def thinned(batch: Batch, rows: int = 12) -> Batch:
+    """A batch with about ``rows`` of its labels' rows, and as dense columns: a search takes hundreds of looks."""
     labels, directions = batch.labels, batch.directions
     if isinstance(directions, Grid):
         every = slice(None, None, max(1, directions.shape[0] // rows))
@@ -86,7 +65,12 @@ def fewer(batch: Batch, rows: int = ROWS) -> Batch:
 
 
 def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
-    """The plane whose reflections lower the mean absolute error most."""
+    """The plane whose reflections lower the mean absolute error most.
+
+    First ``slants`` normals over the sphere, the axes, the present normals and those at right angles to them, each with
+    ``pitches`` offsets across the room; then three times random planes about the best one, each time nearer.
+    """
+    slants, pitches, closer, rounds = 24, 24, 96, 3
     placement = model.placement
     lower, upper = (corner.to(placement.origin) for corner in placement.box)
     corners = torch.cartesian_prod(*torch.stack((lower, upper), 1))
@@ -96,48 +80,48 @@ def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
         torch.linalg.cross(found, axes[2].expand_as(found)), dim=1
     )  # walls meet at right angles
     normals = torch.cat(
-        (axes, -axes, found, -found, across, -across, fibonacci_lattice(SLANTS, -math.pi / 2, math.pi / 2).to(axes))
+        (axes, -axes, found, -found, across, -across, fibonacci_lattice(slants, -math.pi / 2, math.pi / 2).to(axes))
     )
     normals = normals[normals.norm(dim=1) > 0.5]
     along = normals @ corners.T
-    margin = MARGIN * placement.diagonal
+    margin = 0.1 * placement.diagonal
     low, high = along.amin(1) - margin, along.amax(1) + margin
-    shares = torch.linspace(0, 1, OFFSETS).to(low)
+    shares = torch.linspace(0, 1, pitches).to(low)
     offsets = low[:, None] + (high - low)[:, None] * shares
-    pitch = float((high - low).max()) / (OFFSETS - 1)
-    normals, offsets = normals[:, None].expand(-1, OFFSETS, -1).flatten(0, 1), offsets.flatten()
-    batch = fewer(batch, FEW)
+    pitch = float((high - low).max()) / (pitches - 1)
+    normals, offsets = normals[:, None].expand(-1, pitches, -1).flatten(0, 1), offsets.flatten()
+    batch = thinned(batch, 6)  # powers change slowly with direction
     heard = _heard(model, batch)
-    turn = TURN
-    for _ in range(ROUNDS + 1):
+    turn = 0.15  # standard deviation of the tried normals [rad]
+    for _ in range(rounds + 1):
         errors = _errors(model, batch, heard, normals, offsets)
         best = int(errors.argmin())
         normal, offset = normals[best], offsets[best]
-        normals = functional.normalize(normal + turn * torch.randn(CLOSER, 3).to(normal), dim=1)
+        normals = functional.normalize(normal + turn * torch.randn(closer, 3).to(normal), dim=1)
         # About the middle of the room, not about the world's origin.
         middle = (lower + upper) / 2
-        offsets = offset - middle @ normal + normals @ middle + pitch * (torch.rand(CLOSER).to(normal) - 0.5) * 2
+        offsets = offset - middle @ normal + normals @ middle + pitch * (torch.rand(closer).to(normal) - 0.5) * 2
         normals[0], offsets[0] = normal, offset
         turn, pitch = turn / 3, pitch / 3
     return normal, offset.item()
 
 
-def _heard(model, batch: Batch) -> list[tuple[int, Int[Tensor, "k"], Complex[Tensor, "k l"]]]:
-    """Each receiver, its links, and the lags that they hear now."""
+def _heard(model, batch: Batch) -> list[tuple[int, Int[Tensor, " k"], Complex[Tensor, "k l"]]]:
+    """Each receiver, its links, and their present lags."""
     query = batch.query
-    excited = model._excite(query)
+    excited = model.excite(query)
     heard = []
     for receiver in query.receivers.unique().tolist():
         own = (query.receivers == receiver).nonzero()[:, 0]
-        heard.append((receiver, own, model._sum(*excited, own, receiver, query[own])))
+        heard.append((receiver, own, model.pooling.sum_paths(model.paths(excited, own, receiver, query[own]))))
     return heard
 
 
-def _errors(model, batch: Batch, heard: list[tuple], normals: Tensor, offsets: Tensor) -> Float[Tensor, "c"]:
+def _errors(model, batch: Batch, heard: list[tuple], normals: Tensor, offsets: Tensor) -> Float[Tensor, " c"]:
     """Mean absolute error with the reflection at one more plane, of each of some planes."""
     totals = []
     count = len(batch.query)
-    size = max(1, AT_ONCE // count)
+    size = max(1, 4000 // count)  # 4000 pairs of a link and a plane at a time
     for n, d in zip(normals.split(size), offsets.split(size), strict=True):
         errors = normals.new_zeros(count, len(n))
         for receiver, own, lags in heard:
@@ -165,12 +149,116 @@ def _with_one_more(model, batch: Batch, lags, own, receiver: int, normals, offse
     splats = Splats(flat(directions[..., :2]), normals.new_zeros(1, 1, 3), flat(lengths), flat(sides > 0))
     links = own.repeat_interleave(count)
     query = batch.query[links]
-    more = model.rasterizer.lags(
-        splats, flat(gains), flat(lengths), normals.new_zeros(1), None, antenna.array, model._carriers(query)
-    )
+    own_paths = flat(gains), flat(lengths), normals.new_zeros(1), None
+    more = model.pooling.covariances(splats, *own_paths, antenna.array, model.carriers(query))
     lags = lags.repeat_interleave(count, 0) + more
     directions, labels = batch.directions, batch.labels[own]
-    value = model.pooling.hear(lags, query, directions)
-    value = model._on_trend(value, Batch(query, directions))
+    value = model.pooling.read(lags, query, directions)
+    value = model.on_trend(value, Batch(query, directions))
     errors = (value.unflatten(0, (len(own), count)) - labels[:, None]).abs()
     return errors.flatten(2).mean(-1) if errors.ndim > 2 else errors
+
+
+# --- by phases ---
+
+
+def move_planes(placement: Mirrored, batch: Batch, wavelength: float, least: float, loss: Loss) -> list[float]:
+    """Moves each used plane along its normal to the least loss, the strongest plane first.
+
+    Args:
+        placement: Its planes are moved.
+        batch: Links to look at.
+        wavelength: Of the carrier [m].
+        least: Least distance searched on either side [m].
+        loss: As of ``Model.revise``.
+
+    Returns:
+        The moves [m].
+    """
+    some, reach = thinned(batch), max(4.0 * wavelength, least)
+    return [_move(placement, plane, reach, wavelength, some, loss) for plane in by_strength(placement, batch)]
+
+
+def choose_bandwidth(placement: Mirrored, wavelength: float, batch: Batch, loss: Loss) -> None:
+    """Takes the bandwidth with which moving the two strongest planes lowers the loss most.
+
+    Without a bandwidth no plane is right, and without planes no bandwidth is: so both are tried together.
+    """
+    used = by_strength(placement, batch)
+    origin, losses = placement.origin.clone(), {}
+    # From a carrier, where all paths interfere, to a band in which hardly two do.
+    for rooms in (0.01, 1.0, 3.0, 10.0, 30.0, 100.0):
+        placement.log_bandwidth.fill_(math.log(rooms * speed_of_light / placement.diagonal))
+        for plane in used[:2]:
+            _move(placement, plane, 4.0 * wavelength, wavelength, batch, loss)
+        losses[rooms] = loss(batch)
+        placement.origin.copy_(origin)
+    best = min(losses, key=losses.__getitem__)
+    placement.log_bandwidth.fill_(math.log(best * speed_of_light / placement.diagonal))
+
+
+def _move(placement: Mirrored, plane: int, reach: float, wavelength: float, batch: Batch, loss: Loss) -> float:
+    """Moves a plane along its normal to the least loss; by how much [m]."""
+    origin = placement.origin[plane]
+    start = origin[3].item()
+    step = wavelength / 10  # a reflected path changes by twice of it
+    count = round(reach / step)
+    moves = [step * k for k in range(-count, count + 1)]
+    losses = []
+    with placement.holding():
+        loss(batch)
+        for move in moves:
+            origin[3] = start + move
+            losses.append(loss(batch))
+    best = moves[min(range(len(moves)), key=losses.__getitem__)]
+    origin[3] = start + best
+    return best
+
+
+# --- pruning ---
+
+
+def prune(placement: Mirrored, batches: list[Batch], loss: Loss) -> str:
+    """Drops planes, then paths, weakest first, without which the loss is next to no higher on any batch.
+
+    Returns:
+        A sentence for the log.
+    """
+    planes, paths = len(placement.used), int(placement.kept.sum())
+    before = [loss(batch) for batch in batches]
+
+    def is_good(kept: Bool[Tensor, " n"]) -> bool:
+        placement.kept.copy_(kept)
+        # A tenth of what a plane must bring to be added.
+        return all(loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True))
+
+    best = placement.kept.clone()
+    for plane in reversed(by_strength(placement, batches[0])):
+        without = best & ~(placement.sequences == plane).any(1)
+        best = without if is_good(without) else best
+    placement.kept.copy_(best)
+    weakest = best.nonzero()[:, 0][_shares(placement, batches[0]).argsort()]
+    low, high = 0, len(weakest) - 1
+    while low < high:  # the largest number of them that may go, by bisection
+        middle = (low + high + 1) // 2
+        without = best.index_fill(0, weakest[:middle], False)
+        low, high = (middle, high) if is_good(without) else (low, middle - 1)
+    placement.kept.copy_(best.index_fill(0, weakest[:low], False))
+    return (
+        f"{planes - len(placement.used)} of {planes} planes and {paths - int(placement.kept.sum())} of {paths} "
+        f"paths dropped; loss {before[0]:.4f} -> {loss(batches[0]):.4f}"
+    )
+
+
+def by_strength(placement: Mirrored, batch: Batch) -> list[int]:
+    """Used planes, strongest received power first."""
+    shares, sequences = _shares(placement, batch), placement.sequences[placement.kept]
+    return sorted(placement.used.tolist(), key=lambda plane: -shares[(sequences == plane).any(1)].sum().item())
+
+
+def _shares(placement: Mirrored, batch: Batch) -> Float[Tensor, " n"]:
+    """Mean share of each kept path in a link's received power; 0 for a link without power."""
+    query, _ = batch.query.unique(with_receivers=True)
+    powers = placement(None, query).gains.abs().square()
+    total = powers.sum(1, keepdim=True)
+    return (powers / torch.where(total > 0, total, 1)).mean(0)

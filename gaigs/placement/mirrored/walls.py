@@ -1,4 +1,4 @@
-"""Walls that a user knows: planes from a floor plan or a mesh."""
+"""Known walls: planes from a floor plan or a mesh."""
 
 import itertools
 from pathlib import Path
@@ -7,24 +7,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.data.nerf2_rssi import read_walls
 from gaigs.io.meshes import read_obj
-from gaigs.io.tables import refuse
-
-SAME_TURN, SAME_PLACE = 0.02, 0.02
-"""Planes are one where their normals differ by less [rad], and their offsets by less [m]."""
+from gaigs.io.walls import read_walls
 
 SHORTEST = 1e-3
-"""Walls and edges of faces shorter than this have no direction [m]."""
+"""Length below which walls and edges of faces have no direction [m]."""
 
 
 def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> Float[Tensor, "k 4"]:
-    """Planes of a room as rows (normal, offset [m]), those of the largest area first.
+    """Planes of a room as rows (normal, offset [m]), the largest area first.
 
     Args:
         file: ``.csv`` with consecutive vertices x,y of a floor plan [m], whose walls are upright, or ``.obj`` with the
             faces of a mesh [m].
-        lower, upper: Corners of the box of transmitters and receivers: of a floor plan, floor and ceiling are there.
+        lower, upper: Corners of the box of transmitters and receivers, with floor and ceiling of a floor plan.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -33,27 +29,24 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
     if not file.is_file():
         raise FileNotFoundError(f"no walls at {file}; set placement.walls to a .csv or .obj, or to null")
     if file.suffix == ".csv":
-        defects: list[str] = []
-        ends = read_walls(file, defects)
-        refuse(file.parent, defects)
+        ends = read_walls(file)
         along = ends[:, 1] - ends[:, 0]
         lengths = along.norm(dim=1)
         normals = torch.stack((along[:, 1], -along[:, 0], 0 * lengths), 1)
         level = torch.tensor([[0.0, 0.0, 1.0, upper[2]], [0.0, 0.0, -1.0, -lower[2]]])
         walls = _merged(normals[lengths > SHORTEST], ends[lengths > SHORTEST, 0], lengths[lengths > SHORTEST])
-        planes = (
-            torch.cat((walls[:4], level, walls[4:])) if len(walls) else walls
-        )  # a room has floor and ceiling before a fifth wall
+        # A room has floor and ceiling before a fifth wall.
+        planes = torch.cat((walls[:4], level, walls[4:])) if len(walls) else walls
     elif file.suffix == ".obj":
         planes = _merged(*_faces(file))
     else:
         raise ValueError(f"placement.walls must be a .csv or .obj, got {file.name}")
     if not len(planes):
-        raise ValueError(f"{file} must hold walls, and there is none longer than {SHORTEST} m")
+        raise ValueError(f"{file} must have a wall longer than {SHORTEST} m")
     return planes
 
 
-def _faces(file: Path) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f"]]:
+def _faces(file: Path) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, " f"]]:
     """Normals, a point and area of each triangle of a mesh."""
     vertices, groups = read_obj(file)
     faces = itertools.chain(*groups.values())
@@ -68,16 +61,16 @@ def _faces(file: Path) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Floa
 
 
 def _merged(
-    normals: Float[Tensor, "f 3"], points: Float[Tensor, "f 3"], sizes: Float[Tensor, "f"]
+    normals: Float[Tensor, "f 3"], points: Float[Tensor, "f 3"], sizes: Float[Tensor, " f"]
 ) -> Float[Tensor, "k 4"]:
-    """Planes through points, those that are one taken together, by falling size."""
+    """Planes through points by falling size; planes within 0.02 rad and 0.02 m are one."""
     normals = normals / normals.norm(dim=1, keepdim=True)
     rows: list[list] = []  # normal, offset, size
     for normal, point, size in zip(normals, points, sizes, strict=True):
         offset = normal @ point
         for row in rows:
             turned = 1.0 if row[0] @ normal > 0 else -1.0
-            if (row[0] - turned * normal).norm() < SAME_TURN and abs(row[1] - turned * offset) < SAME_PLACE:
+            if (row[0] - turned * normal).norm() < 0.02 and abs(row[1] - turned * offset) < 0.02:
                 row[2] += size
                 break
         else:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gaigs import geometry
-from gaigs.directions import Directions
+from gaigs.geometry import Directions
 from gaigs.model import Model, Prediction
 from gaigs.query import Batch
 from gaigs.scene import Scene

@@ -1,7 +1,7 @@
 """GSRF: complex-valued Gaussians that send by direction and turn the phase of what passes through them."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
@@ -40,6 +40,8 @@ class Gsrf(Model):
     Source: GSRF (NeurIPS 2025). There the transmitter moves and a receiver hears spectra; the README says what of it
         we took.
     """
+
+    learning_rates: Mapping[str, float] = {**ComplexGaussians.learning_rates, **Model.learning_rates}
 
     def __init__(
         self,

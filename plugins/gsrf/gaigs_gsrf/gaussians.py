@@ -1,6 +1,7 @@
 """Complex-valued Gaussians: where they start, and what they send in each direction."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Complex, Float
@@ -42,7 +43,8 @@ class ComplexGaussians(Gaussians):
     Source: GSRF (NeurIPS 2025), "Fourier-Legendre radiance field".
     """
 
-    PARAMETERS = (*Gaussians.PARAMETERS, "phases")
+    learning_rates: Mapping[str, float] = {**Gaussians.learning_rates, "signal": 1e-2, "phases": 1e-2}
+    PARAMETERS = tuple(learning_rates)
 
     def __init__(
         self,

@@ -5,8 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.directions import Directions
-from gaigs.geometry import magnitudes
+from gaigs.geometry import Directions, magnitudes
 from gaigs.pooling import Pooling, sphere
 from gaigs.query import Query
 
@@ -44,7 +43,7 @@ class MeanAmplitude(Pooling):
 
     def forward(
         self, image: Float[Tensor, "b 2 rows columns"], query: Query, directions: Directions | None = None
-    ) -> Float[Tensor, "b"]:
+    ) -> Float[Tensor, " b"]:
         """Level [dBm], float32 where the map is of half precision; where the map is 0, so is its gradient."""
         image = image.to(torch.promote_types(image.dtype, torch.float32))
         return RANGE * (magnitudes(torch.complex(*image.unbind(1))).mean((1, 2)) - 1)

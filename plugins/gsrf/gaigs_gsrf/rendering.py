@@ -49,7 +49,7 @@ def render(
 
 def weights(
     gaussians: ComplexGaussians,
-    order: Int[Tensor, "k"],
+    order: Int[Tensor, " k"],
     centres: Float[Tensor, "k 3"],
     rays: Float[Tensor, "rays 3"],
     radius: float,

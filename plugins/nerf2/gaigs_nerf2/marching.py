@@ -10,11 +10,11 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.directions import Rays
+from gaigs.geometry import Rays
 from gaigs.model import Model, Prediction
 from gaigs.query import Batch, Query
 from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import FINEST
+from gaigs.tokenizer.euclidean import MAX_OCTAVE
 from gaigs_nerf2.readings import make_reading
 
 CALIBRATION = 16, 200
@@ -38,7 +38,7 @@ class Samples(NamedTuple):
 
 
 def render(
-    samples: Samples, step: float, gains: Float[Tensor, "i"], shifts: Float[Tensor, "i c"]
+    samples: Samples, step: float, gains: Float[Tensor, " i"], shifts: Float[Tensor, "i c"]
 ) -> Complex[Tensor, "b r c"]:
     """S = sum_i g_i s_i exp(j (phi_i + x_i)) prod_{j<i} (1 - alpha_j) exp(j p_j d), alpha_j = 1 - exp(-a_j d).
 
@@ -64,12 +64,12 @@ def check_octaves(octaves: int) -> None:
     Raises:
         ValueError: It does not.
     """
-    if not 0 <= octaves <= FINEST:
-        raise ValueError(f"model.octaves must be at least 0 and at most {FINEST}, got {octaves}")
+    if not 0 <= octaves <= MAX_OCTAVE:
+        raise ValueError(f"model.octaves must be at least 0 and at most {MAX_OCTAVE}, got {octaves}")
 
 
 class RayMarching(Model):
-    """A model of what is at samples along rays from the receivers; a subclass says what, in ``sample``.
+    """A model of values at samples along rays from the receivers; a subclass defines them in ``sample``.
 
     Samples stand in the middles of equal steps. ``gaigs_nerf2.readings`` has what the sums along the rays are to
     spectra, RSSI and channels. The unit of strength is such that the untrained model gives the training labels' mean
@@ -170,8 +170,8 @@ class RayMarching(Model):
 
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
-        """Values of a batch, of at most ``chunk`` links at a time; ``march`` parts what is left of them."""
-        parts = [*batch.query.parts(self.chunk)] or [batch.query]
+        """Values of a batch, of at most ``chunk`` links at a time; ``march`` splits them further."""
+        parts = batch.query.parts(self.chunk)
         return torch.cat([self(Batch(part, batch.directions)).value for part in parts])
 
 

@@ -8,11 +8,10 @@ from scipy.constants import speed_of_light
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.directions import Directions, Grid
-from gaigs.geometry import magnitudes
-from gaigs.propagation import array_sign, check_elements, direct_waves, phase_sign
+from gaigs.geometry import Directions, Grid, magnitudes
+from gaigs.propagation import array_sign, phase_sign
 from gaigs.query import Query, check_carrier
-from gaigs.scene import Scene
+from gaigs.scene import Scene, check_elements, direct_waves
 
 REACH = 0.025
 """What a sample adds to a spectrum falls with the distance as 0.025 m / t, as published: lambda / (4 pi) at about
@@ -25,7 +24,7 @@ class Reading(nn.Module):
     Attributes:
         channels: Numbers that a sample has an amplitude and a phase of.
         grid: The rays, where labels have no directions; None where they have.
-        carriers: Whose phase turns along the rays (channels,) [Hz]; None where it is part of what is learnt.
+        carriers: Whose phase turns along the rays (channels,) [Hz]; None where the phase is learnt.
     """
 
     channels = 1
@@ -35,11 +34,11 @@ class Reading(nn.Module):
     def fit(self, links: Links) -> None:
         """Takes what the training links say of themselves; by default nothing."""
 
-    def gains(self, distances: Float[Tensor, "i"]) -> Float[Tensor, "i"]:
+    def gains(self, distances: Float[Tensor, " i"]) -> Float[Tensor, " i"]:
         """By which factor what a sample sends arrives from so far [m]."""
         return torch.ones_like(distances)
 
-    def shifts(self, distances: Float[Tensor, "i"]) -> Float[Tensor, "i c"]:
+    def shifts(self, distances: Float[Tensor, " i"]) -> Float[Tensor, "i c"]:
         """How far the phase turns on the way 2 pi t / lambda [rad]."""
         if self.carriers is None:
             return torch.zeros_like(distances[:, None])
@@ -57,7 +56,7 @@ class Reading(nn.Module):
 class Spectrum(Reading):
     """|S(u)| in each direction u."""
 
-    def gains(self, distances: Float[Tensor, "i"]) -> Float[Tensor, "i"]:
+    def gains(self, distances: Float[Tensor, " i"]) -> Float[Tensor, " i"]:
         return REACH / distances
 
     def amplitudes(self, labels: Tensor, query: Query) -> Tensor:

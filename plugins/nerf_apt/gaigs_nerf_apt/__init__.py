@@ -1,6 +1,7 @@
 """NeRF-APT: the radiance field of NeRF², its networks attention U-Nets over rays x samples."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
@@ -9,7 +10,7 @@ from gaigs_nerf2.marching import check_octaves
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
-from gaigs.directions import Directions, Grid, Rays
+from gaigs.geometry import Directions, Grid, Rays
 from gaigs.model import Prediction
 from gaigs.query import Batch, Query
 from gaigs.scene import Scene
@@ -18,7 +19,7 @@ from gaigs_nerf_apt.unet import DIVISOR, UNet
 
 
 class NerfApt(RayMarching):
-    """Place -> attenuation and a feature; feature, direction and transmitter -> what is sent along the ray.
+    """Place -> attenuation and a feature; feature, direction and transmitter -> the field sent along the ray.
 
     An image is the rays of one elevation, side by side around the circle, times the samples along them. A ray is seen
     with its neighbours, so it must always have the same: a grid of the model's own is marched whatever directions are
@@ -38,6 +39,8 @@ class NerfApt(RayMarching):
 
     Source: NeRF-APT, 2025.
     """
+
+    learning_rates: Mapping[str, float] = {"network": 4e-3}  # not published
 
     def __init__(
         self,

@@ -1,6 +1,7 @@
 """DCGAN: a generator draws labels by transposed convolutions, and a discriminator judges them."""
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
 
 import torch
@@ -36,6 +37,8 @@ class Dcgan(Network):
     Source: Radford et al., Unsupervised Representation Learning with DCGANs, 2016; the baseline in GAI-GS, "Results".
     """
 
+    learning_rates: Mapping[str, float] = {"network": 1e-3, "discriminator": 2e-4}
+
     trained_by = "adversarial"
 
     def __init__(self, scene: Scene, width: int, noise: int, octaves: tuple[int, int] | None, pixel: float):
@@ -46,13 +49,13 @@ class Dcgan(Network):
         doublings = [min(LAYERS, (size - 1).bit_length()) for size in sizes]
         widths = [width * 2**k for k in reversed(range(LAYERS))]
         small = (widths[0], *(-(-size // 2**count) for size, count in zip(sizes, doublings, strict=True)))
-        told = self.question.width
-        drawing = [nn.Linear(noise + told, math.prod(small)), nn.Unflatten(1, small)]
+        features = self.question.width
+        drawing = [nn.Linear(noise + features, math.prod(small)), nn.Unflatten(1, small)]
         judging = []
         for layer, (inner, outer) in enumerate(pairwise([*widths, channels])):
             strides = [2 if layer >= LAYERS - count else 1 for count in doublings]
             drawing += [BatchNorm(inner), nn.ReLU(), transposed(inner, outer, strides, sizes)]
-            seen = outer if layer < LAYERS - 1 else outer + told
+            seen = outer if layer < LAYERS - 1 else outer + features
             judging = [convolution(seen, inner, strides, sizes), nn.LeakyReLU(0.2), *judging]
         self.generator = nn.Sequential(*drawing)
         verdict = (nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(widths[0], 1))
@@ -62,22 +65,22 @@ class Dcgan(Network):
         """Generator and discriminator."""
         return {"network": [*self.generator.parameters()], "discriminator": [*self.discriminator.parameters()]}
 
-    def draw(self, told: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
-        noise = told.new_zeros(len(told), self.noise)
+    def draw(self, features: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
+        noise = features.new_zeros(len(features), self.noise)
         if self.training:
             noise.normal_()
         _, rows, columns = self.label.shape
-        return self.generator(torch.cat((noise, told), 1))[..., :rows, :columns]
+        return self.generator(torch.cat((noise, features), 1))[..., :rows, :columns]
 
-    def discriminate(self, batch: Batch, values: Tensor) -> Float[Tensor, "b"]:
+    def discriminate(self, batch: Batch, values: Tensor) -> Float[Tensor, " b"]:
         """A logit for each link, large where the discriminator takes the values for labels.
 
         Raises:
             ValueError: The values are those of single directions.
         """
         images = self.label.images(values, batch.directions)
-        told = self.question(batch.query)[..., None, None].expand(-1, -1, *images.shape[2:])
-        return self.discriminator(torch.cat((images, told), 1))[:, 0]
+        features = self.question(batch.query)[..., None, None].expand(-1, -1, *images.shape[2:])
+        return self.discriminator(torch.cat((images, features), 1))[:, 0]
 
 
 def transposed(inner: int, outer: int, strides: list[int], sizes: list[int]) -> nn.ConvTranspose2d:

@@ -1,6 +1,7 @@
-"""FIRE: a variational auto-encoder of labels, told where the transmitter stands."""
+"""FIRE: a variational auto-encoder of labels, conditioned on the transmitter's position."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Float
@@ -41,31 +42,34 @@ class Fire(Network):
         Conditional Generative Models, 2015.
     """
 
+    learning_rates: Mapping[str, float] = {"network": 1e-3}
+    penalty_weights: Mapping[str, float] = {"kl": 0.2}  # twice the share of the labels' variance taken for noise
+
     def __init__(self, scene: Scene, widths: list[int], latent: int, octaves: tuple[int, int] | None, pixel: float):
         super().__init__(scene, octaves, pixel)
         check_widths(widths=widths, latent=latent)
-        numbers, told = math.prod(self.label.shape), self.question.width
+        numbers, features = math.prod(self.label.shape), self.question.width
         self.latent = latent
-        self.encoder = linear_layers([numbers + told, *widths], nn.LeakyReLU())
+        self.encoder = linear_layers([numbers + features, *widths], nn.LeakyReLU())
         self.posterior = nn.Linear(widths[-1], 2 * latent)
-        decoder = linear_layers([latent + told, *reversed(widths)], nn.LeakyReLU())
+        decoder = linear_layers([latent + features, *reversed(widths)], nn.LeakyReLU())
         self.decoder = nn.Sequential(decoder, nn.Linear(widths[0], numbers), nn.Unflatten(1, self.label.shape))
 
     def forward(self, batch: Batch) -> Prediction:
-        told = self.question(batch.query)
-        z, penalties = told.new_zeros(len(told), self.latent), {}
+        features = self.question(batch.query)
+        z, penalties = features.new_zeros(len(features), self.latent), {}
         if self.training and batch.labels is not None:
-            z, kl = self.encode(self.label.own_images(batch.labels, batch.directions), told)
+            z, kl = self.encode(self.label.own_images(batch.labels, batch.directions), features)
             unit = 1.0 if batch.labels.is_complex() else self.label.scale.square()
             penalties["kl"] = unit * kl.mean() / math.prod(self.label.shape)
-        images = self.decoder(torch.cat((z, told), 1))
+        images = self.decoder(torch.cat((z, features), 1))
         return Prediction(self.label.values(images, batch.directions), penalties)
 
     def encode(
-        self, images: Float[Tensor, "b channels rows columns"], told: Float[Tensor, "b width"]
-    ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, "b"]]:
+        self, images: Float[Tensor, "b channels rows columns"], features: Float[Tensor, "b width"]
+    ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, " b"]]:
         """A random z of each label, and how much it tells [nat]."""
-        seen = self.encoder(torch.cat((images.flatten(1), told), 1))
+        seen = self.encoder(torch.cat((images.flatten(1), features), 1))
         mean, log_variance = self.posterior(seen).chunk(2, 1)
         kl = (mean.square() + log_variance.exp() - log_variance - 1).sum(1) / 2
         return mean + (log_variance / 2).exp() * torch.randn_like(mean), kl

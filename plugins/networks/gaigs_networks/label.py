@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.directions import Directions, Grid
-from gaigs.propagation import direct_waves, strength
-from gaigs.scene import Scene
+from gaigs.geometry import Directions, Grid
+from gaigs.propagation import strength
+from gaigs.scene import Scene, direct_waves
 
 LARGEST = 90.0
 """No pixel is larger [deg]: at least two rows are left of the sphere's upper half."""
@@ -27,7 +27,7 @@ class LabelImage(nn.Module):
     | one number a link | 1 | 1 | 1 |
     | complex channel | elements | subcarriers | 2: real and imaginary part |
 
-    A spectrum's image has every so-manieth row and column of the label, and between them it is interpolated linearly.
+    A spectrum's image has every k-th row and column of the label, and is interpolated linearly between them.
     Complex labels are scaled by the amplitude that free space has at the median link, times their ``strength`` over
     free space, which no single link rules. They are not shifted: 0 means the same at every phase.
 
@@ -108,7 +108,7 @@ class LabelImage(nn.Module):
         return images if self.grid is None else interpolate(images[:, 0], directions, self.grid)[:, None]
 
 
-def every(angles: Float[Tensor, "n"], pixel: float) -> slice:
+def every(angles: Float[Tensor, " n"], pixel: float) -> slice:
     """Those of a label's rows or columns that are not more than a pixel apart [rad, deg]."""
     pitch = (angles.max() - angles.min()).item() / max(len(angles) - 1, 1)
     # A hundredth more: four rows of a degree in float32 may be more than 4 degrees apart.
@@ -127,7 +127,7 @@ def interpolate(values: Float[Tensor, "b rows columns"], grid: Grid, directions:
     return (rows @ values * columns).sum(-1)
 
 
-def shares(known: Float[Tensor, "n"], asked: Float[Tensor, "k"], period: float | None = None) -> Float[Tensor, "k n"]:
+def shares(known: Float[Tensor, " n"], asked: Float[Tensor, " k"], period: float | None = None) -> Float[Tensor, "k n"]:
     """Which share each of some known angles has in the value at an angle asked for [rad], float64."""
     count = len(known)
     known, order = known.double().sort()

@@ -1,6 +1,7 @@
 """A multi-layer perceptron: the plainest network."""
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
 
 from jaxtyping import Float
@@ -27,6 +28,8 @@ class Mlp(Network):
     Source: the baseline of that name in GAI-GS, "Results".
     """
 
+    learning_rates: Mapping[str, float] = {"network": 3e-3}
+
     def __init__(self, scene: Scene, widths: list[int], dropout: float, octaves: tuple[int, int] | None, pixel: float):
         super().__init__(scene, octaves, pixel)
         check_widths(widths=widths)
@@ -38,5 +41,5 @@ class Mlp(Network):
         shape = self.label.shape
         self.network = nn.Sequential(*hidden, nn.Linear(widths[-1], math.prod(shape)), nn.Unflatten(1, shape))
 
-    def draw(self, told: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
-        return self.network(told)
+    def draw(self, features: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
+        return self.network(features)

@@ -40,8 +40,8 @@ class Network(Model):
         images = self.draw(self.question(batch.query))
         return Prediction(self.label.values(images, batch.directions), {})
 
-    def draw(self, told: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
-        """Images of links, from the numbers that they are told apart by."""
+    def draw(self, features: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
+        """Images of links, from the features of the links."""
         raise NotImplementedError
 
 

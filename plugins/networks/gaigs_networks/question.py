@@ -1,4 +1,4 @@
-"""What the networks are told of a link."""
+"""Features of a link, the input of the networks."""
 
 import torch
 from jaxtyping import Float

@@ -1,6 +1,7 @@
 """WRF-KAN: Kolmogorov-Arnold layers, with a learnt function on each edge."""
 
 import math
+from collections.abc import Mapping
 from itertools import pairwise
 
 import torch
@@ -32,6 +33,8 @@ class WrfKan(Network):
     Source: WRF-KAN, arXiv 2601.11656; its layers are those of ``KanLayer``.
     """
 
+    learning_rates: Mapping[str, float] = {"network": 3e-3}
+
     def __init__(self, scene: Scene, widths: list[int], intervals: int, octaves: tuple[int, int] | None, pixel: float):
         super().__init__(scene, octaves, pixel)
         check_widths(widths=widths, intervals=intervals)
@@ -39,8 +42,8 @@ class WrfKan(Network):
         layers = [KanLayer(*pair, intervals) for pair in pairwise(sizes)]
         self.network = nn.Sequential(*layers, nn.Unflatten(1, self.label.shape))
 
-    def draw(self, told: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
-        return self.network(told)
+    def draw(self, features: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
+        return self.network(features)
 
 
 class KanLayer(nn.Module):

@@ -1,5 +1,7 @@
 """NeWRF: a radiance field of radio waves along the directions from which they arrive."""
 
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
@@ -7,10 +9,10 @@ from torch.nn.functional import normalize, pad, softplus
 
 from gaigs.data import Links
 from gaigs.model import Model, Prediction
-from gaigs.propagation import array_sign, check_elements, direct_waves, free_space, phase_sign
+from gaigs.propagation import array_sign, free_space, phase_sign
 from gaigs.query import Batch
-from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import FINEST, fourier_features
+from gaigs.scene import Scene, check_elements, direct_waves
+from gaigs.tokenizer.euclidean import MAX_OCTAVE, fourier_features
 from gaigs_newrf.arrivals import find_origins
 
 MARGIN = 0.5
@@ -31,7 +33,7 @@ def render(
     fields: Complex[Tensor, "b k i e"],
     depths: Float[Tensor, "b k i"],
     distances: Float[Tensor, "b k i"],
-    frequencies: Float[Tensor, "s"],
+    frequencies: Float[Tensor, " s"],
     sign: int = -1,
 ) -> Complex[Tensor, "b e s"]:
     """sum_k sum_i F_i c / (4 pi f z_i) alpha_i prod_{j<i} (1 - alpha_j) exp(-j 2 pi f z_i / c).
@@ -54,7 +56,7 @@ def render(
 
 
 class Field(nn.Module):
-    """Place and direction -> density, and what is sent there in that direction to each element.
+    """Place and direction -> density, and the field sent from there in that direction to each element.
 
     Args:
         features: Widths of the features of place and direction.
@@ -114,6 +116,8 @@ class NeWrf(Model):
     Source: NeWRF, 2024.
     """
 
+    learning_rates: Mapping[str, float] = {"network": 1e-3}
+
     def __init__(
         self, scene: Scene, arrivals: int, samples: int, octaves: int, view_octaves: int, width: int, layers: int
     ):
@@ -134,8 +138,8 @@ class NeWrf(Model):
         for (option, low), value in zip(least.items(), given, strict=True):
             if value < low:
                 raise ValueError(f"model.{option} must be at least {low}, got {value}")
-            if option.endswith("octaves") and value > FINEST:
-                raise ValueError(f"model.{option} must be at most {FINEST}, got {value}")
+            if option.endswith("octaves") and value > MAX_OCTAVE:
+                raise ValueError(f"model.{option} must be at most {MAX_OCTAVE}, got {value}")
         lower, upper = scene.lower, scene.upper
         self.register_buffer("middle", (lower + upper) / 2)
         self.register_buffer("steps", (torch.arange(samples) + 1) / samples, persistent=False)

@@ -1,4 +1,4 @@
-"""Where waves seem to come from, told by the delays in the training channels.
+"""Apparent origins of waves, found from the delays in the training channels.
 
 A wave that the room's walls mirror arrives as if from an image of the one who sent it, and that image stands still
 while the other end moves. So the delays of one path, measured at many places, are the distances to a single point.
@@ -27,7 +27,7 @@ PASSES = 4
 def find_origins(
     channels: Complex[Tensor, "k e s"],
     places: Float[Tensor, "k 3"],
-    frequencies: Float[Tensor, "s"],
+    frequencies: Float[Tensor, " s"],
     first: Float[Tensor, "3"],
     region: Float[Tensor, "2 3"],
     count: int,
@@ -77,14 +77,14 @@ def _lattice(region: Float[Tensor, "2 3"], pitch: float) -> tuple[Float[Tensor, 
     return torch.cartesian_prod(*axes), pitch
 
 
-def _waves(distances: Float[Tensor, "*batch"], frequencies: Float[Tensor, "s"]) -> Complex[Tensor, "*batch s"]:
+def _waves(distances: Float[Tensor, "*batch"], frequencies: Float[Tensor, " s"]) -> Complex[Tensor, "*batch s"]:
     """exp(-j 2 pi f d / c), of power 1 over the subcarriers."""
     phases = -2 * math.pi / speed_of_light * distances[..., None] * frequencies
     return torch.polar(torch.full_like(phases, len(frequencies) ** -0.5), phases)
 
 
 def _part(
-    channels: Complex[Tensor, "k e s"], distances: Float[Tensor, "k"], frequencies: Float[Tensor, "s"]
+    channels: Complex[Tensor, "k e s"], distances: Float[Tensor, " k"], frequencies: Float[Tensor, " s"]
 ) -> Complex[Tensor, "k e s"]:
     """The part of each element's channel with that delay."""
     waves = _waves(distances, frequencies)
@@ -94,7 +94,7 @@ def _part(
 def _refined(
     channels: Complex[Tensor, "k e s"],
     places: Float[Tensor, "k 3"],
-    frequencies: Float[Tensor, "s"],
+    frequencies: Float[Tensor, " s"],
     point: Float[Tensor, "3"],
     pitch: float,
 ) -> Float[Tensor, "3"]:
@@ -106,7 +106,7 @@ def _refined(
     return point
 
 
-def _profile(channels: Complex[Tensor, "k e s"], frequencies: Float[Tensor, "s"], far: float) -> tuple[Tensor, float]:
+def _profile(channels: Complex[Tensor, "k e s"], frequencies: Float[Tensor, " s"], far: float) -> tuple[Tensor, float]:
     """Power of each link by distance, from 0 to ``far`` (k, d), and the step between distances [m]."""
     step = speed_of_light / (OVERSAMPLING * (frequencies.max() - frequencies.min()).item())
     distances = step * torch.arange(math.ceil(far / step) + 1, dtype=torch.float64)
@@ -127,9 +127,9 @@ def _strongest(
 def _powers(
     channels: Complex[Tensor, "k e s"],
     places: Float[Tensor, "k 3"],
-    frequencies: Float[Tensor, "s"],
+    frequencies: Float[Tensor, " s"],
     points: Float[Tensor, "p 3"],
-) -> Float[Tensor, "p"]:
+) -> Float[Tensor, " p"]:
     """Power that all links have at their distances to each point."""
     waves = _waves(torch.cdist(points, places), frequencies)
     return torch.einsum("kes,pks->pke", channels, waves.conj()).abs().square().sum((1, 2))

@@ -1,21 +1,23 @@
 """Ray tracing in a room whose geometry is known, with materials learnt from the training links or as tabulated."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Complex, Float
 from scipy.constants import epsilon_0
 from torch import Tensor, nn
 
+from gaigs.antenna import Array
 from gaigs.data import Links
 from gaigs.data.sionna.meshes import THICKNESS, wavefront_obj
 from gaigs.data.sionna.tracing import frequency_offsets, respond
 from gaigs.data.synthetic.image_source import MATERIALS, Paths
 from gaigs.model import Model, Prediction
-from gaigs.pooling.array_response import ArrayResponse
-from gaigs.propagation import carriers, check_elements, direct_waves, fit_gain, free_space, phase_sign
+from gaigs.pooling.beamformer import Beamformer
+from gaigs.propagation import fit_gain, free_space, phase_sign
 from gaigs.query import Batch, Query, check_carrier
-from gaigs.scene import Array, Scene
+from gaigs.scene import Scene, carriers, check_elements, direct_waves
 
 from .fields import Slabs, gains, padded
 from .rooms import check_room, find_meshes, known_materials, read_obj
@@ -51,7 +53,7 @@ class RayTracing(Model):
         mesh: File of one's own room instead (.obj, .ply, .xml) [m]; None for the room of that name. It is read in
             ``fit``, and is in the state dict.
         materials: Which tabulated material a material of the mesh is like, by its name there.
-        calibrate: Whether materials and gains are trained. Else materials are as tabulated, and nothing is trained.
+        calibrate: True to train materials and gains. Else materials are as tabulated, and nothing is trained.
         frequency: Carrier of links whose data say none [Hz]; None where they do.
         depth: Largest number of reflections, passages through surfaces and diffractions of a path.
         rays: That leave each transmitter.
@@ -62,6 +64,9 @@ class RayTracing(Model):
 
     Source: Sionna RT technical report, arXiv:2504.21719; slabs and materials as in ITU-R P.2040-3.
     """
+
+    # Of logarithms [1], and of gains [Np, rad]: slower, as materials shall explain what they can.
+    learning_rates: Mapping[str, float] = {"materials": 5e-2, "gains": 5e-3}
 
     def __init__(
         self,
@@ -89,7 +94,7 @@ class RayTracing(Model):
         if scene.task.dtype.is_complex:
             check_elements("model 'ray_tracing'", scene)
         elif scene.task.directions is not None:
-            self.beamformer = ArrayResponse(scene, grid=[2, 3])  # of maps, which there are none of
+            self.beamformer = Beamformer("model 'ray_tracing'", scene)
         elif scene.task.unit != "dBm":
             raise ValueError(
                 f"model 'ray_tracing' predicts spectra, RSSI and channels, and labels of task {scene.task.name!r} are "
@@ -222,7 +227,7 @@ class RayTracing(Model):
             return channels.conj() if self.sign > 0 else channels
         if self.beamformer is not None:
             lags = _lags(respond(paths, antenna, carrier, self.offsets), antenna.array)
-            return self.beamformer.hear(lags.to(torch.complex64), query, batch.directions)
+            return self.beamformer(lags.to(torch.complex64), query, batch.directions)
         if self.scene.bandwidth is None:
             distances = (paths.images - antenna.pose.position.double()).norm(dim=-1)
             powers = (paths.gains.abs() * free_space(distances, torch.tensor(carrier), 0).real).square().sum(1)
@@ -248,7 +253,7 @@ class RayTracing(Model):
     def _lowest(self) -> Float[Tensor, "1"] | None:
         return self.scene.frequencies[:1] if len(self.scene.frequencies) else None
 
-    def _carriers(self, query: Query) -> Float[Tensor, "b"]:
+    def _carriers(self, query: Query) -> Float[Tensor, " b"]:
         """The frequency of each link [Hz]."""
         if self.frequency is not None and query.frequencies is None and not self.scene.task.dtype.is_complex:
             return torch.full((len(query),), float(self.frequency))

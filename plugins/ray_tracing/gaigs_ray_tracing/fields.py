@@ -22,7 +22,7 @@ GRAZING = 1e-6
 class Traced(NamedTuple):
     """Paths from transmitters to a receiver point: p of one link, or (b, p) of several.
 
-    Up to d things happen to a path, from its transmitter on. A field is told by its two components across the
+    Up to d things happen to a path, from its transmitter on. A field has two components across the
     direction: at the transmitter and at the receiver along the horizontal and down the meridian; at each surface across
     (TE) and in (TM) the plane of incidence.
 
@@ -67,13 +67,13 @@ class Slabs(NamedTuple):
         frequency: [Hz].
     """
 
-    permittivities: Complex[Tensor, "m"]
-    thicknesses: Float[Tensor, "m"]
+    permittivities: Complex[Tensor, " m"]
+    thicknesses: Float[Tensor, " m"]
     frequency: float
 
     def coefficients(
         self, surfaces: Int[Tensor, "*p"], cosines: Float[Tensor, "*p"]
-    ) -> tuple[Complex[Tensor, "2 *p"], Complex[Tensor, "2 *p"]]:
+    ) -> tuple[Complex[Tensor, " 2 *p"], Complex[Tensor, " 2 *p"]]:
         """Of reflection and of passage, each TE and TM.
 
         Args:

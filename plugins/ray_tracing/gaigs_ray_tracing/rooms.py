@@ -5,12 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from gaigs.data import synthetic
 from gaigs.data.sionna import ROOMS, tracing
 from gaigs.data.sionna.meshes import THICKNESS, Mesh
-from gaigs.io.meshes import NO_NAME, check_mesh, parse_obj, read_ply
+from gaigs.io.meshes import NO_NAME, check_mesh, parse_obj, positions, read_ply
 from gaigs.io.meshes import read_obj as read_mesh
 
 BUILT_IN = ("built_in", "synthetic", "synthetic_rssi", "synthetic_csi")
@@ -120,8 +118,7 @@ def read_obj(text: str, source: str) -> list[Mesh]:
 
 def _read_ply(file: Path) -> list[Mesh]:
     vertices, faces = read_ply(file)
-    corners = np.stack([vertices[axis] for axis in "xyz"], -1).tolist()
-    return [_mesh(file.stem, NO_NAME[1], corners, faces)] if faces else []
+    return [_mesh(file.stem, NO_NAME[1], positions(vertices).tolist(), faces)] if faces else []
 
 
 def _read_scene(file: Path) -> list[Mesh]:
@@ -144,7 +141,7 @@ def _read_scene(file: Path) -> list[Mesh]:
             )
         points = parameters["vertex_positions"].numpy().reshape(-1, 3).astype(float)
         faces = [tuple(face) for face in parameters["faces"].numpy().reshape(-1, 3).tolist()]
-        check_mesh(points, faces, f"{file}, shape {name!r},")
+        check_mesh(points, faces, f"{file}, shape {name!r}")
         meshes.append(_mesh(name, shape.radio_material.name, points.tolist(), faces))
     return meshes
 

@@ -255,7 +255,7 @@ def _normals(mesh: Mesh) -> Float[ndarray, "f 3"]:
     return normals / np.where(lengths > 0, lengths, 1)
 
 
-def _strongest(fields: ndarray) -> Int[ndarray, "k"]:
+def _strongest(fields: ndarray) -> Int[ndarray, " k"]:
     """The paths without the weakest."""
     order = np.argsort(-np.abs(fields), kind="stable")
     power = np.abs(fields[order]) ** 2

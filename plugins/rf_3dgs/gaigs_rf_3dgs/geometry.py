@@ -11,8 +11,8 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gaigs.io.meshes import read_obj, read_ply
-from gaigs.io.tables import read_points, refuse
+from gaigs.io.meshes import read_obj, read_ply, triangles
+from gaigs.io.tables import read_points
 
 NEIGHBOURS = 3
 """A Gaussian at a bare point is as wide as these are away, in root mean square, as 3-D Gaussian splatting starts."""
@@ -41,7 +41,7 @@ class Geometry(NamedTuple):
     means: Float[Tensor, "n 3"]
     log_scales: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
-    opacity_logits: Float[Tensor, "n"] | None = None
+    opacity_logits: Float[Tensor, " n"] | None = None
 
 
 def read_geometry(file: Path, most: int) -> Geometry:
@@ -61,13 +61,13 @@ def read_geometry(file: Path, most: int) -> Geometry:
         raise FileNotFoundError(f"no geometry at {file}; set model.geometry to a .csv, .obj or .ply, or to null")
     if file.suffix.lower() not in readers:
         raise ValueError(f"model.geometry must be a .csv, .obj or .ply, got {file.name}")
-    points, triangles, splats = readers[file.suffix.lower()](file)
+    points, corners, splats = readers[file.suffix.lower()](file)
     values = np.concatenate([points, *splats.values()], 1)
     if not np.isfinite(values).all():
         row = int((~np.isfinite(values)).any(1).argmax())
         raise ValueError(f"{file} must hold finite numbers, got {values[row].tolist()} at point {row + 1}")
-    if len(triangles):
-        points = _sample(points[triangles], most)
+    if len(corners):
+        points = _sample(points[corners], most)
     if len(points) <= NEIGHBOURS or most <= NEIGHBOURS:
         count = min(len(points), most)
         raise ValueError(f"{file} must give at least {NEIGHBOURS + 1} Gaussians, got {count} of gaussians.count={most}")
@@ -95,9 +95,7 @@ def _sample(corners: np.ndarray, count: int) -> np.ndarray:
 
 
 def _read_csv(file: Path) -> tuple[np.ndarray, np.ndarray, dict]:
-    defects: list[str] = []
-    points = read_points(file, "xyz", "x,y,z in each line [m]", defects)
-    refuse(file.parent, defects)
+    points = read_points(file, "xyz", "x,y,z in each line [m]")
     return np.array(points).reshape(-1, 3), _triangles(()), {}
 
 
@@ -115,6 +113,5 @@ def _read_ply(file: Path) -> tuple[np.ndarray, np.ndarray, dict]:
 
 
 def _triangles(faces: Iterable[tuple[int, ...]]) -> np.ndarray:
-    """Triangles (f, 3) of polygons, as fans."""
-    fans = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
-    return np.array(fans, int).reshape(-1, 3)
+    """Triangles (f, 3) of polygons."""
+    return np.array(triangles(faces), int).reshape(-1, 3)

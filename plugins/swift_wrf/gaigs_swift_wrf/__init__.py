@@ -1,19 +1,18 @@
 """SwiftWRF: 2-D Gaussians in the plane of a spectrum, which a network deforms for each transmitter."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot, relu
 
 from gaigs.deformation.two_branch import TokenLinear
-from gaigs.gaussians import fibonacci_lattice
+from gaigs.gaussians import Tokens, fibonacci_lattice
 from gaigs.geometry import to_spherical
 from gaigs.model import Model, Prediction
 from gaigs.query import Batch, Query
 from gaigs.scene import Scene
-from gaigs.tokenizer import Tokens
 from gaigs.tokenizer.euclidean import BAND_FREQUENCIES, fourier_features, learnable_octaves
 from gaigs.tokenizer.euclidean import octaves as angular_frequencies
 from gaigs_swift_wrf.plane import PlaneGaussians, add_up
@@ -47,6 +46,11 @@ class SwiftWrf(Model):
 
     Source: SwiftWRF (Liu et al., arXiv 2506.12787).
     """
+
+    learning_rates: Mapping[str, float] = {
+        **dict.fromkeys(PlaneGaussians._fields, 5e-3),  # means and factors in [rad]
+        **Model.learning_rates,
+    }
 
     def __init__(self, scene: Scene, count: int, width: int, layers: int, octaves: tuple[int, int] | None):
         super().__init__(scene)

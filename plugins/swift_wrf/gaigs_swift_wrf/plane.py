@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.directions import Directions, Grid
+from gaigs.geometry import Directions, Grid
 
 
 class PlaneGaussians(NamedTuple):
@@ -24,7 +24,7 @@ class PlaneGaussians(NamedTuple):
     amplitudes: Float[Tensor, "b n"]
 
 
-def add_up(gaussians: PlaneGaussians, directions: Directions, pixel_variance: float) -> Float[Tensor, "b *shape"]:
+def add_up(gaussians: PlaneGaussians, directions: Directions, pixel_variance: float) -> Float[Tensor, " b *shape"]:
     """sum_i a_i exp(-x' C_i^-1 x / 2), with x the direction less the mean, its azimuth taken to the nearest image.
 
     Args:

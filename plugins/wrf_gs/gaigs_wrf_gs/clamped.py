@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.directions import Directions
-from gaigs.pooling.spectrum import Spectrum
+from gaigs.geometry import Directions
+from gaigs.pooling.spectrum import SpectrumPooling
 from gaigs.query import Query
 
 
@@ -27,7 +27,7 @@ class _Clamp(torch.autograd.Function):
         return gradient.masked_fill(outwards, 0)
 
 
-class Clamped(Spectrum):
+class Clamped(SpectrumPooling):
     """C_0, or |C_0 + j C_1|, clamped to 0..1; beyond, gradients that lead back count.
 
     Args:

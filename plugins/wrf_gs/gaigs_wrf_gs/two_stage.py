@@ -8,20 +8,20 @@ from torch import Tensor, nn
 from torch.nn.functional import relu
 
 from gaigs.deformation import Deformation, Residuals
-from gaigs.deformation.two_branch import CLEAR, DARKEST, TokenLinear
-from gaigs.placement import Placed
+from gaigs.deformation.two_branch import INITIAL_ATTENUATION, LEAST_ATTENUATION, TokenLinear
+from gaigs.gaussians import Placed, Tokens
 from gaigs.projection import NEAR
 from gaigs.query import Query
 from gaigs.scene import Scene
-from gaigs.tokenizer import Tokens
-from gaigs.tokenizer.euclidean import FINEST, fourier_features
+from gaigs.tokenizer.euclidean import MAX_OCTAVE, fourier_features
 
 
 class TwoStage(Deformation):
     """Attenuation and signal of every Gaussian, for a transmitter and a receiver.
 
-    Attenuation network: E(P_x) -> layers of one width with ReLU, into the middle one of which E(P_x) is fed again. From
-    its end h the attenuation delta and a feature, both linear; delta through a sigmoid, ``CLEAR`` at the start.
+    Attenuation network: E(P_x) -> layers of one width with ReLU, E(P_x) is fed into the middle one again. From
+    its end h the attenuation delta and a feature, both linear; delta through a sigmoid, at first
+    ``INITIAL_ATTENUATION``.
     Signal network: [feature, E(P_TX), CLS, PE(view)] -> width -> half of it, with ReLU -> the signal of each channel.
     The view is the unit vector from the receiver to the Gaussian. So matter is the same for all, and what it sends
     depends on who sends and who hears.
@@ -55,8 +55,8 @@ class TwoStage(Deformation):
         for option, count, least in (("width", width, 2), ("layers", layers, 2), ("view_octaves", view_octaves, 0)):
             if count < least:
                 raise ValueError(f"deformation.{option} must be at least {least}, got {count}")
-        if view_octaves > FINEST:
-            raise ValueError(f"deformation.view_octaves must be at most {FINEST}, got {view_octaves}")
+        if view_octaves > MAX_OCTAVE:
+            raise ValueError(f"deformation.view_octaves must be at most {MAX_OCTAVE}, got {view_octaves}")
         self.scene = scene
         links, gaussians, transmitters = tokenizer_widths
         matter = 0, gaussians, 0
@@ -69,12 +69,12 @@ class TwoStage(Deformation):
         self.signal_first = TokenLinear((links, width, transmitters), width, hidden=view)
         self.signal_second, self.signal = nn.Linear(width, width // 2), nn.Linear(width // 2, channels)
         nn.init.zeros_(self.attenuation.weight)
-        nn.init.constant_(self.attenuation.bias, math.log(CLEAR / (1 - CLEAR)))
+        nn.init.constant_(self.attenuation.bias, math.log(INITIAL_ATTENUATION / (1 - INITIAL_ATTENUATION)))
 
     def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
         """Signal (b, n, channels, 1), attenuations (b, n)."""
         b, n = len(query), placed.means.shape[1]
-        # One row, where Gaussians stand still: what is matter alone is computed once for all queries.
+        # One row, where Gaussians stand still: the part that depends on matter alone is computed once for all queries.
         nobody = tokens.scene.new_zeros(1 if tokens.gaussians.ndim == 2 else b, 0)
         matter = Tokens(nobody, tokens.gaussians, nobody)
         hidden = relu(self.first(matter))
@@ -83,7 +83,7 @@ class TwoStage(Deformation):
         hidden = relu(self.again(matter, hidden))
         for layer in self.behind:
             hidden = relu(layer(hidden))
-        attenuations = DARKEST + (1 - DARKEST) * self.attenuation(hidden)[..., 0].sigmoid()
+        attenuations = LEAST_ATTENUATION + (1 - LEAST_ATTENUATION) * self.attenuation(hidden)[..., 0].sigmoid()
         excited = tokens._replace(gaussians=self.feature(hidden))
         signal = relu(self.signal_first(excited, self.view(placed, query)))
         signal = self.signal(relu(self.signal_second(signal)))

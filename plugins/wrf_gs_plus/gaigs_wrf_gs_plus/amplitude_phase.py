@@ -6,18 +6,17 @@ from torch.nn.functional import relu
 
 from gaigs.deformation import Deformation, Residuals
 from gaigs.deformation.two_branch import TokenLinear
-from gaigs.placement import Placed
+from gaigs.gaussians import Placed, Tokens
 from gaigs.query import Query
-from gaigs.tokenizer import Tokens
 
 
 class AmplitudePhase(Deformation):
     """What a transmitter adds to every Gaussian's rotation, scale and signal.
 
-    Network: u = [E(P_x), E(P_TX), CLS] -> layers of one width with ReLU, into the middle one of which u is fed again.
+    Network: u = [E(P_x), E(P_TX), CLS] -> layers of one width with ReLU, u is fed into the middle one again.
     Linear heads from its end: rotation and scale, 0 at the start; amplitude a and phase phi of each wave. A wave is a
     pair of channels, real and imaginary part, and its residual a exp(j phi); of a map with an odd number of channels,
-    which are real, each is a wave of which the real part counts.
+    which are real, the real part of each wave counts.
 
     Published is |a exp(j phi)|, in which the phase cancels.
 

@@ -48,17 +48,7 @@ def test_the_depth_is_the_integral_of_the_density(obstacles):
     assert depths.max() > 1
 
 
-def test_through_the_middle_of_a_ball_it_is_that_of_a_bell_curve():
-    ball = Obstacles(1, LOWER, UPPER).double()
-    with torch.no_grad():
-        ball.log_widths.fill_(math.log(0.3))
-        ball.log_densities.fill_(math.log(2.0))
-    ray = torch.tensor([[0.0, 30.0, 40.0]], dtype=torch.float64)
-    depth = ball(ball.centres - ray, ball.centres + ray)
-    assert depth.item() == pytest.approx(2.0 * 0.3 * math.sqrt(2 * math.pi))
-
-
-def test_pieces_of_a_way_add_up_and_its_direction_does_not_matter(obstacles):
+def test_pieces_of_a_segment_add_up_and_its_direction_does_not_matter(obstacles):
     starts, ends = segments(20)
     middles = torch.lerp(starts, ends, 0.3)
     whole = obstacles(starts, ends)
@@ -85,7 +75,7 @@ def test_gradients_are_the_derivatives(obstacles):
     assert torch.autograd.gradcheck(depth, leaves)
 
 
-def test_no_way_has_no_depth(obstacles):
+def test_a_segment_of_no_length_has_no_depth(obstacles):
     start = segments(5)[0].requires_grad_()
     end = start.detach().clone().requires_grad_()
     depth = obstacles(start, end)
@@ -118,8 +108,8 @@ def test_single_precision_is_near_double(obstacles):
         torch.testing.assert_close(gradient.double(), expected, rtol=0, atol=1e-4 * expected.abs().max().item())
 
 
-@pytest.mark.parametrize("width", [1e-4, 1e-2, 1.0, 1e2, 1e5])
-@pytest.mark.parametrize("density", [1e-12, 1.0, 1e6])
+@pytest.mark.parametrize("width", [1e-4, 1.0, 1e5])
+@pytest.mark.parametrize("density", [1e-12, 1e6])
 def test_extreme_obstacles_have_finite_gradients(width, density):
     torch.manual_seed(0)
     obstacles = Obstacles(20, LOWER, UPPER)
@@ -139,7 +129,7 @@ def test_extreme_obstacles_have_finite_gradients(width, density):
 
 
 def test_wide_obstacles_are_uniform_matter():
-    """The depth is then the density times the way."""
+    """The depth is the density times the length."""
     obstacles = Obstacles(3, LOWER, UPPER).double()
     with torch.no_grad():
         obstacles.log_widths.fill_(math.log(1e4))

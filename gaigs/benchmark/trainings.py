@@ -1,0 +1,204 @@
+"""Benchmarks whose rows are whole runs, each in a folder of its own."""
+
+import gc
+import json
+import logging
+import math
+import re
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from omegaconf import OmegaConf
+
+from gaigs import runs
+from gaigs.benchmark import UNAVAILABLE, Benchmark, Context, Row, grouped
+from gaigs.configuration import run_folder
+from gaigs.data import load
+from gaigs.processes import lacks_memory
+from gaigs.registry import check_type, registry
+from gaigs.report.curves import read_validations
+from gaigs.report.runs import train_seconds
+from gaigs.report.table import monitor_names
+
+log = logging.getLogger(__name__)
+
+COSTS = ("train_seconds", "inference_ms", "render_ms", "num_parameters", "num_gaussians", "checkpoint_bytes")
+
+
+class Trainings(Benchmark):
+    """Rows are runs that differ from a reference in one key.
+
+    Args:
+        trainer: Options of ``trainer`` for each run; the command line has precedence.
+        axes: By name: ``key``, its ``values``, and the reference ``of``, a list of overrides.
+        factors: Values of an axis without ``values``, in multiples of a default of whole numbers.
+
+    Raises:
+        TypeError, ValueError: An axis has another form.
+    """
+
+    keys = ("device", "scene", "trainer", "of", "key", "default", "axis", "value")
+    values = ("task", "split", "seed", "steps", "validation", "test", "compared", *COSTS, "curve")
+
+    def __init__(self, trainer: dict, axes: dict[str, dict], factors: Sequence[float] = ()):
+        self.trainer, self.axes, self.factors = trainer, axes, factors
+        for name, axis in axes.items():
+            if axis.keys() | {"values"} != {"key", "of", "values"}:
+                raise ValueError(f"benchmark.axes.{name} must have key, of and values, got {', '.join(axis)}")
+            for part, kind in (("key", str), ("of", list[str]), ("values", list | None)):
+                check_type(f"benchmark.axes.{name}.{part}", axis.get(part), kind)
+
+    def reference(self, context: Context) -> dict:
+        """The configuration of the command line.
+
+        Raises:
+            ValueError, OSError: Its data cannot be read, or its split has no validation links.
+        """
+        config = context.compose()
+        split = load(config["data"], config["split"], config["task"]["name"]).split
+        if not len(split.validation):
+            raise ValueError(f"split {split.name} must have validation links; set split.validation above 0")
+        return config
+
+    def options(self, context: Context) -> list[str]:
+        """Overrides of the trainer, without those of the command line."""
+        given = {word.lstrip("+~").partition("=")[0] for word in context.overrides}
+        options = {f"trainer.{key}": value for key, value in self.trainer.items()}
+        return [f"{key}={written(value)}" for key, value in options.items() if key not in given]
+
+    def compose(self, context: Context, overrides: Sequence[str]) -> dict:
+        """The configuration of a run; look-ups are runs of their own, so it has no baselines."""
+        return context.compose(
+            *self.options(context), f"trainer.accelerator={context.device}", "baselines=[]", *overrides
+        )
+
+    def cell(self, context: Context, of: Sequence[str], **keys: str) -> list[Row]:
+        """The cell of one run."""
+        common = {"scene": " ".join(context.overrides), "trainer": " ".join(self.options(context))}
+        return [common | {"of": shlex.join(of), "default": ""} | keys]
+
+    def cells_of_axes(self, context: Context) -> Iterator[list[Row]]:
+        """Cells of each axis whose key the reference has.
+
+        Raises:
+            ValueError: A reference cannot be composed, or an axis has neither values nor a default to multiply.
+        """
+        for name, axis in self.axes.items():
+            try:
+                default = OmegaConf.select(OmegaConf.create(self.compose(context, axis["of"])), axis["key"])
+            except ValueError as error:
+                raise ValueError(f"benchmark.axes.{name} (~benchmark.axes.{name} leaves it out): {error}") from error
+            if default is None:
+                log.info("%s: %s is left out: this configuration has no %s", self.name, name, axis["key"])
+                continue
+            if OmegaConf.is_config(default):
+                default = [*default] if OmegaConf.is_list(default) else default.get("name")
+            values = axis.get("values") or multiples(default, self.factors)
+            if not values:
+                raise ValueError(f"benchmark.axes.{name} needs values, a list for {axis['key']}")
+            for value in values if default in values else [*values, default]:
+                keys = {"axis": name, "key": axis["key"], "value": written(value), "default": written(default)}
+                yield self.cell(context, axis["of"], **keys)
+
+    def measure(self, cell: Sequence[Row], context: Context) -> Iterable[dict]:
+        """Trains and tests, or reads the run that has ended in its folder.
+
+        Raises:
+            OSError: A file cannot be written.
+        """
+        (row,) = cell
+        words = overrides_of(row)
+        places = row["device"], f"{row['scene']} {row['trainer']}".strip(), ",".join(words)
+        folder = context.folder.joinpath(self.name, *map(run_folder, places))
+        log.info("%s: %s %s", self.name, row["axis"], " ".join(words))
+        try:
+            metrics = runs.run(self.compose(context, words), folder)
+        except Exception as error:  # of whatever system; the next one goes on
+            if lacks_memory(error) or (isinstance(error, OSError) and not isinstance(error, FileNotFoundError)):
+                raise
+            log.debug("", exc_info=True)  # shown by hydra.verbose=true
+            text = f"{type(error).__name__}: {' '.join(str(error).removeprefix('gaigs: ').split())}"
+            log.error("%s: %s", " ".join(words), text)
+            return [row | {"status": UNAVAILABLE + text}]
+        gc.collect()  # Lightning leaves reference cycles
+        return [row | results(metrics, folder)]
+
+
+class Score(NamedTuple):
+    """The scores of a task: names of its first metric and of the mean validation score, and the latter's title, unit
+    (empty for a ratio) and direction."""
+
+    first: str
+    mean: str
+    title: str
+    unit: str
+    higher_is_better: bool
+
+    @classmethod
+    def of(cls, task: str) -> "Score":
+        """The scores of a task by name."""
+        known = registry("task").get(task).metrics()
+        first = next(iter(known))
+        mean = monitor_names(task)[1] or first
+        title, is_better, _ = known[mean]
+        return cls(first, mean, title, title.partition("[")[2].rstrip("]"), is_better)
+
+    def loss(self, score: str | float) -> float:
+        """A validation score as a number that is lower if the score is better; infinite for an empty text."""
+        return math.inf if score == "" else (-1 if self.higher_is_better else 1) * float(score)
+
+
+def sections(name: str, rows: Sequence[Row]) -> Iterator[tuple[str, Score, list[Row]]]:
+    """Rows that can be compared with each other: a heading with their conditions and command, score, and rows."""
+    groups = grouped(rows, "scene", "trainer", "device", "task", "split")
+    for (scene, trainer, device, task, split), own in groups.items():
+        scene = re.sub(r"=[/~.]\S*/", "=", scene)  # a page shows the last part of a path
+        title = ", ".join(filter(None, (task, scene, f"split {split}")))
+        command = f"python -m gaigs command=benchmark benchmark={name} {scene}".rstrip()
+        conditions = "; ".join(filter(None, (device, trainer)))
+        yield f"## {title}\n\n{conditions}\n\n```\n{command}\n```\n", Score.of(task), own
+
+
+def overrides_of(row: Row) -> list[str]:
+    """Overrides of a row's run beside those of the command line."""
+    of = shlex.split(row["of"])
+    if row["value"] == row["default"]:
+        return of
+    return [*(word for word in of if word.partition("=")[0] != row["key"]), f"{row['key']}={row['value']}"]
+
+
+def results(metrics: Mapping, folder: Path) -> dict:
+    """Values of a run's row, from its ``metrics.json`` and its log; kriging is the last point of the curve."""
+    task, own = metrics["task"], next(iter(metrics["models"]))
+    score, test = Score.of(task), metrics["models"][own]
+    validation = (metrics["validation"] or {}).get(own, {}).get(score.mean)
+    points = read_validations(folder, monitor_names(task)[0])
+    curve = [(point.seconds, point.score) for point in points if math.isfinite(point.seconds)]
+    if metrics.get("kriging") and curve and validation is not None:
+        curve.append((train_seconds(metrics), validation))
+    found = {key: metrics[key] for key in ("task", "split", "seed", *COSTS)} | {"train_seconds": train_seconds(metrics)}
+    found |= {"validation": validation, "test": test[score.mean], "compared": test[score.first]}
+    found["steps"] = points[-1].step + 1 if points else None
+    return found | {"curve": " ".join(f"{time:.1f}:{value:.5g}" for time, value in curve)}
+
+
+def multiples(default: object, factors: Sequence[float]) -> list:
+    """Multiples of a whole number or of a list of them, each at least 1; none of other values."""
+    entries = default if isinstance(default, list) else [default]
+    if not all(type(entry) is int for entry in entries):
+        return []
+    found = dict.fromkeys(tuple(max(1, round(entry * factor)) for entry in entries) for factor in factors)
+    return [[*value] if isinstance(default, list) else value[0] for value in found]
+
+
+def written(value: object) -> str:
+    """A value in the syntax of Hydra's command line."""
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}: {written(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(written, value))}]"
+    if isinstance(value, str):
+        return value if re.fullmatch(r"[\w.:+-]+", value) else f"'{value}'"
+    return json.dumps(value)

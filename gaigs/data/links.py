@@ -1,0 +1,141 @@
+"""Links of a registered reader, or of arrays in memory."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gaigs import configuration
+from gaigs.antenna import Receiver
+from gaigs.data import Links, load
+from gaigs.data.readings import gateway
+from gaigs.io.tables import number_places
+from gaigs.query import Query, as_numbers, as_positions, check_carrier
+from gaigs.registry import registry
+from gaigs.task import Task
+
+
+def links(reader: str | None = None, /, **options) -> Links:
+    """Links of a registered reader, or of arrays in memory, with their split.
+
+    Args:
+        reader: Name of a data set's reader, e.g. ``"synthetic"``, ``"nerf2_spectrum"``, ``"rssi_csv"``; None for
+            arrays.
+        options: ``split``, the name of a registered split, by default the reader's own, ``"random"`` for arrays; and
+            the options of reader and split by their names. For arrays those of ``from_arrays``:
+            ``task``, ``transmitters`` (n, 3) [m], ``receivers``, ``labels``.
+
+    Raises:
+        FileNotFoundError: The reader finds no data there.
+        TypeError: An option has a wrong type.
+        ValueError: A name is unknown, or files, arrays or the split do not fit.
+
+    Example:
+        >>> gaigs.links("synthetic_rssi", transmitters=50, split="blocks", edge=2.0).split.name
+        'blocks 2 m, test 0.2, validation 0.1, seed 0'
+        >>> places = [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [2.0, 2.0, 1.0]]
+        >>> readings = [[-40.0, -52.0], [-45.0, float("nan")], [-50.0, -41.0], [-55.0, -44.0]]  # [dBm], nan: not heard
+        >>> len(gaigs.links(task="rssi", transmitters=places, receivers=[[0, 0, 2], [3, 3, 2]], labels=readings))
+        7
+    """
+    if reader is None:
+        needed = ("task", "transmitters", "receivers", "labels")
+        if missing := [key for key in needed if key not in options]:
+            raise ValueError(
+                f"links takes the name of a reader first, or arrays: {', '.join(needed)}; {', '.join(missing)} must be "
+                "given"
+            )
+        return from_arrays(**options)
+    config = configuration.composed([f"data={reader}"], options, ("data", "split"))
+    return load(config["data"], config["split"])
+
+
+def from_arrays(
+    task: str | Task,
+    transmitters: Float[Tensor, "n 3"],
+    receivers: Receiver | Sequence[Receiver] | Float[Tensor, "k 3"],
+    labels: Tensor,
+    index: Int[Tensor, " n"] | None = None,
+    frequency: float | Float[Tensor, " n"] | None = None,
+    split: str | Mapping = "random",
+    **options,
+) -> Links:
+    """Links of arrays in memory, with their split; every argument that torch can convert is an array.
+
+    Args:
+        task: Task of the labels: ``"rssi"`` (scalars [dBm]), or a task with its axes, e.g.
+            ``gaigs.task.spectrum.Spectrum(elevations, azimuths, "")`` or ``gaigs.task.csi.Csi(elements, frequencies)``.
+        transmitters: Positions, world frame (n, 3) [m].
+        receivers: ``Receiver`` objects, or positions (3,) or (k, 3) [m] of single antennas that look along the axes.
+        labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver, (n, k, ...). A
+            reading that is NaN and a channel of zeros was not heard, and is left out.
+        index: Receiver of each link (n,), from 0. Not needed with one receiver; with n positions, each of one link; or
+            with labels (n, k, ...).
+        frequency: Carrier, one or one a link [Hz]; None if unknown, for channels the middle of the subcarriers.
+        split: Name of a registered split.
+        options: Options of the split.
+
+    Raises:
+        TypeError: An option has a wrong type.
+        ValueError: Shapes do not fit, a number is not finite or out of range, or there is nothing to split.
+    """
+    config = configuration.composed([], {"split": split, **options}, ("split",))["split"]
+    task = registry("task").build(task)
+    places = as_positions("transmitters", transmitters).detach()
+    if places.ndim != 2 or not len(places):
+        raise ValueError(f"transmitters must be (n, 3) positions [m], got shape {tuple(places.shape)}")
+    if isinstance(receivers, Receiver):
+        receivers = [receivers]
+    if not (isinstance(receivers, Sequence) and all(isinstance(each, Receiver) for each in receivers)):
+        stands = as_positions("receivers", receivers).reshape(-1, 3)
+        if index is None and len(stands) == len(places) > 1 and np.ndim(labels) == 1 + len(task.shape):
+            stands, index = stands.unique(dim=0, return_inverse=True)
+        receivers = [gateway(f"rx{k}", place) for k, place in enumerate(stands)]
+    if np.ma.is_masked(labels):
+        raise ValueError("labels must be plain numbers, got a masked array; fill it with nan where nothing was heard")
+    if task.dtype.is_complex:
+        labels = torch.as_tensor(labels).detach().to(task.dtype)
+    else:
+        labels = as_numbers("labels", labels, f"labels of task {task.name!r}").detach().to(task.dtype)
+    count, most, shape = len(places), len(receivers), tuple(task.shape)
+    rows = torch.arange(count)
+    if tuple(labels.shape) == (count, most, *shape) and index is None:
+        rows, index = rows.repeat_interleave(most), torch.arange(most).repeat(count)
+        labels = labels.flatten(0, 1)
+    elif tuple(labels.shape) == (count, *shape) and (index is not None or most == 1):
+        index = torch.zeros(count, dtype=torch.long) if index is None else torch.as_tensor(index)
+    else:
+        raise ValueError(
+            f"labels of task {task.name!r} must be {(count, *shape)} with the receiver of each link in index, or "
+            f"{(count, most, *shape)}, one for each transmitter and receiver, got {tuple(labels.shape)}"
+        )
+    is_whole = not (index.is_floating_point() or index.is_complex() or index.dtype == torch.bool)
+    if not is_whole or index.shape != (len(rows),) or not ((index >= 0) & (index < most)).all():
+        raise ValueError(f"index must be {count} whole numbers from 0 to {most - 1}, got {index.tolist()[:5]} ...")
+    flat = labels.reshape(len(rows), -1)
+    heard = (flat != 0).any(1) if task.dtype.is_complex else ~flat.isnan().all(1)
+    if not heard.any() or not flat[heard].isfinite().all():
+        raise ValueError("labels must be finite where something was heard, and something must have been heard")
+    carriers = None
+    if frequency is None and hasattr(task, "frequencies"):
+        frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
+    if frequency is not None:
+        carriers = as_numbers("frequency", frequency, "a carrier in Hz")
+        if carriers.ndim and carriers.shape != (count,):
+            raise ValueError(f"frequency must be one number, or {count}, one for each transmitter, got {len(carriers)}")
+        carriers = carriers.expand(count)[rows]
+        for carrier in carriers.unique().tolist():
+            check_carrier("frequency", carrier)
+        carriers = carriers[heard]
+    made = Links(
+        query=Query(places[rows][heard], index[heard].long(), carriers),
+        receivers=tuple(receivers),
+        labels=labels[heard],
+        task=task,
+        rows=number_places(places.tolist())[1][rows][heard],
+        remarks=f"{int((~heard).sum())} links were not heard and are left out" if not heard.all() else "",
+    )
+    return replace(made, split=registry("split").build(config, links=made))

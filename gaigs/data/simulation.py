@@ -1,0 +1,220 @@
+"""Data sets of simulated rooms: the same labels, whatever simulates the room."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from jaxtyping import Bool, Complex, Float, Int
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.antenna import Array, Receiver
+from gaigs.data import Links, Parts
+from gaigs.data.nerf2_spectrum import NORMALISATION
+from gaigs.geometry import Grid, Pose
+from gaigs.propagation import bartlett, min_max
+from gaigs.query import Query, check_carrier
+from gaigs.registry import check_type
+from gaigs.task.csi import Csi
+from gaigs.task.rssi import Rssi
+from gaigs.task.spectrum import Spectrum
+
+PART = 64
+"""Transmitters simulated at a time: the waves of all paths, elements and frequencies at once would need a hundred times
+the memory of the labels."""
+
+
+@dataclass(frozen=True)
+class SimulatedRoom:
+    """A room with its receivers, and the responses of their antennas.
+
+    Attributes:
+        pose: Position and orientation of the receiver with an array.
+        gateways: Receivers with a single antenna.
+        edges: Line segments to draw in figures (k, 2, 3) [m].
+        place: Function from a count and a seed to random places of transmitters (count, 3) [m].
+        frequency_offsets: Function from a bandwidth to frequencies that sample the band, relative to its middle [Hz].
+        respond: Function from places (n, 3), a receiver, a frequency and offsets (f,) to the response of each element
+            to unit-power transmitters, ``PART`` of them at a time (part, elements, f).
+    """
+
+    pose: Pose
+    gateways: tuple[Receiver, ...]
+    edges: Float[Tensor, "k 2 3"]
+    place: Callable[[int, int], Tensor]
+    frequency_offsets: Callable[[float], Tensor]
+    respond: Callable[[Tensor, Receiver, float, Tensor], Iterable[Tensor]]
+
+
+def simulate_spectra(
+    room: SimulatedRoom,
+    spectrum: str,
+    transmitters: int,
+    frequency: float | Sequence[float],
+    bandwidth: float,
+    seed: int,
+) -> Links:
+    """Spectra of transmitters at random places; ``gaigs.data.synthetic.furnished_room`` describes the options."""
+    carriers = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
+    for carrier in carriers:
+        check_type("frequency", carrier, float)
+        check_carrier("frequency", carrier)
+    if not carriers or len(set(carriers)) < len(carriers):
+        raise ValueError(f"frequency must be a carrier or several different ones [Hz], got {frequency}")
+    check_spectrum(spectrum)
+    places = room.place(transmitters, seed)
+    receiver = patch_array(room.pose, max(carriers))
+    offsets = room.frequency_offsets(bandwidth) if spectrum == "band" else torch.zeros(1)
+    grid = Grid.degrees()
+    labels = [to_spectra(room.respond(places, receiver, f, offsets), grid, receiver.array, f) for f in carriers]
+    rows = torch.arange(transmitters).repeat_interleave(len(carriers))
+    return Links(
+        query=Query(places[rows], torch.zeros_like(rows), torch.tensor(carriers).float().repeat(transmitters)),
+        receivers=(receiver,),
+        labels=torch.stack(labels, 1).flatten(0, 1),
+        task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
+        rows=rows,
+        official=partial(last_fifth, transmitters, rows),
+        bandwidth=bandwidth if spectrum == "band" else 0.0,
+        edges=room.edges,
+    )
+
+
+def simulate_channels(
+    room: SimulatedRoom, transmitters: int, frequency: float, bandwidth: float, subcarriers: int, seed: int
+) -> Links:
+    """Channels of transmitters at random places; ``gaigs.data.synthetic_csi`` describes the options.
+
+    A channel is in Friis' unit: its magnitude is the square root of the power that an element receives of a unit power
+    sent, between antennas of unit gain. Its time dependence is exp(+j omega t). There is no noise.
+    """
+    if not 0 < bandwidth < math.inf:
+        raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
+    if subcarriers < 1:
+        raise ValueError(f"subcarriers must be at least 1, got {subcarriers}")
+    offsets = torch.zeros(1, dtype=torch.float64)
+    if subcarriers > 1:
+        offsets = torch.linspace(-bandwidth / 2, bandwidth / 2, subcarriers, dtype=torch.float64)
+    places = room.place(transmitters, seed)
+    receiver = patch_array(room.pose, frequency)
+    rows = torch.arange(transmitters)
+    return Links(
+        query=Query(places, torch.zeros_like(rows), torch.full((transmitters,), float(frequency))),
+        receivers=(receiver,),
+        labels=torch.cat([*room.respond(places, receiver, frequency, offsets)]).to(torch.complex64),
+        task=Csi(len(receiver.array), frequency + offsets),
+        rows=rows,
+        official=partial(last_fifth, transmitters, rows),
+        edges=room.edges,
+    )
+
+
+def simulate_readings(room: SimulatedRoom, transmitters: int, noise: float, sensitivity: float, seed: int) -> Links:
+    """Signal strength of transmitters of 0 dBm at random places; ``gaigs.data.synthetic_rssi`` describes the options.
+
+    Power is averaged over the band of Bluetooth's advertising channels before it becomes dB. The links of one place
+    share a row.
+    """
+    if not 0 <= noise < math.inf:
+        raise ValueError(f"noise must be a standard deviation, 0 or more [dB], got {noise}")
+    places = room.place(transmitters, seed)
+    frequency, bandwidth = 2.441e9, 78e6  # Bluetooth's advertising channels span 2.402 to 2.480 GHz
+    offsets = room.frequency_offsets(bandwidth)
+    strengths = torch.stack(
+        [torch.cat([*map(rss_dbm, room.respond(places, each, frequency, offsets))]) for each in room.gateways], 1
+    )
+    # A seed of its own: the places come from the random numbers of ``seed`` itself.
+    generator = torch.Generator().manual_seed(hash((seed, 1)) % 2**63)
+    readings = strengths + noise * torch.randn(strengths.shape, dtype=strengths.dtype, generator=generator)
+    heard = readings >= sensitivity
+    for receiver, any_heard in zip(room.gateways, heard.any(0), strict=True):
+        if not any_heard:
+            raise ValueError(
+                f"sensitivity must let each gateway hear a reading, but {receiver.name!r} hears none of {len(places)} "
+                f"at {sensitivity:g} dBm; lower it"
+            )
+    rows, columns = heard.nonzero(as_tuple=True)
+    return Links(
+        query=Query(places[rows], columns, torch.full((len(rows),), frequency)),
+        receivers=room.gateways,
+        labels=readings[heard].float(),
+        task=Rssi(),
+        rows=rows,
+        official=partial(last_fifth, transmitters, rows),
+        bandwidth=bandwidth,
+        edges=room.edges,
+        remarks=(
+            f"{len(rows)} readings of {len(places)} places at {len(room.gateways)} gateways; "
+            f"{int((~heard).sum())} below {sensitivity:g} dBm were not heard and are left out"
+        ),
+    )
+
+
+def check_spectrum(spectrum: str) -> None:
+    """Raises a ``ValueError`` for another kind of spectrum than ``band`` and ``carrier``."""
+    if spectrum not in ("band", "carrier"):
+        raise ValueError(f"spectrum must be 'band' or 'carrier', got {spectrum!r}")
+
+
+def patch_array(pose: Pose, frequency: float) -> Receiver:
+    """A receiver with 4 x 4 patches, as in the NeRF² spectra, half a wavelength of the frequency [Hz] apart.
+
+    Raises:
+        ValueError: The frequency is out of range.
+    """
+    check_carrier("frequency", frequency)
+    return Receiver("gateway1", pose, Array.planar(4, 4, speed_of_light / frequency / 2, "cosine"))
+
+
+def last_fifth(transmitters: int, rows: Int[Tensor, " n"]) -> Parts:
+    """Official parts of links, given the transmitter of each; the last fifth of the transmitters tests."""
+    training = transmitters - max(1, round(transmitters / 5))
+    return (rows < training).nonzero()[:, 0], (rows >= training).nonzero()[:, 0]
+
+
+def draw_places(
+    lower: Float[Tensor, "3"],
+    upper: Float[Tensor, "3"],
+    is_free: Callable[[Float[Tensor, "k 3"]], Bool[Tensor, " k"]],
+    count: int,
+    seed: int,
+) -> Float[Tensor, "count 3"]:
+    """Random places [m], uniform over the free part of a box.
+
+    Raises:
+        ValueError: There are fewer than 2.
+    """
+    if count < 2:
+        raise ValueError(f"transmitters must be at least 2, one to train and one to test on, got {count}")
+    generator = torch.Generator().manual_seed(seed)
+    places = torch.zeros(0, 3)
+    while len(places) < count:
+        tries = lower + (upper - lower) * torch.rand(count, 3, generator=generator)
+        places = torch.cat((places, tries[is_free(tries)]))
+    return places[:count]
+
+
+def sample_band(bandwidth: float, longest: float) -> Float[Tensor, " f"]:
+    """Frequencies that sample a band, relative to its middle [Hz]; dense enough for paths up to a length [m].
+
+    Raises:
+        ValueError: The bandwidth is not positive.
+    """
+    if not 0 < bandwidth < math.inf:
+        raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}; one frequency is the spectrum 'carrier'")
+    count = math.ceil(bandwidth * longest / speed_of_light) + 1
+    return torch.linspace(-bandwidth / 2, bandwidth / 2, count, dtype=torch.float64)
+
+
+def to_spectra(
+    responses: Iterable[Complex[Tensor, "part elements f"]], grid: Grid, array: Array, frequency: float
+) -> Float[Tensor, "n rows columns"]:
+    """Spectra of an array's responses at a carrier [Hz], float32 in [0, 1]."""
+    return torch.cat([min_max(bartlett(part, grid, array, frequency)).float() for part in responses])
+
+
+def rss_dbm(responses: Complex[Tensor, "b elements f"], tx_power_dbm: float = 0.0) -> Float[Tensor, " b"]:
+    """Received signal strength [dBm]: power averaged over elements and frequencies."""
+    return tx_power_dbm + 10 * torch.log10(responses.abs().square().mean((1, 2)))

@@ -1,0 +1,96 @@
+"""Kriged residuals of one receiver in a compact form: places, weights, and principal components."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.kriging.fit import Hyperparameters
+from gaigs.kriging.kernel import cholesky_factor, kernel
+from gaigs.kriging.links import at_directions
+from gaigs.query import Batch
+from gaigs.scene import Scene
+
+
+class Field(nn.Module):
+    """The kriged residual at one receiver.
+
+    With k known links and q principal components of their residuals it holds places (k, d) [m], see ``coordinates``;
+    weights (k, q), the components' scores over the covariances of the links; and components (q, *shape) in half
+    precision, complex ones as real and imaginary part in the last dimension. ``load_state_dict`` takes any k and q.
+
+    Args:
+        scene: Receivers and task.
+    """
+
+    def __init__(self, scene: Scene):
+        super().__init__()
+        task = scene.task
+        self.scene = scene
+        parts = (2,) if task.dtype.is_complex else ()
+        self.register_buffer("places", torch.zeros(0, 3 + scene.has_band, dtype=torch.float64))
+        self.register_buffer("weights", torch.zeros(0, 0, dtype=task.dtype))
+        self.register_buffer("components", torch.zeros(0, *task.shape, *parts, dtype=torch.float16))
+        self.register_buffer("widened", torch.zeros(0, *task.shape, dtype=task.dtype), persistent=False)
+
+    def solve(self, places: Float[Tensor, "k d"], residuals: Tensor, process: Hyperparameters) -> None:
+        """Takes residuals (k, *shape) at their places."""
+        residuals = residuals.reshape(len(residuals), -1)
+        components = principal_components(residuals)
+        if components.is_complex():
+            components = torch.view_as_real(components)
+        shape = (len(components), *self.components.shape[1:])
+        # All buffers have the strides of a loaded state: other layouts round products differently.
+        like_loaded = lambda own, values: own.new_empty(values.shape).copy_(values)
+        self.components = like_loaded(self.components, components.reshape(shape))
+        self._widen()
+        # Scores of the rounded components, so that each component corrects the rounding of the others.
+        kept = self.widened.cpu().reshape(len(components), -1)
+        wide = torch.promote_types(kept.dtype, torch.float64)
+        gram, cross = (kept @ kept.mH).to(wide), (residuals @ kept.mH).to(wide)
+        scores = torch.linalg.solve(gram, cross, left=False)
+        factor = cholesky_factor(places, process.length, process.nugget)
+        self.weights = like_loaded(self.weights, torch.cholesky_solve(scores, factor.to(wide)))
+        self.places = like_loaded(self.places, places)
+
+    def forward(self, places: Float[Tensor, "b d"], length: Tensor, batch: Batch) -> Tensor:
+        """Kriged residuals (b, *shape) at some places, in the directions of a batch."""
+        covariances = kernel(places, self.places, length)
+        components = at_directions(self.widened, batch, self.scene)
+        return torch.tensordot(covariances.to(self.weights) @ self.weights, components, 1)
+
+    def _widen(self) -> None:
+        """Converts the components to the task's precision, in which products are fast."""
+        components = self.components.float()
+        self.widened = torch.view_as_complex(components) if self.weights.is_complex() else components
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        for name in ("places", "weights", "components"):
+            stored = state_dict.get(f"{prefix}{name}")
+            if stored is not None:
+                own = getattr(self, name)
+                setattr(self, name, own.new_empty(stored.shape))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self._widen()
+
+
+LEFT, MOST = 5e-4, 256
+"""Share of the residuals' energy that the components may leave out, and their largest number: SSIM hardly changes
+below this share, and visibly at ten times as much."""
+
+EXACT = 512
+"""Links or numbers of a label up to which components are exact; beyond it random projections are faster."""
+
+
+def principal_components(residuals: Float[Tensor, "k m"]) -> Float[Tensor, "q m"]:
+    """The fewest principal components that leave out at most ``LEFT`` of the energy, each scaled to a maximum of 1."""
+    if min(residuals.shape) <= EXACT:
+        _, values, components = torch.linalg.svd(residuals, full_matrices=False)
+    else:
+        with torch.random.fork_rng(devices=[]):  # a resumed run must continue as an uninterrupted one
+            torch.manual_seed(0)
+            _, values, columns = torch.svd_lowrank(residuals, q=MOST + 16)
+        components = columns.mH
+    energy = residuals.abs().square().sum()
+    left = energy - values.square().cumsum(0)
+    components = components[: min(int((left > LEFT * energy).sum()) + 1, MOST)]
+    return components / components.abs().amax(1, keepdim=True)

@@ -1,0 +1,47 @@
+"""The Matern-1/2 kernel exp(-d / l), and kriging weights with their variance."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.kriging.links import distances
+
+LIMIT = 6000
+"""Most known links of a receiver that enter one covariance matrix, for memory's sake."""
+
+
+def kernel(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"], length: float | Tensor) -> Float[Tensor, "*c m n"]:
+    """Covariances exp(-d / length) of places ``a`` and ``b`` over the signal's variance; places and length in [m]."""
+    return (distances(a, b) / -length).exp_()
+
+
+def cholesky_factor(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
+    """Lower Cholesky factor of the covariances of noisy labels at known places [m].
+
+    Args:
+        places: Known places, see ``coordinates`` [m].
+        length: Correlation length of the kernel [m].
+        nugget: Variance of the noise over that of the signal.
+    """
+    covariances = kernel(places, places, length)
+    covariances.diagonal().add_(nugget)
+    return torch.linalg.cholesky(covariances)
+
+
+def kriging_weights(
+    asked: Float[Tensor, "b d"], around: Float[Tensor, "b j d"], length: float | Tensor, nugget: float | Tensor
+) -> tuple[Float[Tensor, "b j"], Float[Tensor, " b"]]:
+    """Weights of the known links around each asked link, and the variance of its label over the signal's.
+
+    Args:
+        asked, around: Places, see ``coordinates`` [m].
+        length: Correlation length of the kernel [m].
+        nugget: Variance of the noise over that of the signal.
+
+    Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 2.2.
+    """
+    identity = torch.eye(around.shape[1], dtype=around.dtype)
+    covariances = kernel(around, around, length) + nugget * identity
+    towards = kernel(around, asked[:, None], length)
+    weights = torch.cholesky_solve(towards, torch.linalg.cholesky(covariances))[..., 0]
+    return weights, 1 + nugget - (weights * towards[..., 0]).sum(1)

@@ -1,0 +1,344 @@
+"""The placement of mirrored Gaussians: reflection paths by way of learnt planes."""
+
+import logging
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Complex, Float, Int
+from scipy.constants import speed_of_light
+from torch import Tensor, distributed, nn
+from torch.nn import functional
+
+from gaigs.antenna import Receiver
+from gaigs.data import Links
+from gaigs.gaussians import SH_DC, Gaussians, Placed
+from gaigs.placement import Placement
+from gaigs.placement.mirrored.obstacles import Obstacles
+from gaigs.placement.mirrored.reflections import Folded, all_sequences, fold, images
+from gaigs.placement.mirrored.walls import read_planes
+from gaigs.propagation import NEAREST, fresnel
+from gaigs.query import Query
+from gaigs.registry import register
+from gaigs.scene import Scene, carriers
+
+log = logging.getLogger(__name__)
+
+BOX = 6
+"""Planes at the start: one beyond each face of the box that holds transmitters and receivers."""
+
+TILT = 0.05
+"""Standard deviation of the random tilt of the first planes: exactly parallel planes would have equal gradients."""
+
+PERMITTIVITY, CONDUCTIVITY = 4.0, 0.3
+"""Real and imaginary part of the planes' relative permittivity at the start: between wood and concrete."""
+
+UNIT = 0.12
+"""Unit of the parameters of plane offsets [diagonals of the box], so that learning rates suit rooms of any size."""
+
+
+@register("placement", "mirrored")
+class Mirrored(Placement):
+    """Gaussians at p_k = V_k x ~V_k, with the transmitter x and the product V_k of at most ``order`` plane vectors.
+
+    In projective geometric algebra a plane is a vector, and its sandwich product mirrors. All paths and receivers share
+    the planes, so direction, path length L and spreading follow from geometry. The field of path k is
+
+        a_k = F(u_k) / L_k  exp(g_k + g_r + j phi_k + j phi_r - tau_k - j 2 pi L_k / lambda)
+              prod_w exp(g_w) Gamma_w(theta)
+
+    with the element's pattern F towards the image, times a learnt power of the cosine; the gain g and phase phi of a
+    path; the gain g_r and, of channels, the phase phi_r of a receiver; the gain g_w of a plane, which falls off as a
+    Gaussian about the plane's middle; Fresnel's reflection Gamma_w with a learnt permittivity; and the optical depth
+    tau_k of the obstacles along the folded path. Polarisation is vertical: TE at upright planes, TM at level ones,
+    weighted by n_z² in between. A path that does not meet its planes in their order does not exist.
+
+    Paths add as powers until ``enable_phases``: powers locate planes to some centimetres, and phases need a fraction of
+    the wavelength. Channels start from free space, the direct path without obstacles and spread, until
+    ``enable_reflections``.
+
+    Args:
+        scene: Its box and receivers give the first planes.
+        channels: Of the signal, 1 (amplitude) or 2 (complex).
+        planes: Largest number of planes; six at the start, the search finds the others.
+        order: Largest number of reflections of a path.
+        obstacles: Number of Gaussians of matter in the room; 0 for none.
+        walls: File of walls to start from: a floor plan ``.csv`` of consecutive vertices x,y [m], or a Wavefront
+            ``.obj`` [m], of which the largest planes are taken; None: the box's faces. A checkpoint does not need it.
+        fixed: True if planes stay where they start.
+
+    Raises:
+        ValueError: An option is out of range.
+
+    Source: ours; Allen and Berkley, Image method for efficiently simulating small-room acoustics, 1979, for images;
+    Roelfs and De Keninck, Graded Symmetry Groups: Plane and Simple, 2023, for reflections as versors.
+    """
+
+    sees_receivers = True
+    has_own = True
+    model = "mirrored"
+    learning_rates: Mapping[str, float] = {"planes": 1e-2, "paths": 2e-2, "obstacles": 2.5e-2}
+    penalty_weights: Mapping[str, float] = {"obstacles": 4e-4}  # matter only where paths are attenuated
+
+    def __init__(
+        self,
+        scene: Scene,
+        channels: int,
+        planes: int = 10,
+        order: int = 2,
+        obstacles: int = 60,
+        walls: str | None = None,
+        fixed: bool = False,
+    ):
+        super().__init__()
+        for option, value, least in (("planes", planes, BOX), ("order", order, 0), ("obstacles", obstacles, 0)):
+            if value < least:
+                raise ValueError(f"placement.{option} must be at least {least}, got {value}")
+        if channels not in (1, 2):
+            raise ValueError(f"placement 'mirrored' has 1 or 2 channels, amplitude or complex, got {channels}")
+        self.scene, self.channels, self.order = scene, channels, order
+        self.walls, self.fixed = walls, fixed
+        is_complex = scene.task.dtype.is_complex
+        receivers = scene.positions(scene.lower)
+        lower = torch.cat((scene.lower[None], receivers)).amin(0)
+        upper = torch.cat((scene.upper[None], receivers)).amax(0)
+        self.box = lower, upper
+        self.diagonal = float((upper - lower).norm())
+        margin = 0.04 * self.diagonal
+        faces = torch.cat((torch.eye(3), -torch.eye(3), torch.eye(3).repeat(-(-(planes - BOX) // 3), 1)))[:planes]
+        offsets = torch.cat((upper + margin, margin - lower, torch.zeros(planes - BOX)))
+        # Planes turn about a point within a diagonal of the box, wherever the world's origin is; 0 where that is near.
+        self.register_buffer("pivot", ((lower + upper) / (2 * self.diagonal)).trunc() * self.diagonal)
+        normals = faces + TILT * torch.randn(planes, 3)
+        offsets = offsets + (functional.normalize(normals, dim=1) - faces) @ self.pivot
+        self.register_buffer("origin", torch.cat((normals, offsets[:, None]), 1))
+        self.register_buffer("step", torch.ones(()))
+        sequences = all_sequences(planes, order)
+        self.register_buffer("sequences", sequences, persistent=False)
+        self.register_buffer("kept", ((sequences < BOX).all(1)))
+        self.register_buffer("most", self.kept.sum())
+        self.register_buffer("coherent", torch.tensor(False))
+        self.register_buffer("is_bare", torch.tensor(False), persistent=is_complex)
+        self.register_buffer("planned", self.kept.clone(), persistent=is_complex)
+
+        def filled(value: float, *shape: int) -> nn.Parameter:
+            return nn.Parameter(torch.full(shape, value))
+
+        paths, antennas = len(sequences), len(scene.receivers)
+        self.shifts = nn.Parameter(torch.zeros(planes, 4), requires_grad=not fixed)
+        self.log_permittivities = filled(math.log(PERMITTIVITY - 1), planes)
+        self.log_conductivities = filled(math.log(CONDUCTIVITY), planes)
+        self.plane_gains = filled(0.0, planes)
+        self.middles = nn.Parameter(((lower + upper) / 2).repeat(planes, 1))
+        self.log_extents = filled(math.log(2.0 * self.diagonal), planes, 3)  # so wide that planes have no edges
+        self.path_gains, self.path_phases = filled(0.0, paths), filled(0.0, paths)
+        self.log_spreads = filled(math.log(0.03), paths)  # [rad], far below the resolution of small arrays
+        self.log_blurs = filled(math.log(0.3), paths)  # standard deviation of a path's phase [rad]
+        self.receiver_gains, self.directivity = filled(0.0, antennas), filled(0.0)
+        self.receiver_phases = filled(0.0, antennas) if is_complex else None
+        self.log_bandwidth = None
+        if scene.bandwidth != 0 and not is_complex:
+            self.log_bandwidth = filled(math.log(scene.bandwidth or speed_of_light / self.diagonal))
+        self.obstacles = Obstacles(obstacles, lower, upper) if obstacles else None
+        self.boresights = [torch.tensor([0.0, 0.0, 1.0])] * antennas
+        if is_complex:
+            self.boresights = [boresight(receiver, (lower + upper) / 2) for receiver in scene.receivers]
+        self.holds, self.held = False, None
+
+    def fit(self, links: Links) -> None:
+        """Starts from the user's walls, where there are any.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It holds no planes.
+        """
+        if self.walls is None:
+            return
+        planes = read_planes(Path(self.walls), *self.box).to(self.origin)
+        most = len(self.origin)
+        if len(planes) > most:
+            log.warning("placement.planes: %s has %d planes, the first %d are taken", self.walls, len(planes), most)
+        planes = planes[:most]
+        for plane, (*normal, offset) in enumerate(planes):
+            self.place(plane, torch.stack(normal), offset.item())
+        self.kept.copy_(self.sequences_of(torch.arange(len(planes), device=self.kept.device)))
+
+    # --- the room ---
+
+    @property
+    def normals(self) -> Float[Tensor, "w 3"]:
+        """Unit normals of all planes."""
+        return functional.normalize(self.origin[:, :3] + self.step * self.shifts[:, :3], dim=1)
+
+    @property
+    def offsets(self) -> Float[Tensor, " w"]:
+        """Offsets of all planes along their normals, from the world's origin [m]."""
+        moved = self.origin[:, 3] + self.step * UNIT * self.diagonal * self.shifts[:, 3]
+        return moved + (self.normals - functional.normalize(self.origin[:, :3], dim=1)) @ self.pivot
+
+    @property
+    def used(self) -> Int[Tensor, " k"]:
+        """Planes that a kept path meets."""
+        found = self.sequences[self.kept].unique()
+        return found[found >= 0]
+
+    @torch.no_grad()
+    def place(self, plane: int, normal: Float[Tensor, "3"], offset: float) -> None:
+        """Moves a plane to a normal and an offset [m]."""
+        self.origin[plane] = torch.cat((functional.normalize(normal, dim=0), normal.new_tensor([offset])))
+        self.shifts[plane] = 0
+
+    def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
+        """True for each sequence of these planes alone."""
+        return torch.isin(self.sequences, torch.cat((planes, planes.new_tensor([-1])))).all(1)
+
+    @torch.no_grad()
+    def enable_phases(self, wavelength: float) -> None:
+        """Lets paths interfere, and planes move in fractions of the wavelength [m]."""
+        self.origin.copy_(torch.cat((self.normals, self.offsets[:, None]), 1))
+        self.shifts.zero_()
+        # 2.2 wavelengths: a usual step of 0.01 then turns a phase by a tenth of a radian.
+        self.step.fill_(min(1.0, 2.2 * wavelength / (UNIT * self.diagonal)))
+        self.coherent.fill_(True)
+
+    @torch.no_grad()
+    def start_from_free_space(self, gains: Complex[Tensor, " receivers"]) -> None:
+        """Leaves the direct path alone, without obstacles and spread.
+
+        Args:
+            gains: Gain of each receiver over the pooling's unit, not 0.
+        """
+        self.planned.copy_(self.kept)
+        self.kept.copy_(self.sequences_of(self.used[:0]))
+        self.is_bare.fill_(True)
+        self.receiver_gains.copy_(gains.abs().log())
+        self.receiver_phases.copy_(gains.angle())
+
+    @torch.no_grad()
+    def enable_reflections(self) -> None:
+        """Ends ``start_from_free_space``: planes reflect, obstacles attenuate, paths spread."""
+        self.kept.copy_(self.planned)
+        self.is_bare.fill_(False)
+
+    @contextmanager
+    def holding(self) -> Iterator[None]:
+        """Keeps the strengths of the first query within the context, while images follow the planes: for searches."""
+        self.holds = True
+        try:
+            yield
+        finally:
+            self.holds, self.held = False, None
+
+    # --- the Gaussians of a query ---
+
+    def forward(self, gaussians: Gaussians | None, query: Query) -> Placed:
+        """Gaussians at the images of each transmitter, followed by the free ones."""
+        sequences = self.sequences[self.kept]
+        normals, offsets = self.normals, self.offsets
+        seen = images(query.transmitters, sequences, normals, offsets)
+        receivers = self.scene.positions(query.transmitters)[query.receivers]
+        lengths = (seen[-1] - receivers[:, None]).norm(dim=-1).clamp_min(NEAREST)
+        strengths = self.held
+        if strengths is None:
+            strengths = self.strengths(query, fold(seen, receivers, sequences, normals, offsets))
+            strengths = strengths * self._patterns(query, seen[-1])
+            if self.holds:
+                self.held = strengths
+        gains = strengths / lengths
+        coherences = torch.zeros_like(self.log_blurs[self.kept])
+        if self.coherent:
+            turns = lengths / (speed_of_light / carriers(self.scene, query).to(lengths))[:, None]
+            phases = self.path_phases[self.kept] - 2 * math.pi * (turns - turns.detach().round())
+            if self.receiver_phases is not None:
+                phases = phases + self.receiver_phases[query.receivers, None]
+            gains = gains * torch.polar(torch.ones_like(phases), phases)
+            coherences = (-self.log_blurs[self.kept].exp().square() / 2).exp()
+        if distributed.is_available() and distributed.is_initialized():
+            # Each of several processes waits for the gradients of all parameters, also of unused ones.
+            gains = gains + 0 * sum(parameter.sum() for parameter in self.parameters() if parameter.requires_grad)
+        signal = lengths.new_zeros(len(sequences), self.channels, 1)
+        signal[:, 0] = 1
+        scales = (lengths * (self.log_spreads[self.kept].exp() * ~self.is_bare))[..., None].expand(-1, -1, 3)
+        quats = signal.new_tensor([1.0, 0, 0, 0]).expand(len(sequences), 4)
+        bandwidth = None if self.log_bandwidth is None else self.log_bandwidth.exp()
+        ones = signal.new_ones(len(sequences))
+        placed = Placed(seen[-1], lengths, quats, scales, ones, signal, gains, coherences, bandwidth)
+        return placed if gaussians is None else _beside(placed, gaussians)
+
+    def strengths(self, query: Query, folded: Folded) -> Complex[Tensor, "b n"]:
+        """Field of each kept path over free space, after reflections and obstacles; 0 where there is no path."""
+        left = self.path_gains[self.kept] + self.receiver_gains[query.receivers, None]
+        if self.obstacles is not None and not self.is_bare:
+            left = left.index_add(1, folded.path, -self.obstacles(folded.start, folded.end))
+        left = torch.complex(left.exp() * folded.exists, torch.zeros_like(left))
+        normals = self.normals
+        permittivities = torch.complex(1 + self.log_permittivities.exp(), -self.log_conductivities.exp())
+        for first, planes, points, cosines in folded.bounces:
+            te, tm = fresnel(permittivities[planes], cosines)
+            level = normals[planes, 2].square()
+            aside = (points - self.middles[planes]) * (-self.log_extents[planes]).exp()
+            reflected = ((1 - level) * te + level * tm) * (self.plane_gains[planes] - aside.square().sum(-1) / 2).exp()
+            left = torch.cat((left[:, :first], left[:, first:] * reflected), 1)
+        return left
+
+    def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Field gain of a receiver's elements in its frame; of arrays times the learnt cos^q."""
+        array = self.scene.receivers[receiver].array
+        gain = array.gain(directions)
+        normal = self.boresights[receiver]
+        if len(array) == 1 or not normal.any():
+            return gain
+        cosines = (directions @ normal.to(directions)).clamp_min(0.05)  # the logarithm has no bound at 0
+        return gain * cosines**self.directivity
+
+    def _patterns(self, query: Query, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
+        """Field gain of the receivers' elements towards points."""
+        gains = torch.ones_like(points[..., 0])
+        for receiver in query.receivers.unique().tolist():
+            own, pose = query.receivers == receiver, self.scene.receivers[receiver].pose.to(points)
+            gains[own] = self.pattern(receiver, functional.normalize(pose.local(points[own]), dim=-1))
+        return gains
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Positions of planes; what is learnt of each plane, path and receiver; obstacles."""
+        obstacles = [] if self.obstacles is None else [*self.obstacles.parameters()]
+        apart = {id(parameter) for parameter in (self.shifts, *obstacles)}
+        groups = {} if self.fixed else {"planes": [self.shifts]}
+        groups["paths"] = [parameter for parameter in self.parameters() if id(parameter) not in apart]
+        return groups | ({"obstacles": obstacles} if obstacles else {})
+
+    def penalties(self) -> dict[str, Float[Tensor, ""]]:
+        """The obstacles' mean density over a diagonal of the room [Np]."""
+        if self.obstacles is None:
+            return {}
+        return {"obstacles": self.obstacles.densities.mean() * self.diagonal}
+
+
+def boresight(receiver: Receiver, middle: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Normal of a planar array in its own frame, towards a point of the world [m]; 0 for other arrays."""
+    elements = receiver.array.elements.double()
+    _, values, axes = torch.linalg.svd(elements - elements.mean(0), full_matrices=True)
+    flat = 1e-6 * values[0]  # float32 places elements no better
+    if len(values) < 3 or values[2] > flat or values[1] <= flat:
+        return torch.zeros(3)
+    normal = axes[2].float()
+    return normal if normal @ receiver.pose.to(middle).local(middle) >= 0 else -normal
+
+
+def _beside(placed: Placed, gaussians: Gaussians) -> Placed:
+    """Mirrored Gaussians followed by free ones, whose path lengths and phases are unknown."""
+    b, free = len(placed.lengths), len(gaussians)
+    ones = placed.lengths.new_ones(b, free)
+    return Placed(
+        means=torch.cat((placed.means, gaussians.means.expand(b, -1, -1)), 1),
+        lengths=torch.cat((placed.lengths, 0 * ones), 1),
+        quats=torch.cat((placed.quats, gaussians.unit_quats)),
+        scales=torch.cat((placed.scales, gaussians.scales.expand(b, -1, -1)), 1),
+        opacities=torch.cat((placed.opacities, gaussians.opacities)),
+        signal=torch.cat((placed.signal, gaussians.signal)),
+        gains=torch.cat((placed.gains, torch.complex(SH_DC * ones, 0 * ones)), 1),
+        coherences=torch.cat((placed.coherences, ones.new_zeros(free))),
+        bandwidth=placed.bandwidth,
+    )

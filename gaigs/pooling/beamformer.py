@@ -1,0 +1,146 @@
+"""The conventional beamformer: from the covariance of an array's elements to the label of a spectrum."""
+
+import math
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Complex, Float, Int
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.antenna import Array
+from gaigs.geometry import FAINTEST, Directions, Grid
+from gaigs.query import Query
+from gaigs.scene import Scene, carriers
+
+NORMALISATION = "min-max of each spectrum's amplitude"
+"""Scaling of labels, in the words of their task, that the beamformer reproduces."""
+
+
+class Beamformer:
+    """The amplitude of the conventional beamformer, scaled as the labels are.
+
+        s(u) = sqrt(sum_D n_D R(D) exp(-j 2 pi D . u / lambda)),   label = (s - min s) / (max s - min s)
+
+    with R(D) the mean covariance of the n_D pairs of elements that are D apart.
+
+    Args:
+        owner: The component that takes nothing else, as errors name it.
+        scene: Its task has the directions and the normalisation, its receivers the arrays.
+
+    Attributes:
+        zone: Lowest and highest elevation from which the arrays hear anything [rad].
+
+    Raises:
+        ValueError: The labels are no spectra, are normalised otherwise, or an array has a single element.
+
+    Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
+    """
+
+    def __init__(self, owner: str, scene: Scene):
+        task = scene.task
+        if task.directions is None:
+            raise ValueError(
+                f"{owner} gives spectra, and labels of task {task.name!r} are none\ntake a pooling of that task, such "
+                "as mean_power for RSSI or element_sum for channels"
+            )
+        if task.normalisation != NORMALISATION:
+            raise ValueError(
+                f"{owner} takes labels scaled by {NORMALISATION}, got {task.normalisation!r}; take pooling=spectrum"
+            )
+        for receiver in scene.receivers:
+            if len(receiver.array) < 2:
+                raise ValueError(
+                    f"{owner} takes arrays of at least 2 elements, got {len(receiver.array)} of {receiver.name}; give "
+                    "the data's elements and frequency"
+                )
+        self.scene = scene
+        is_cosine = all(receiver.array.pattern == "cosine" for receiver in scene.receivers)
+        self.zone = 0.0 if is_cosine else -math.pi / 2, math.pi / 2
+        # 16 rows, and columns in proportion, show the label's extremes: 6 degrees apart in a hemisphere, a quarter of
+        # what 16 elements resolve.
+        step = max(1, task.directions.shape[0] // 16)
+        self.coarse = task.directions.thin(slice(None, None, step), slice(None, None, step))
+        self._kept: dict[tuple, Tensor] = {}
+
+    def __call__(
+        self, lags: Complex[Tensor, "b l"], query: Query, directions: Directions | None = None
+    ) -> Float[Tensor, "b ..."]:
+        """Spectra from covariances at the lags of the receiver's array.
+
+        Args:
+            lags: Mean covariance of the pairs of elements at each of ``array.lags``.
+            query: The link of each row; all to one receiver.
+            directions: Directions asked for; None for all of the task's.
+        """
+        own = self.scene.task.directions
+        asked = own if directions is None else directions
+        half = lags.shape[1] // 2
+        power = lags[:, half].real
+        # Relative to the power, so that no scale of the fields overflows; silence has no spectrum, and 0 stands for it.
+        relative = lags[:, half:] / torch.where(power < FAINTEST, 1, power)[:, None]
+        parts = torch.cat((relative.real, relative.imag), 1)
+        is_whole = _are_same(asked, own)
+        spectra, order = [parts.new_zeros(0, math.prod(asked.shape))], [torch.zeros(0).long().to(parts.device)]
+        for carrier, links in self.by_carrier(query):
+            amplitudes = self._look(parts[links], carrier, query, asked)
+            shown = amplitudes
+            if not is_whole:
+                shown = torch.cat((amplitudes, self._look(parts[links], carrier, query, self.coarse)), 1)
+            low, high = shown.amin(1, keepdim=True), shown.amax(1, keepdim=True)
+            spread = torch.where(high > low, high - low, 1)
+            # Pixels are many, and each pass over them in memory costs as much as the beamformer itself.
+            scaled = (amplitudes - low) / spread if torch.is_grad_enabled() else amplitudes.sub_(low).div_(spread)
+            spectra.append(scaled)
+            order.append(links)
+        whole = spectra[1] if len(spectra) == 2 else torch.cat(spectra)[torch.cat(order).argsort()]
+        return whole.unflatten(1, asked.shape)
+
+    def array(self, query: Query) -> Array:
+        """The array of a query's receiver."""
+        return self.scene.receivers[int(query.receivers[0]) if len(query) else 0].array
+
+    def by_carrier(self, query: Query) -> Iterator[tuple[float, Int[Tensor, " k"]]]:
+        """The different carriers [Hz], and the links of each."""
+        frequencies = carriers(self.scene, query)
+        for carrier in frequencies.unique().tolist():
+            yield carrier, (frequencies == carrier).nonzero()[:, 0]
+
+    def _look(self, parts: Tensor, carrier: float, query: Query, directions: Directions) -> Tensor:
+        """Amplitudes of the beamformer in some directions (b, k)."""
+        key, basis = None, None
+        if isinstance(directions, Grid):  # training thins one grid in a few ways, time and again; rays hardly come back
+            axes = (axis.cpu().numpy().tobytes() for axis in (directions.elevations, directions.azimuths))
+            key = int(query.receivers[0]), carrier, parts.dtype, parts.device, *axes
+            basis = self._kept.get(key)
+        if basis is None:
+            # Kept beyond this call: made in inference mode it could not be saved for a later backward pass.
+            with torch.inference_mode(False):
+                basis = self._basis(carrier, query, directions).to(parts)
+            if key is not None:
+                if len(self._kept) >= 64:  # thinning by a stride of 4 has 16 grids
+                    self._kept.clear()
+                self._kept[key] = basis
+        power = parts @ basis
+        # Of the mean power over all pixels: sums of tens of float32 terms round at this, and below it the slope of the
+        # root has no bound.
+        least = 1e-6
+        return power.clamp_min(least).sqrt() if torch.is_grad_enabled() else power.clamp_min_(least).sqrt_()
+
+    def _basis(self, carrier: float, query: Query, directions: Directions) -> Float[Tensor, "m k"]:
+        """Contribution of the real and then the imaginary part of each lag to the power in each direction, float64."""
+        array = self.array(query)
+        steps, _, counts = array.lags
+        half = len(steps) // 2
+        # Of two opposite lags, which are each other's conjugates, one stands for both.
+        weights = counts[half:] / len(array) * torch.where(torch.arange(len(steps) - half) > 0, 2, 1)
+        vectors = directions.to(steps).flatten().vectors()
+        phases = 2 * math.pi * carrier / speed_of_light * (steps[half:] @ vectors.T)
+        return torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None]))
+
+
+def _are_same(asked: Directions, own: Directions) -> bool:
+    if asked is own:
+        return True
+    pairs = (asked.elevations, own.elevations), (asked.azimuths, own.azimuths)
+    return asked.shape == own.shape and all(torch.equal(a, b.to(a)) for a, b in pairs)

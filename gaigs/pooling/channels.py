@@ -1,0 +1,51 @@
+"""Base of poolings that give complex channels: their strength and the signs of their phases."""
+
+import math
+
+import torch
+
+from gaigs.data import Links
+from gaigs.pooling import Pooling
+from gaigs.propagation import array_sign, phase_sign, strength
+from gaigs.scene import Scene, check_elements, direct_waves
+
+
+class ChannelPooling(Pooling):
+    """Fits the level and the phase convention of the training channels.
+
+    The sign of phases is -1 as for the time dependence exp(+j omega t), or +1. Where phases follow the distance with
+    neither sign, as without a common clock, ``array_sign`` is how they differ between the elements and subcarriers of a
+    link.
+
+    Args:
+        scene: Its task has the subcarriers, its receivers the elements.
+        name: Registered name, for errors.
+
+    Attributes:
+        strength: Amplitude of the channels relative to free space.
+        sign: Sign with which phases follow the direct distance; 0 for neither.
+        array_sign: Sign between elements and subcarriers, -1 or 1.
+
+    Raises:
+        ValueError: The labels are no channels, or an array has another number of elements than they.
+    """
+
+    def __init__(self, scene: Scene, name: str):
+        super().__init__()
+        check_elements(f"pooling {name!r}", scene)
+        self.scene = scene
+        if all(receiver.array.pattern == "cosine" for receiver in scene.receivers):
+            self.zone = (0.0, math.pi / 2)
+        self.register_buffer("strength", torch.ones(()))
+        self.register_buffer("sign", torch.tensor(-1))
+        self.register_buffer("array_sign", torch.tensor(-1))
+
+    @torch.no_grad()
+    def fit(self, links: Links) -> None:
+        """Takes strength and signs from the training channels."""
+        train = links.split.train
+        labels, query = links.labels[train].to(torch.complex128), links.query[train]
+        waves = direct_waves(self.scene, query, self.scene.task.frequencies)
+        self.strength.fill_(strength(labels, waves, query.receivers))
+        self.sign.fill_(phase_sign(labels, waves, query.receivers))
+        self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))

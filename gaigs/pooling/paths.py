@@ -1,0 +1,211 @@
+"""Propagation paths as the elements of an array hear them, summed in closed form without a map."""
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Complex, Float
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.antenna import Array, Receiver
+from gaigs.geometry import Directions, Grid, magnitudes, polar
+from gaigs.pooling import Pooling
+from gaigs.projection import Splats
+from gaigs.projection.direction_cosine import DirectionCosine
+from gaigs.propagation import NEAREST
+from gaigs.query import Query
+from gaigs.scene import Scene
+
+
+@dataclass(frozen=True)
+class ReceivedPaths:
+    """Propagation paths to one receiver. A path arrives from a Gaussian, whose extent is the path's angular spread.
+
+    Attributes:
+        means: Centres of the Gaussians, world frame (b, n, 3) [m].
+        semi_axes: Of the Gaussians, world frame, a column for each axis (1 or b, n, 3, 3) [m].
+        amplitudes: Complex field of each path at the carrier, in the middle of the array (b, n).
+        lengths: From the transmitter to the middle of the array (b, n) [m].
+        coherences: Share of each path's field whose phase is known, in [0, 1] (n,). The rest adds as power.
+        bandwidth: Band over which powers are averaged, a scalar [Hz]; None for the carrier alone.
+        receiver: Pose and array of the receiver.
+        carriers: Frequency of each query (b,) [Hz].
+    """
+
+    means: Float[Tensor, "b n 3"]
+    semi_axes: Float[Tensor, "c n 3 3"]
+    amplitudes: Complex[Tensor, "b n"]
+    lengths: Float[Tensor, "b n"]
+    coherences: Float[Tensor, " n"]
+    bandwidth: Float[Tensor, ""] | None
+    receiver: Receiver
+    carriers: Float[Tensor, " b"]
+
+
+class PathPooling(Pooling):
+    """Base of poolings that read paths, so that nothing is projected or rasterized."""
+
+    def forward(self, paths: ReceivedPaths, query: Query, directions: Directions | None = None) -> Tensor:
+        return self.read(self.sum_paths(paths), query, directions)
+
+    @abstractmethod
+    def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b ..."]:
+        """Sum of the paths at the elements of the receiver's array."""
+
+    @abstractmethod
+    def read(self, received: Complex[Tensor, "b ..."], query: Query, directions: Directions | None = None) -> Tensor:
+        """The label from what ``sum_paths`` gives; arguments as for ``forward``."""
+
+
+class LagPooling(PathPooling):
+    """Base of poolings that read the covariance of the array's elements, in which powers add.
+
+    Args:
+        scene: Its receivers have planar arrays.
+
+    Raises:
+        ValueError: An array is not planar.
+    """
+
+    def __init__(self, scene: Scene):
+        super().__init__()
+        for receiver in scene.receivers:
+            height = receiver.array.elements[:, 2].abs().max()
+            if height > 1e-6:  # [m]; float32 places metres no better
+                raise ValueError(
+                    f"a pooling of path powers takes planar arrays, got elements up to z = {height:.3g} m in "
+                    f"{receiver.name}\ntake projection=mercator rasterizer=fastest and a pooling of maps, such as "
+                    "array_response"
+                )
+
+    def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b l"]:
+        """Covariance of the elements at each of ``array.lags``.
+
+        In direction cosines a path is at least as wide as a pixel of a map of 24 x 48. A path on the receiver has no
+        direction and is left out.
+        """
+        plane = DirectionCosine(Grid.sphere(24, 48).pitch)
+        splats = plane.project(paths.means, paths.semi_axes, paths.receiver.pose)
+        own = paths.amplitudes, paths.lengths, paths.coherences, paths.bandwidth
+        return self.covariances(splats, *own, paths.receiver.array, paths.carriers)
+
+    @staticmethod
+    def covariances(
+        splats: Splats,
+        amplitudes: Complex[Tensor, "b n"],
+        lengths: Float[Tensor, "b n"],
+        coherences: Float[Tensor, " n"],
+        bandwidth: Float[Tensor, ""] | None,
+        array: Array,
+        carriers: Float[Tensor, " b"],
+    ) -> Complex[Tensor, "b l"]:
+        """Mean covariance of the pairs of elements that are ``array.lags`` apart; at lag 0 it is the power.
+
+        Where powers add, elements a lag D apart, in wavelengths, have
+
+            sum |A|² exp(-(2 pi)² D' S D / 2 + j 2 pi D . u)
+
+        Two paths interfere by the product of their coherences, and over a band by sinc(bandwidth (t - t')), with t
+        their delays: the mean over the band of cos(2 pi f (t - t')).
+
+        Args:
+            splats: The paths in direction cosines: directions u and covariances S, one set a query. A path that is not
+                visible is left out.
+            amplitudes, lengths, coherences, bandwidth, carriers: As of ``ReceivedPaths``.
+            array: Planar.
+
+        Source: as ``element_fields``.
+        """
+        amplitudes, directions = torch.where(splats.visible, amplitudes, 0), splats.means2d
+        steps, pairs, counts = (part.to(amplitudes.device) for part in array.lags)
+        steps, counts = steps.to(lengths), counts.to(lengths)
+        wavelengths = speed_of_light / carriers.to(lengths)[:, None, None]
+        # Half of the lags are the conjugates of the others.
+        half = len(steps) // 2
+        angles = 2 * math.pi / wavelengths * (directions @ steps[half:, :2].T)
+        narrow = _footprints(splats, steps[half:, :2], wavelengths)
+        powers = magnitudes(amplitudes).square() * (1 - coherences.square())
+        real, imaginary = ((powers[..., None] * narrow * part).sum(1) for part in (angles.cos(), angles.sin()))
+        later = torch.complex(real, imaginary)
+        found = torch.cat((later[:, 1:].conj().flip(1), later), 1)
+        sure = coherences.nonzero()[:, 0]  # pairs of the others have no phase: they cost nothing
+        if not len(sure):
+            return found
+        waves = (amplitudes * coherences)[:, sure]
+        elements = array.elements.to(directions)[:, :2]
+        angles = 2 * math.pi / wavelengths * (directions @ elements.T)
+        steering = polar(_footprints(splats, elements, wavelengths), angles)[:, sure]
+        if bandwidth is None:
+            heard = (waves[:, None] @ steering).mT
+            covariance = heard @ heard.mH
+        else:
+            delays = lengths[:, sure] / speed_of_light
+            likeness = torch.sinc(bandwidth * (delays[:, :, None] - delays[:, None]))
+            together = waves[:, :, None] * waves[:, None].conj() * likeness
+            covariance = steering.mT @ together @ steering.conj()
+        added = torch.zeros_like(found).index_add(1, pairs, covariance.flatten(1))
+        return found + added / counts
+
+
+def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Complex[Tensor, "b e s"]:
+    """Field at each element and frequency, all paths interfering.
+
+    The wave of a path is spherical about the path's Gaussian, at an array of any shape and orientation. An element at
+    x, in wavelengths from the middle, hears a path of the amplitude A, from the direction u, as
+
+        A exp(-(2 pi)² x' S x / 2 - j 2 pi (|p - x| - |p|)) |p| / |p - x|
+
+    with p the Gaussian's centre and S its covariance in direction cosines.
+
+    Args:
+        paths: To one receiver.
+        offsets: Frequencies over the carrier [Hz].
+
+    Source: ours; the Fourier transform of a Gaussian, and Van Trees, Optimum Array Processing, 2002, section 2.2.
+    """
+    amplitudes, lengths, pose = paths.amplitudes, paths.lengths, paths.receiver.pose.to(paths.means)
+    points, semi_axes = pose.local(paths.means), pose.rotation.mT @ paths.semi_axes
+    # Distances below NEAREST count as that: of the amplitudes they are the unit.
+    elements, exact = paths.receiver.array.elements.to(points), points.norm(dim=-1, keepdim=True)
+    # Plain differences: by the matrix product an element far from a near point would lose its digits.
+    own = torch.cdist(points, elements, compute_mode="donot_use_mm_for_euclid_dist")
+    to_elements, ways = own.clamp_min(NEAREST), exact.clamp_min(NEAREST)
+    # The difference of two lengths, without the digits that it would lose.
+    both = own + exact
+    longer = (elements.square().sum(-1) - 2 * points @ elements.T) / torch.where(both > 0, both, 1)
+    longer = longer + (to_elements - own) - (ways - exact)
+    wavenumbers = 2 * math.pi / speed_of_light * paths.carriers.to(points)[:, None, None]
+    # Semi-axes across the way, in radians as the middle sees them.
+    units = (points / ways)[..., None]
+    across = (semi_axes - units * (units * semi_axes).sum(-2, keepdim=True)) * (wavenumbers / ways)[..., None]
+    turns = (elements @ across.movedim(-2, 0).flatten(1)).view(len(elements), *across.shape[:2], 3)
+    spread = turns.square().sum(-1).movedim(0, -1)
+    waves = amplitudes[..., None] * polar((spread / -2).exp() * (ways / to_elements), -wavenumbers * longer)
+    reach = float(elements.norm(dim=-1).amax()) / speed_of_light
+    rates = -2 * math.pi * offsets.to(lengths)
+    turned = lambda delays: torch.polar(torch.ones_like(delays), delays)
+    widest = reach * float(rates.abs().amax()) if rates.numel() else 0.0  # phase of the band over the array [rad]
+    if widest > 3:
+        delays = (lengths[..., None] + longer) / speed_of_light
+        return (waves[..., None] * turned(delays[..., None] * rates[:, None, None])).sum(1)
+    # exp(j rate (t + dt)) = exp(j rate t) sum_k (j rate dt)^k / k!: one product of matrices, and no wave of each path,
+    # element and frequency. |dt| is at most the reach. Up to 3 rad the terms of the series stay small.
+    terms, size = [waves], widest
+    while size > torch.finfo(lengths.dtype).eps:
+        terms.append(terms[-1] * (longer * (1j / (reach * speed_of_light * len(terms)))))
+        size *= widest / len(terms)
+    middle = turned(lengths[..., None] / speed_of_light * rates[:, None])
+    sums = torch.stack(terms, 2).flatten(2).mT @ middle  # (b, terms x e, s)
+    powers = (reach * rates)[:, None] ** torch.arange(len(terms), device=rates.device)[:, None]
+    return (sums.unflatten(1, (len(terms), -1)) * powers[:, :, None]).sum(1)
+
+
+def _footprints(
+    splats: Splats, steps: Float[Tensor, "k 2"], wavelengths: Float[Tensor, "b 1 1"]
+) -> Float[Tensor, "b n k"]:
+    """exp(-(2 pi)² D' S D / 2) of each path and step D [m]."""
+    squares = (steps[:, :, None] * steps[:, None]).flatten(1)
+    covariances = splats.covariances2d.expand(len(wavelengths), -1, -1, -1).flatten(2)
+    return ((-0.5 * (2 * math.pi / wavelengths) ** 2) * (covariances @ squares.T)).exp()

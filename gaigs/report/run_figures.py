@@ -1,0 +1,54 @@
+"""All figures of a run."""
+
+from pathlib import Path
+
+from gaigs.data import Links
+from gaigs.model import Model
+from gaigs.report import figures, style
+from gaigs.report.csi import CsiFigures
+from gaigs.report.curves import loss_curves, read_curves
+from gaigs.report.room import paths, room
+from gaigs.report.scalar import ScalarFigures
+from gaigs.report.spectrum import SpectrumFigures
+from gaigs.task import Task
+from gaigs.task.csi import Csi
+from gaigs.task.scalar import Scalar
+from gaigs.task.spectrum import Spectrum
+
+BUILT_IN = {Csi: CsiFigures, Scalar: ScalarFigures, Spectrum: SpectrumFigures}
+
+
+def figures_of(task: type[Task]) -> figures.TaskFigures:
+    """Figures of a task: those registered for its class or else for the nearest base class."""
+    known = BUILT_IN | figures.registered
+    return next((known[kind] for kind in task.__mro__ if kind in known), figures.TaskFigures)()
+
+
+def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
+    """Draws a run: its room, its losses and the figures of its task.
+
+    Args:
+        folder: Of the run. ``predictions.npz``, the files of the task and, of a trained model, ``log/*/metrics.csv``
+            are read from it. The figures go to ``figures/``.
+        links: Data of the run.
+        model: Trained or fitted. Its ``primitives`` and ``learnt_room`` are drawn where it has them.
+
+    Returns:
+        The files, as PNG.
+
+    Raises:
+        FileNotFoundError: The folder lacks a file that a figure needs.
+    """
+    learnt_room = getattr(model, "learnt_room", None)
+    learnt = learnt_room(links) if learnt_room else None
+    drawn = {"room": room(links, getattr(model, "primitives", None), learnt)}
+    if learnt is not None and learnt.paths:
+        drawn["paths"] = paths(links, learnt)
+    if losses := sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime):
+        drawn["loss"] = loss_curves(read_curves(losses))
+    drawn |= figures_of(type(links.task)).of_run(links.task, folder, links)
+    (folder / "figures").mkdir(exist_ok=True)
+    files = {folder / "figures" / f"{name}.png": figure for name, figure in drawn.items()}
+    for file, figure in files.items():
+        style.save(figure, file)
+    return list(files)

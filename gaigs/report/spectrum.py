@@ -1,0 +1,165 @@
+"""Figures of spatial spectra, over azimuth and elevation or as the sky above the array."""
+
+from collections.abc import Mapping, Sequence
+from math import ceil
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
+from numpy import ndarray
+
+from gaigs.data import Links
+from gaigs.report.curves import cdf
+from gaigs.report.figures import TaskFigures, examples, own_scores, scores_of_systems
+from gaigs.report.style import PAGE, STYLE
+from gaigs.task.spectrum import Spectrum
+
+AMPLITUDE = {"cmap": "viridis", "vmin": 0, "vmax": 1}
+
+
+class SpectrumFigures(TaskFigures):
+    """Example spectra and the distribution of SSIM."""
+
+    def of_run(self, task: Spectrum, folder: Path, links: Links) -> dict[str, Figure]:
+        scores = own_scores(folder / "predictions.npz", "ssim")
+        own = next(iter(scores.values()))
+        names = examples(own)
+        shown = list(names)
+        with np.load(folder / "predictions.npz") as run:
+            labels, predictions = run["labels"][shown], run["prediction"][shown]
+        grid = (np.rad2deg(angles.numpy()) for angles in (task.directions.elevations, task.directions.azimuths))
+        drawn = labels, predictions, own[shown], list(names.values()), *grid
+        return {
+            "spectra": spectra(*drawn),
+            "spectra_polar": spectra(*drawn, polar=True),
+            "ssim_cdf": cdf(scores, "SSIM", "spectra", links.split.name, (None, 1)),
+        }
+
+    def of_systems(self, task: type[Spectrum], files: Mapping[str, Path], split: str) -> dict[str, Figure]:
+        scores = scores_of_systems(files, "ssim")
+        order = np.argsort(np.mean([scores[name] for name in files], 0))
+        median = order[round(0.5 * (len(order) - 1))]
+        predictions = {}
+        for name, file in files.items():
+            with np.load(file) as run:
+                title = f"{name} {scores[name][median]:.3f}"
+                predictions[title], label = run["prediction"][median], run["labels"][median]
+                grid = [np.rad2deg(run[key]) for key in ("elevations", "azimuths")]
+        return {
+            "cdf": cdf(scores, "SSIM", "spectra", split, (None, 1)),
+            "spectra": side_by_side({"label": label} | predictions, *grid),
+        }
+
+
+def spectra(
+    labels: Float[ndarray, "k rows columns"],
+    predictions: Float[ndarray, "k rows columns"],
+    ssim: Float[ndarray, " k"],
+    names: Sequence[str],
+    elevations: Float[ndarray, " rows"],
+    azimuths: Float[ndarray, " columns"],
+    polar: bool = False,
+) -> Figure:
+    """Label, prediction and signed error, one transmitter a row.
+
+    Args:
+        labels: Measured spectra, amplitudes in [0, 1].
+        predictions: Predicted spectra; values outside [0, 1] take the colour of the nearer end.
+        ssim: Score of each prediction.
+        names: Names of the rows.
+        elevations: Of the pixels' rows [deg].
+        azimuths: Of the pixels' columns [deg].
+        polar: The zenith in the middle and azimuth around it, instead of azimuth across and elevation upwards.
+    """
+    labels, predictions = labels.astype(np.float32), predictions.astype(np.float32)
+    errors = predictions - labels
+    limit = float(np.abs(errors).max()) or 1.0  # a perfect prediction still needs a colour scale
+    columns = (
+        (labels, AMPLITUDE, [f"Label, {name}" for name in names]),
+        (predictions, AMPLITUDE, [f"Prediction, SSIM {score:.3f}" for score in ssim]),
+        (
+            errors,
+            {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit},
+            [f"Error, MAE {np.abs(error).mean():.3f}" for error in errors],
+        ),
+    )
+    draw = _draw_sky if polar else _draw_plane
+    edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
+    with rc_context(STYLE):
+        figure = Figure(figsize=(PAGE, (2.2 if polar else 0.95) * len(labels) + 0.75), layout="constrained")
+        axes = figure.subplots(len(labels), 3, squeeze=False, subplot_kw={"projection": "polar"} if polar else {})
+        for panels, (values, colours, titles) in zip(axes.T, columns, strict=True):
+            for ax, value, title in zip(panels, values, titles, strict=True):
+                image = draw(ax, *edges, value, colours)
+                ax.set_title(title)
+        bar = {"location": "bottom", "shrink": 0.7}
+        figure.colorbar(axes[0, 0].collections[0], ax=axes[:, :2], label="normalised amplitude", aspect=45, **bar)
+        figure.colorbar(image, ax=axes[:, 2], label="prediction − label", aspect=22, **bar)
+        if not polar:
+            for ax in axes.flat:
+                ax.label_outer()
+    return figure
+
+
+def side_by_side(
+    panels: Mapping[str, Float[ndarray, "rows columns"]],
+    elevations: Float[ndarray, " rows"],
+    azimuths: Float[ndarray, " columns"],
+) -> Figure:
+    """Several spectra, e.g. a measured one and its predictions by several systems.
+
+    Args:
+        panels: Spectra by title; values outside [0, 1] take the colour of the nearer end.
+        elevations: Of the rows [deg].
+        azimuths: Of the columns [deg].
+    """
+    columns = min(4, len(panels))
+    rows = ceil(len(panels) / columns)
+    edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
+    with rc_context(STYLE):
+        figure = Figure(figsize=(PAGE, 0.8 * rows + 0.75), layout="constrained")
+        axes = [*figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat]
+        for ax in axes[len(panels) :]:
+            ax.remove()
+        axes = axes[: len(panels)]
+        for index, (ax, (title, values)) in enumerate(zip(axes, panels.items(), strict=True)):
+            image = _draw_plane(ax, *edges, values.astype(np.float32), AMPLITUDE)
+            ax.set_title(title)
+            ax.label_outer()
+            if index + columns >= len(panels):  # the lowest panel of its column
+                ax.set_xlabel("azimuth [deg]")
+                ax.tick_params(labelbottom=True)
+        figure.colorbar(image, ax=axes, label="normalised amplitude", location="bottom", shrink=0.5, aspect=45)
+    return figure
+
+
+def _edges(centres: Float[ndarray, " n"], lowest: float, highest: float) -> Float[ndarray, " n+1"]:
+    """Borders of the pixels: half-way between their centres, and as far outside the first and the last."""
+    middle = (centres[1:] + centres[:-1]) / 2
+    ends = 2 * centres[0] - middle[0], 2 * centres[-1] - middle[-1]
+    return np.concatenate((ends[:1], middle, ends[1:])).clip(lowest, highest)
+
+
+def _draw_plane(ax: Axes, azimuths, elevations, values, colours):
+    image = ax.pcolormesh(azimuths, elevations, values, rasterized=True, **colours)
+    ax.set(xlabel="azimuth [deg]", ylabel="elevation\n[deg]")
+    ax.xaxis.set_major_locator(MultipleLocator(90))
+    ax.yaxis.set_major_locator(MultipleLocator(30))
+    ax.spines[:].set_visible(False)
+    return image
+
+
+def _draw_sky(ax: Axes, azimuths, elevations, values, colours):
+    image = ax.pcolormesh(np.deg2rad(azimuths), 90 - elevations, values, rasterized=True, **colours)
+    ink = "0.3" if colours["vmin"] < 0 else "white"  # the middle of the error's scale is white itself
+    ax.set_ylim(0, 90 - elevations.min())
+    ax.set_yticks((30, 60), ("60°", "30°"), color=ink, size=6)
+    ax.set_xticks(np.deg2rad((0, 90, 180, 270)), ("0°", "90°", "180°", "270°"))
+    ax.tick_params(pad=-2)
+    ax.grid(color=ink, alpha=0.35, linewidth=0.4)
+    ax.spines[:].set_visible(False)
+    return image

@@ -1,0 +1,259 @@
+"""Evaluation of a trained model beside its baselines: scores, times, predictions."""
+
+import copy
+import io
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from rich.console import Console, Group
+from rich.jupyter import JupyterMixin
+from torch import Tensor
+
+from gaigs.configuration import composed, has_file
+from gaigs.data import Links, Split
+from gaigs.data.matching import check_fit
+from gaigs.io.files import atomic_write
+from gaigs.model import Model, call_optional
+from gaigs.model.kriging import Kriging
+from gaigs.registry import name_of, registry
+from gaigs.report.table import metrics_table, verdict
+from gaigs.scene import Scene
+from gaigs.task import Task
+
+BATCH = 64
+"""Links predicted at a time."""
+
+Scores = dict[str, dict[str, Tensor]]
+"""Scores of every link, by the names of model and score."""
+
+
+def build_baselines(configurations: Sequence[str | Mapping], own: str, scene: Scene) -> dict[str, Model]:
+    """The baselines of a run by name, not fitted; the one with the run's own model name is left out.
+
+    Args:
+        configurations: Names or configurations of models without a training.
+        own: Name of the run's model.
+        scene: Receivers and task.
+
+    Raises:
+        ValueError: A baseline has no name, an unknown one or options that do not fit, has to be trained, or two have
+            the same name.
+    """
+    models: dict[str, Model | None] = {}
+    for config in configurations:
+        config = {"name": config} if isinstance(config, str) else config
+        if not isinstance(config, Mapping) or "name" not in config:
+            raise ValueError(f"baselines must be names or model configurations with a name, got {config!r}")
+        name = config["name"]
+        if name in models:
+            raise ValueError(f"baselines must have different names, got {name!r} twice")
+        models[name] = None if name == own else registry("model").build(config, scene=scene)
+        if name != own and is_trained(models[name]):
+            raise ValueError(f"baseline {name!r} has to be trained; run it by model={name}")
+    return {name: model for name, model in models.items() if model is not None}
+
+
+def is_trained(model: Model) -> bool:
+    """True if a model has parameters to train, beside those that ``fit`` sets."""
+    return any(parameter.requires_grad for parameter in model.parameters())
+
+
+def fitted(look_up: Model, links: Links) -> Model:
+    """A copy of a model without a training, fitted to the known links."""
+    model = copy.deepcopy(look_up)
+    model.fit(links)
+    return model
+
+
+def predict(model: Model, links: Links, index: Int[Tensor, " k"]) -> Tensor:
+    """Predictions for some links, on the CPU."""
+    return torch.cat([model.predict(links.query[part], batch_size=BATCH).cpu() for part in index.split(BATCH)])
+
+
+@dataclass(frozen=True)
+class Evaluation(JupyterMixin):
+    """Scores on the test links; prints as a table, in a notebook too.
+
+    Attributes:
+        task: Task of the labels.
+        split: Name of the split.
+        scores: Scores of every test link (k,), by the names of model and score; the evaluated model first.
+        device: Name of the device that computed them.
+    """
+
+    task: Task
+    split: str
+    scores: Scores
+    device: str
+
+    @property
+    def models(self) -> dict[str, dict[str, float]]:
+        """The numbers of the table, by the model's name and the metric's."""
+        return {name: self.task.summarise(values) for name, values in self.scores.items()}
+
+    def __rich__(self) -> Group:
+        facts = {"task": self.task.name, "split": self.split, "device": self.device, "models": self.models}
+        return Group(metrics_table(facts), verdict(facts))
+
+    def __str__(self) -> str:
+        console = Console(file=io.StringIO(), width=120)
+        console.print(self)
+        return console.file.getvalue().rstrip()
+
+
+def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | None = None) -> Evaluation:
+    """Scores of a model on the test links, beside those of baselines that are fitted to the other links.
+
+    Args:
+        model: A trained, fitted or loaded model, of the same receivers and task.
+        links: Links with a split.
+        baselines: Names or configurations of models without a training; None: those of the task.
+
+    Raises:
+        TypeError: The model is not a ``gaigs.Model``, or the links are not ``gaigs.Links``.
+        ValueError: There are no test links, the links have other receivers or another task, or a baseline has to be
+            trained.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=50)
+        >>> result = gaigs.evaluate(gaigs.train("knn", links), links, baselines=["mean", "path_loss"])
+        >>> list(result.models)
+        ['knn', 'mean', 'path_loss']
+        >>> print(result)
+        Test scores
+        ...
+        evaluated on ...
+    """
+    if not isinstance(model, Model) or not isinstance(links, Links):
+        raise TypeError(f"evaluate takes a model and links, got {type(model).__name__} and {type(links).__name__}")
+    check_fit(links, model.scene)
+    if not len(links.split.test):
+        raise ValueError("links must have some to test on; take another split")
+    task = links.task
+    own = name_of(model.trend if isinstance(model, Kriging) else model)
+    models = {own: model} | ({f"{own}_trend": model.trend} if isinstance(model, Kriging) else {})
+    if baselines is None:
+        baselines = composed([f"task={task.name}"], {})["baselines"] if has_file("task", task.name) else ()
+    baselines = [baselines] if isinstance(baselines, str) else baselines
+    scores = score(models, build_baselines(baselines, own, links.scene), links)
+    return Evaluation(task, links.split.name, scores, device_name(device_of(model)))
+
+
+def score(
+    models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links, folder: Path | None = None
+) -> Scores:
+    """Scores of every test link.
+
+    Args:
+        models: Fitted models by name; predictions of the first are written.
+        look_ups: Models without a training by name, not fitted.
+        links: The whole data set.
+        folder: Gets ``predictions.npz``; None: no file.
+    """
+    task, index = links.task, links.split.test
+    labels = torch.cat([links.labels[part] for part in index.split(BATCH)])
+    query = links.query[index]
+    content = {
+        "link": index.numpy(),
+        "transmitters": query.transmitters.numpy(),
+        "receiver": query.receivers.numpy(),
+        "labels": task.packed(labels),
+    }
+    if query.frequencies is not None:
+        content["frequencies"] = query.frequencies.numpy()
+    if task.directions is not None:
+        content |= {"elevations": task.directions.elevations.numpy(), "azimuths": task.directions.azimuths.numpy()}
+    scores = {}
+    for key in [*models, *look_ups]:
+        values = predict(models[key] if key in models else fitted(look_ups[key], links), links, index)
+        scores[key] = task.scores(labels, values)
+        content.setdefault("prediction", task.packed(values))
+        content |= {f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()}
+    if folder is not None:
+        with atomic_write(folder / "predictions.npz") as part:
+            np.savez_compressed(part, **content)
+    return scores
+
+
+def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
+    """Scores of every validation link; empty without such links.
+
+    Args:
+        models: Models by name that have not been fitted to the validation links.
+        look_ups: Models without a training by name, not fitted.
+        links: The whole data set.
+    """
+    split = links.split
+    if not len(split.validation):
+        return {}
+    unseen = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
+    labels = torch.cat([links.labels[part] for part in split.validation.split(BATCH)])
+    scores = {}
+    for name in [*models, *look_ups]:
+        model = models[name] if name in models else fitted(look_ups[name], unseen)
+        scores[name] = links.task.scores(labels, predict(model, unseen, split.validation))
+    return scores
+
+
+def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
+    """The table's numbers for each receiver with test links, by the names of receiver and model."""
+    receivers = links.query.receivers[links.split.test]
+    return {
+        receiver.name: {
+            name: links.task.summarise({key: score[receivers == i] for key, score in values.items()})
+            for name, values in scores.items()
+        }
+        for i, receiver in enumerate(links.receivers)
+        if (receivers == i).any()
+    }
+
+
+def inference_ms(model: Model, links: Links) -> float:
+    """Time from a query to its value [ms]."""
+    query = links.query[links.split.test[:1]]
+    return median_ms(lambda: model.predict(query))
+
+
+def render_ms(model: Model, links: Links) -> float | None:
+    """Time of rendering alone [ms]; None for a model that renders nothing."""
+    work = call_optional(model, "rendering", links.batch(links.split.test[:1]).to(device_of(model)))
+    if work is None:
+        return None
+    with torch.no_grad():
+        return median_ms(work)
+
+
+def median_ms(work: Callable, warm_up: int = 5, repeats: int = 25) -> float:
+    """Median duration of a call [ms], after warm-up."""
+    wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
+    seconds = []
+    for _ in range(warm_up + repeats):
+        wait()
+        start = time.perf_counter()
+        work()
+        wait()
+        seconds.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(seconds[warm_up:])
+
+
+def device_of(model: Model) -> torch.device:
+    """The device of a model."""
+    return next((tensor.device for tensor in model.state_dict().values()), torch.device("cpu"))
+
+
+def device_name(device: torch.device) -> str:
+    """The name of a device, for tables."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    threads = torch.get_num_threads()
+    return f"{names[0] if names else platform.processor() or platform.machine()}, {threads} thread{'s' * (threads > 1)}"

@@ -1,0 +1,178 @@
+"""Checkpoints of a training: the best one, and the last one, from which a stopped training goes on.
+
+Lightning's ``ModelCheckpoint`` is not used: it saves before a due validation, by each process's own clock, and knows no
+stop at a signal, so a training could not go on exactly where it stopped.
+"""
+
+import contextlib
+import math
+import signal
+import threading
+import time
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Checkpoint
+
+from gaigs import checkpoint
+from gaigs.io.files import atomic_write
+from gaigs.processes import STOPPING
+from gaigs.training import MeanScores
+
+
+class KeepBest(Checkpoint):
+    """Writes the checkpoint of the best validation score (``Task.monitor``), or of the last step without validation.
+
+    Args:
+        path: The checkpoint.
+        patience: Validations without a better score until the training stops; None: it goes on to the last step.
+
+    Raises:
+        ValueError: The patience is less than one validation.
+    """
+
+    def __init__(self, path: Path, patience: int | None):
+        if patience is not None and patience < 1:
+            raise ValueError(f"training.patience must be at least 1 validation or null, got {patience}")
+        self.path, self.patience = path, patience
+        self.best, self.waited = -math.inf, 0  # an error counts as its negative
+
+    def state_dict(self) -> dict:
+        return {"best": self.best, "waited": self.waited}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.best, self.waited = state["best"], state["waited"]
+
+    def on_train_start(self, trainer, module) -> None:
+        """The start of a model that predicts untrained counts too: few readings may not better it."""
+        self._stop_in_time(trainer)  # a run that was killed once it had stopped
+        if trainer.enable_validation and self.best == -math.inf and module.model.predicts_untrained:
+            self._validate(trainer, module)
+
+    def on_validation_end(self, trainer, module) -> None:
+        if trainer.sanity_checking:
+            return
+        score = trainer.callback_metrics[f"validation/{module.task.monitor}"].item()
+        self.waited = 0 if self._keep(trainer, module, score) else self.waited + 1
+        self._stop_in_time(trainer)
+
+    def on_train_end(self, trainer, module) -> None:
+        """The last step counts too, where no validation was due at it."""
+        if trainer.enable_validation and trainer.global_step % trainer.val_check_batch:
+            self._validate(trainer, module)
+
+    @torch.no_grad()
+    def _validate(self, trainer, module) -> None:
+        module.eval()
+        scores = MeanScores(module.task)
+        for batch in trainer.val_dataloaders:
+            batch = trainer.precision_plugin.convert_input(batch).to(module.device)
+            with trainer.precision_plugin.val_step_context():
+                scores.add(batch, module.model.evaluate(batch))
+        module.train()
+        self._keep(trainer, module, scores.over_processes(trainer.strategy)[module.task.monitor])
+
+    def on_fit_end(self, trainer, module) -> None:
+        if self.best == -math.inf:
+            save(trainer, self.path)
+
+    def _keep(self, trainer, module, score: float) -> bool:
+        score = score if module.task.higher_is_better else -score
+        better = score > self.best
+        if better:
+            self.best = score
+            save(trainer, self.path)
+        return better
+
+    def _stop_in_time(self, trainer) -> None:
+        if self.patience is not None and self.waited >= self.patience:
+            trainer.should_stop = True
+
+
+class KeepLast(Checkpoint):
+    """Writes the checkpoint to go on from: at intervals, at Ctrl-C or SIGTERM, and at the end.
+
+    It writes between two steps, after a due validation and after the other callbacks, whose state it stores: from there
+    a training goes on as if it had never stopped. At the first signal the training stops there, at the second at once.
+    Several processes follow the clock of the first, and stop together whichever of them got the signal.
+
+    Args:
+        path: The checkpoint.
+        every: Interval [s].
+    """
+
+    def __init__(self, path: Path, every: float):
+        self.path, self.every = path, every
+        self.received: int | None = None
+        self.random: dict | None = None
+
+    def state_dict(self) -> dict:
+        """The states of torch's global generators, which a model may draw from."""
+        devices = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+        return {"processor": torch.random.get_rng_state(), "devices": devices}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.random = state
+
+    def interrupt(self, number: int, *_) -> None:
+        """Handles the signals that stop a run."""
+        if self.received is not None:
+            raise Interrupted("stopped within a step", number)
+        self.received = number
+
+    def on_train_start(self, trainer, module) -> None:
+        self.saved = time.monotonic()
+        if threading.current_thread() is threading.main_thread():  # others may set no handlers
+            for number in STOPPING:
+                # After Lightning's handler of SIGTERM, which would talk to the other processes in the midst of a step.
+                signal.signal(number, self.interrupt)
+        if self.random is not None:
+            torch.random.set_rng_state(self.random["processor"])
+            for device, state in enumerate(self.random["devices"][: torch.cuda.device_count()]):
+                torch.cuda.set_rng_state(state, device)
+
+    def on_train_batch_end(self, trainer, module, *_) -> None:
+        if not (trainer.enable_validation and trainer.global_step % trainer.val_check_batch == 0):
+            self._rest(trainer)
+
+    def on_validation_end(self, trainer, module) -> None:
+        if not trainer.sanity_checking:
+            self._rest(trainer)
+
+    def on_fit_end(self, trainer, module) -> None:
+        save(trainer, self.path)
+
+    def _rest(self, trainer) -> None:
+        anyone = lambda holds: trainer.strategy.reduce_boolean_decision(holds, all=False)
+        is_due = trainer.is_global_zero and time.monotonic() >= self.saved + self.every
+        if not anyone(is_due or self.received is not None):
+            return
+        save(trainer, self.path)
+        self.saved = time.monotonic()
+        if anyone(self.received is not None):
+            raise Interrupted(f"stopped after step {trainer.global_step}", self.received or signal.SIGINT)
+
+
+class Interrupted(Exception):
+    """Ctrl-C or SIGTERM; at a KeyboardInterrupt Lightning would end the process.
+
+    Args:
+        message: Where the training stopped.
+        number: Of the signal.
+    """
+
+    def __init__(self, message: str, number: int):
+        super().__init__(message)
+        self.number = number
+
+
+def save(trainer: lightning.Trainer, path: Path) -> None:
+    """Writes a checkpoint atomically, after the log of the steps before it; every process has to call it."""
+    for logger in trainer.loggers:
+        logger.save()
+    with atomic_write(path) if trainer.is_global_zero else contextlib.nullcontext(path.with_suffix(".part")) as part:
+        trainer.save_checkpoint(part, weights_only=False)  # the first process alone writes
+        if trainer.is_global_zero:
+            checkpoint.seal(part)
+    trainer.strategy.barrier()

@@ -1,0 +1,102 @@
+"""Density control: Gaussians are pruned, cloned and split while a model trains."""
+
+import torch
+from lightning.pytorch.callbacks import Callback
+
+from gaigs import density
+from gaigs.training import seeded
+
+
+class DensityControl(Callback):
+    """Prunes, clones and splits Gaussians on a schedule.
+
+    Where the loss still pulls at converged Gaussians there are too few. The pull at a Gaussian is its mean positional
+    gradient since the last round times its distance to the receivers' middle: a gradient per radian seen from there.
+    Of those pulled harder than ``gradient``, wide ones split and narrow ones are cloned. Frozen positions end it.
+
+    Args:
+        every: Steps between two rounds.
+        start, stop: First and last step of a round.
+        gradient: Bound on the pull [loss/rad].
+        split_angle: Largest standard deviation over distance beyond which a Gaussian is wide [rad].
+        opacity: Opacity below which Gaussians are pruned.
+        max_count: Largest number of Gaussians to grow to.
+        seed: Of the halves' random positions.
+
+    Raises:
+        ValueError: An option is out of range, or the model has no Gaussians.
+
+    Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2; thresholds in docs/methods.md.
+    """
+
+    def __init__(
+        self,
+        every: int,
+        start: int,
+        stop: int,
+        gradient: float,
+        split_angle: float,
+        opacity: float,
+        max_count: int,
+        seed: int,
+    ):
+        least = {"every": (every, 1), "start": (start, 0), "stop": (stop, start), "max_count": (max_count, 1)}
+        least |= {"gradient": (gradient, 0), "split_angle": (split_angle, 0)}
+        for option, (value, bound) in least.items():
+            if not value >= bound:
+                raise ValueError(f"density.{option} must be at least {bound}, got {value}")
+        if not 0 <= opacity < 1:
+            raise ValueError(f"density.opacity must be in [0, 1), got {opacity}")
+        self.every, self.start, self.stop = every, start, stop
+        self.gradient, self.split_angle, self.opacity = gradient, split_angle, opacity
+        self.max_count, self.seed = max_count, seed
+        self.pull = torch.zeros(0)
+        self.steps = 0
+
+    def state_dict(self) -> dict:
+        return {"pull": self.pull, "steps": self.steps}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.pull, self.steps = state["pull"], state["steps"]
+
+    def on_fit_start(self, trainer, module) -> None:
+        if module.model.primitives is None:
+            raise ValueError("density needs a model with Gaussians, and this one has none; leave density out")
+
+    def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
+        gaussians = module.model.primitives
+        if not gaussians.means.requires_grad:
+            return
+        pull = gaussians.means.grad.norm(dim=-1) * self._distances(module)
+        self.pull = pull if self.steps == 0 else self.pull.to(pull) + pull
+        self.steps += 1
+
+    @torch.no_grad()
+    def on_train_batch_end(self, trainer, module, *_) -> None:
+        gaussians, optimizer, step = module.model.primitives, trainer.optimizers[0], trainer.global_step
+        is_due = step % self.every == 0 and self.start <= step <= self.stop
+        if not is_due or not gaussians.means.requires_grad:
+            return
+        pulled = self.pull / self.steps > self.gradient
+        room = max(0, self.max_count - len(gaussians))
+        if int(pulled.sum()) > room:  # the hardest pulled alone
+            chosen = torch.topk(torch.where(pulled, self.pull, -1), room).indices
+            pulled = torch.zeros_like(pulled).index_fill(0, chosen, True)
+        wide = gaussians.scales.amax(-1) / self._distances(module) > self.split_angle
+        cloned, split = pulled & ~wide, pulled & wide
+        density.clone(gaussians, optimizer, cloned)
+        split = torch.cat((split, split.new_zeros(len(gaussians) - len(split))))
+        density.split(gaussians, optimizer, split, seeded(self.seed, step))
+        faint = gaussians.opacities < self.opacity
+        if faint.any():
+            density.prune(gaussians, optimizer, faint)
+        self.steps = 0
+        if trainer.world_size > 1:
+            # Gradients are averaged before they are added up here, and all processes draw alike, so all have the same
+            # Gaussians. Lightning's wrapper still holds the replaced parameters.
+            trainer.strategy.model = trainer.strategy._setup_model(module)
+
+    def _distances(self, module) -> torch.Tensor:
+        gaussians = module.model.primitives
+        middle = module.model.scene.positions(gaussians.means).mean(0)
+        return (gaussians.means.detach() - middle).norm(dim=-1)

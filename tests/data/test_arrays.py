@@ -1,0 +1,58 @@
+"""Links of arrays in memory."""
+
+import numpy as np
+import pytest
+import torch
+
+import gaigs
+
+PLACES = np.random.default_rng(0).uniform(0, 4, (12, 3))
+GATEWAYS = [[0.0, 0.0, 2.0], [4.0, 4.0, 2.0]]
+
+
+def test_readings_of_all_gateways_become_links():
+    readings = np.arange(24.0).reshape(12, 2) - 90
+    readings[3, 1] = np.nan
+    links = gaigs.links(task="rssi", transmitters=PLACES, receivers=GATEWAYS, labels=readings, frequency=2.4e9)
+    assert len(links) == 23
+    heard = ~np.isnan(readings.ravel())
+    assert torch.equal(links.labels, torch.tensor(readings.ravel()[heard], dtype=torch.float32))
+    assert torch.equal(links.query.receivers, torch.arange(2).repeat(12)[torch.tensor(heard)])
+    assert torch.equal(links.rows, torch.arange(12).repeat_interleave(2)[torch.tensor(heard)])
+    long = gaigs.links(
+        task="rssi", transmitters=PLACES.repeat(2, 0), receivers=GATEWAYS, labels=readings.ravel(), index=[0, 1] * 12
+    )
+    assert torch.equal(long.rows, links.rows), "links of one place are never parted"
+    assert links.query.frequencies.unique().tolist() == [2.4e9]
+    assert "1 links were not heard" in links.remarks
+
+
+def test_each_link_has_a_receiver_of_its_own():
+    index = torch.arange(12) % 2
+    given = gaigs.links(task="rssi", transmitters=PLACES, receivers=GATEWAYS, labels=np.zeros(12) - 50, index=index)
+    stands = np.array(GATEWAYS)[index.numpy()]
+    placed = gaigs.links(task="rssi", transmitters=PLACES, receivers=stands, labels=np.zeros(12) - 50)
+    assert torch.equal(given.query.receivers, placed.query.receivers)
+    assert len(placed.receivers) == 2
+    alone = gaigs.links(task="rssi", transmitters=PLACES, receivers=[0, 0, 2], labels=np.zeros(12) - 50, test=0.5)
+    assert len(alone.receivers) == 1
+    assert len(alone.split.test) == 6
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"labels": np.zeros((12, 3))}, r"labels of task 'rssi' must be \(12,\) .* or \(12, 2\).*, got \(12, 3\)"),
+        ({"labels": np.zeros((12, 2)) + np.inf}, "labels must be finite where something was heard"),
+        ({"labels": np.zeros(12), "index": [5] * 12}, "index must be 12 whole numbers from 0 to 1"),
+        ({"transmitters": PLACES[:, :2]}, r"transmitters must be \(..., 3\) positions \[m\], got shape \(12, 2\)"),
+        ({"transmitters": PLACES * np.nan}, "transmitters must be finite"),
+        ({"frequency": 2.4}, "frequency must be a carrier in Hz, from 10000 to 3e.11, got 2.4; in GHz?"),
+        ({"tset": 0.5}, r"there is no option 'tset' \(did you mean 'test'\?\) of split 'random'"),
+        ({"task": "rsi"}, r"unknown task 'rsi' \(did you mean 'rssi'\?\)"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(changes, message):
+    arrays = {"task": "rssi", "transmitters": PLACES, "receivers": GATEWAYS, "labels": np.zeros((12, 2)) - 50}
+    with pytest.raises(ValueError, match=message):
+        gaigs.links(**(arrays | changes))

@@ -1,0 +1,91 @@
+"""Grey images: headers are checked at once, pixels when they are asked for."""
+
+import re
+import zlib
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from gaigs.io.images import GreyImages
+
+SHAPE = (90, 360)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Three images of random pixels."""
+    found = [tmp_path / f"{k}.png" for k in range(3)]
+    for k, file in enumerate(found):
+        Image.fromarray(np.random.default_rng(k).integers(0, 256, SHAPE, dtype=np.uint8)).save(file)
+    return found
+
+
+def test_an_image_is_decoded_once_and_when_asked(files):
+    images = GreyImages(files, SHAPE)
+    first = images[torch.tensor([0, 2, 0])]
+    assert first.dtype == torch.float32
+    expected = [np.random.default_rng(k).integers(0, 256, SHAPE, dtype=np.uint8) for k in (0, 2, 0)]
+    np.testing.assert_allclose(first, np.stack(expected) / 255, atol=1e-7)
+    assert len(images) == 3
+    assert images[torch.tensor([], dtype=torch.long)].shape == (0, *SHAPE)
+    for file in files:
+        file.unlink()
+    assert torch.equal(images[torch.tensor([2, 0])], first[1:])
+    with pytest.raises(ValueError, match=r"cannot parse .*1\.png: no whole PNG image \(.*\); copy it again"):
+        images[torch.tensor([0, 1])]
+
+
+def save(array):
+    return lambda file: Image.fromarray(array).save(file)
+
+
+def cut(size):
+    return lambda file: file.write_bytes(file.read_bytes()[:size])
+
+
+def vast(file):
+    """A header of so many pixels that Pillow warns."""
+    content = file.read_bytes()
+    header = b"IHDR" + (10_000).to_bytes(4) + (10_000).to_bytes(4) + content[24:29]
+    file.write_bytes(content[:12] + header + zlib.crc32(header).to_bytes(4) + content[33:])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (save(np.zeros((90, 361), np.uint8)), "of 90 x 360 pixels, got mode L of 90 x 361"),
+        (save(np.zeros((360, 90), np.uint8)), "got mode L of 360 x 90"),
+        (
+            save(np.zeros((90, 360, 3), np.uint8)),
+            "expected 8-bit grey (Pillow's mode L) of 90 x 360 pixels, got mode RGB",
+        ),
+        (save(np.zeros(SHAPE, np.uint16)), "got mode I;16"),
+        (lambda file: Image.new("L", (360, 90)).save(file, format="jpeg"), "no whole PNG image (cannot identify image"),
+        *((cut(size), "no whole PNG image (") for size in (0, 20, 40)),
+        (vast, "no whole PNG image (Image size"),
+    ],
+)
+def test_a_header_with_a_defect_is_refused_at_once(files, damage, message):
+    damage(files[1])
+    with pytest.raises(ValueError, match=rf"1\.png: .*{re.escape(message)}"):
+        GreyImages(files, SHAPE)
+
+
+@pytest.mark.parametrize("place", [45, 100, 6000, 20000, -60, -5000])
+def test_a_damaged_byte_is_no_other_pixel(files, place):
+    content = bytearray(files[1].read_bytes())
+    content[place] ^= 0x10
+    files[1].write_bytes(content)
+    with pytest.raises(ValueError, match=r"1\.png: no whole PNG image"):
+        GreyImages(files, SHAPE)[torch.tensor([1])]
+
+
+@pytest.mark.parametrize("keep", [60, 5000, 32000])
+def test_a_truncated_image_is_refused_when_decoded(files, keep):
+    cut(keep)(files[1])
+    images = GreyImages(files, SHAPE)
+    images[torch.tensor([0])]
+    with pytest.raises(ValueError, match=r"1\.png: no whole PNG image"):
+        images[torch.tensor([0, 1])]

@@ -1,0 +1,280 @@
+"""Mirrored Gaussians with the planes and materials of the simulated room, against the simulator."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.constants import speed_of_light
+
+from gaigs.antenna import Array, Receiver
+from gaigs.data.synthetic import POSE, REGION
+from gaigs.data.synthetic.image_source import Room, permittivity, trace
+from gaigs.gaussians import SH_DC
+from gaigs.placement.mirrored.paths import Mirrored
+from gaigs.query import Query
+from gaigs.scene import Scene
+from gaigs.task.csi import Csi
+from gaigs.task.rssi import Rssi
+from gaigs.testing import check_placement, example_links
+from gaigs.testing.placement import example_gaussians
+
+FREQUENCY = 6.4896e9
+ROOM = Room((7.0, 5.0, 3.0), ("concrete", "glass", "wood", "brick", "plasterboard", "ceiling_board"))
+LOWER, UPPER = torch.tensor(REGION)
+
+
+def scene(pattern="cosine", bandwidth=5e8, task=None):
+    array = Array.planar(4, 4, 0.02, pattern)
+    return Scene(
+        (Receiver("gateway", POSE, array),), LOWER, UPPER, 0.3, task or Rssi(), torch.tensor([FREQUENCY]), bandwidth
+    )
+
+
+def make(order=2, planes=6, obstacles=0, channels=2, **options):
+    torch.manual_seed(0)
+    return Mirrored(scene(**options), channels, planes, order, obstacles)
+
+
+def walled(placement):
+    """The placement with the room's planes and materials; no path has a gain of its own."""
+    with torch.no_grad():
+        for wall, material in enumerate(ROOM.walls):
+            axis, side = divmod(wall, 2)
+            normal = torch.eye(3)[axis] * (1 if side else -1)
+            placement.place(wall, normal, ROOM.size[axis] if side else 0.0)
+            epsilon = permittivity(material, FREQUENCY)
+            placement.log_permittivities[wall] = math.log(epsilon.real - 1)
+            placement.log_conductivities[wall] = math.log(-epsilon.imag)
+        placement.log_extents.fill_(20.0)
+    return placement
+
+
+def ask(count=40, seed=0):
+    places = torch.lerp(LOWER, UPPER, torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)))
+    return Query(places, torch.zeros(count, dtype=torch.long), torch.full((count,), FREQUENCY))
+
+
+def simulated(query, order, pattern):
+    """Images, and each path's field over that of free space at one metre, in float64."""
+    paths = trace(ROOM, query.transmitters, POSE.position, FREQUENCY, order)
+    local = (paths.images - POSE.position.double()) @ POSE.rotation.double()
+    lengths = local.norm(dim=-1)
+    gains = paths.gains / lengths
+    if pattern == "cosine":
+        gains = gains * (local[..., 2] / lengths).clamp(min=0)
+    return paths.images, gains, lengths
+
+
+@pytest.mark.parametrize(("order", "pattern"), [(0, "isotropic"), (1, "cosine"), (3, "isotropic"), (2, "cosine")])
+def test_with_the_rooms_walls_it_is_the_simulator(order, pattern):
+    """Each path of the simulator is one of its Gaussians, with the same field; the other Gaussians are silent."""
+    query = ask()
+    placement = walled(make(order, pattern=pattern)).double()
+    query = replace(query, transmitters=query.transmitters.double())
+    placed = placement(None, query)
+    true_images, true_gains, true_lengths = simulated(query, order, pattern)
+    for i in range(len(query)):
+        distances = (placed.means[i, :, None] - true_images[i]).norm(dim=-1)
+        exists = placed.gains[i].abs() > 0
+        for k in range(true_images.shape[1]):
+            found = (distances[:, k] < 1e-5) & exists
+            if true_gains[i, k].abs() == 0:  # behind the array
+                assert not found.any()
+                continue
+            (which,) = found.nonzero()[:, 0].tolist()
+            # The planes' buffers are float32.
+            assert placed.gains[i, which].item() == pytest.approx(true_gains[i, k].item(), rel=1e-4)
+            assert placed.lengths[i, which].item() == pytest.approx(true_lengths[i, k].item(), abs=1e-5)
+        assert exists.sum() == (true_gains[i].abs() > 0).sum()
+
+
+def test_phases_follow_path_lengths_once_they_count():
+    query = ask()
+    placement = walled(make())
+    quiet = placement(None, query)
+    assert not quiet.coherences.any()
+    placement.enable_phases(speed_of_light / FREQUENCY)
+    with torch.no_grad():
+        placement.path_phases[3] = 1.0
+        placement.log_blurs[4] = 0.0
+    placed = placement(None, query)
+    turns = placed.lengths.double() * FREQUENCY / speed_of_light
+    expected = quiet.gains * torch.polar(torch.ones_like(turns), -2 * math.pi * turns)
+    expected[:, 3] *= torch.polar(torch.tensor(1.0), torch.tensor(1.0))
+    scale = expected.abs().max().item()
+    # float32 places a path of some ten metres to a millionth of a metre, a ten thousandth of a turn.
+    torch.testing.assert_close(placed.gains.to(expected), expected, rtol=0, atol=2e-3 * scale)
+    # A path's phase is known but for a normal error: exp(-variance / 2) of its field is left.
+    assert placed.coherences[4].item() == pytest.approx(math.exp(-0.5))
+    assert placed.coherences[0].item() == pytest.approx(math.exp(-(0.3**2) / 2))
+    torch.testing.assert_close(placed.means, quiet.means)
+
+
+def test_phases_are_learnt_as_they_turn():
+    """The derivative of a phase by a plane's offset is 2 pi over the wavelength times that of the length."""
+    placement = walled(make(1))
+    placement.enable_phases(speed_of_light / FREQUENCY)
+    query = ask(1)
+    placed = placement(None, query)
+    wall = 2  # its sequence is the third after the direct path
+    phase = placed.gains[0, wall].angle()
+    for leaf, of_length in ((placement.shifts, placed.lengths[0, wall]), (placement.path_phases, None)):
+        (by_phase,) = torch.autograd.grad(phase, leaf, retain_graph=True)
+        if of_length is None:
+            assert by_phase[wall] == pytest.approx(1)
+            continue
+        (by_length,) = torch.autograd.grad(of_length, leaf, retain_graph=True)
+        slopes = by_phase[wall - 1, 3] / by_length[wall - 1, 3]
+        assert slopes.item() == pytest.approx(-2 * math.pi * FREQUENCY / speed_of_light, rel=1e-2)
+
+
+def test_it_starts_with_a_plane_beyond_each_face_of_the_box():
+    placement = make(planes=9)
+    assert placement.used.tolist() == [0, 1, 2, 3, 4, 5]
+    assert len(placement(None, ask(1)).means[0]) == 1 + 6 + 30
+    corners = torch.stack((torch.minimum(LOWER, POSE.position), torch.maximum(UPPER, POSE.position)))
+    for plane in range(6):
+        axis, sign = plane % 3, 1 if plane < 3 else -1
+        assert placement.normals[plane, axis] * sign > 0.95
+        # Along its normal it lies beyond the box by a few per cent of the diagonal.
+        beyond = placement.offsets[plane] - sign * corners[0 if sign < 0 else 1, axis]
+        assert 0 < beyond < 0.1 * placement.diagonal
+
+
+def test_a_plane_can_be_put_elsewhere_and_its_paths_be_dropped():
+    placement = make(planes=7)
+    with torch.no_grad():
+        placement.shifts.normal_()
+    placement.place(2, torch.tensor([0.0, 3.0, 4.0]), 1.5)
+    torch.testing.assert_close(placement.normals[2], torch.tensor([0.0, 0.6, 0.8]))
+    assert placement.offsets[2] == 1.5
+    placement.kept &= placement.sequences_of(torch.tensor([0, 2]))
+    assert placement.used.tolist() == [0, 2]
+    kept = sorted(map(tuple, placement.sequences[placement.kept].tolist()))
+    assert kept == [(-1, -1), (-1, 0), (-1, 2), (0, 2), (2, 0)]
+    assert placement(None, ask(3)).means.shape == (3, 5, 3)
+
+
+def test_phases_move_no_plane_and_makes_steps_small():
+    placement = make()
+    with torch.no_grad():
+        placement.shifts.normal_()
+    normals, offsets = placement.normals.clone(), placement.offsets.clone()
+    placement.enable_phases(0.05)
+    torch.testing.assert_close(placement.normals, normals)
+    torch.testing.assert_close(placement.offsets, offsets)
+    with torch.no_grad():
+        placement.shifts[:, 3] += 0.01
+    turned = 4 * math.pi * (placement.offsets - offsets).abs() / 0.05  # phase of a reflected path in a usual step
+    assert ((turned > 0.03) & (turned < 0.4)).all()
+
+
+def test_held_strengths_stay_while_images_follow():
+    query, placement = ask(), walled(make(obstacles=5))
+    with placement.holding():
+        first = placement(None, query)
+        with torch.no_grad():
+            placement.origin[0, 3] += 0.3
+            placement.plane_gains[0] = -1.0
+        moved = placement(None, query)
+    after = placement(None, query)
+    torch.testing.assert_close(moved.gains * moved.lengths, first.gains * first.lengths)
+    assert (moved.means - first.means).norm(dim=-1).max() > 0.5
+    torch.testing.assert_close(after.means, moved.means)
+    assert (after.gains - moved.gains).abs().max() > 1e-3
+
+
+def test_obstacles_attenuate_paths_along_their_legs():
+    query, bare = ask(), walled(make(1))
+    placement = walled(make(1, obstacles=4))
+    clear, dimmed = bare(None, query), placement(None, query)
+    losses = -(dimmed.gains / clear.gains).abs().log()
+    heard = clear.gains.abs() > 0
+    # The direct path has one leg, a reflected one two, which meet on the wall.
+    direct = placement.obstacles(query.transmitters, POSE.position.expand_as(query.transmitters))
+    torch.testing.assert_close(losses[heard[:, 0], 0], direct[heard[:, 0]], rtol=1e-3, atol=1e-5)
+    wall = 1 + 2  # y = 0
+    image = query.transmitters * torch.tensor([1, -1, 1])
+    share = POSE.position[1] / (POSE.position[1] - image[:, 1])
+    stop = torch.lerp(POSE.position.expand_as(image), image, share[:, None])
+    both = placement.obstacles(query.transmitters, stop) + placement.obstacles(stop, POSE.position.expand_as(stop))
+    own = heard[:, wall]
+    assert own.any()
+    torch.testing.assert_close(losses[own, wall], both[own], rtol=1e-3, atol=1e-5)
+    expected = placement.obstacles.densities.mean() * placement.diagonal
+    torch.testing.assert_close(placement.penalties(), {"obstacles": expected})
+    assert bare.penalties() == {}
+
+
+def test_a_small_plane_mirrors_near_its_middle_alone():
+    query, whole, small = ask(), walled(make(1)), walled(make(1))
+    with torch.no_grad():
+        small.middles[4] = torch.tensor([3.0, 2.0, 0.0])
+        small.log_extents[4] = math.log(0.5)
+    ratio = (small(None, query).gains / whole(None, query).gains)[:, 1 + 4].abs()
+    image = query.transmitters * torch.tensor([1, 1, -1])
+    share = POSE.position[2] / (POSE.position[2] - image[:, 2])
+    stop = torch.lerp(POSE.position.expand_as(image), image, share[:, None])
+    aside = (stop - torch.tensor([3.0, 2.0, 0.0])).square().sum(1) / 0.25
+    heard = ratio.isfinite()
+    assert heard.any()
+    torch.testing.assert_close(ratio[heard], (-aside / 2).exp()[heard], rtol=1e-3, atol=1e-6)
+
+
+def test_free_gaussians_follow_the_mirrored_ones():
+    query, placement = ask(3), make()
+    gaussians = example_gaussians(placement.scene, 8)
+    alone, both = placement(None, query), placement(gaussians, query)
+    n = alone.means.shape[1]
+    assert both.means.shape == (3, n + 8, 3)
+    for name in ("means", "scales"):
+        torch.testing.assert_close(getattr(both, name)[:, :n], getattr(alone, name))
+        assert torch.equal(getattr(both, name)[0, n:], getattr(gaussians, name))
+    for name in ("quats", "opacities", "signal", "coherences"):
+        assert torch.equal(getattr(both, name)[:n], getattr(alone, name))
+    assert torch.equal(both.opacities[n:], gaussians.opacities)
+    assert torch.equal(both.signal[n:], gaussians.signal)
+    assert (both.gains[:, n:] == SH_DC).all()  # as if nothing had placed them
+    assert not both.coherences[n:].any()
+
+
+@pytest.mark.parametrize("sharp", [False, True])
+@pytest.mark.parametrize("carrier", [None, 5e9])
+def test_it_keeps_the_contract_of_placements(sharp, carrier):
+    links = example_links("rssi", carrier)
+    torch.manual_seed(0)
+    placement = Mirrored(links.scene, 2, planes=7, order=2, obstacles=4)
+    if sharp and carrier is not None:
+        placement.enable_phases(speed_of_light / carrier)
+        with torch.no_grad():
+            placement.shifts.normal_()
+    check_placement(placement, links.scene)
+
+
+def test_the_band_is_learnt_from_the_datas_or_from_the_rooms_size():
+    assert make().log_bandwidth.exp().item() == pytest.approx(5e8)
+    assert make(bandwidth=None).log_bandwidth.exp().item() == pytest.approx(speed_of_light / make().diagonal)
+    for placement in (make(bandwidth=0.0), make(task=Csi(16, torch.tensor([FREQUENCY])))):
+        assert placement.log_bandwidth is None
+        assert placement(None, ask(1)).bandwidth is None
+
+
+def test_each_group_has_a_learning_rate():
+    assert list(make().parameter_groups()) == ["planes", "paths"]
+    assert make(obstacles=3).parameter_groups().keys() == Mirrored.learning_rates.keys()
+    assert make(obstacles=3).penalties().keys() == Mirrored.penalty_weights.keys()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"planes": 5}, "placement.planes must be at least 6, got 5"),
+        ({"order": -1}, "placement.order must be at least 0, got -1"),
+        ({"obstacles": -2}, "placement.obstacles must be at least 0, got -2"),
+        ({"channels": 10}, "'mirrored' has 1 or 2 channels, amplitude or complex, got 10"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        make(**options)
