@@ -27,16 +27,6 @@ def _extract(multivectors: Tensor, *blades: str) -> Tensor:
     return torch.stack([multivectors[..., _INDEX[blade]] for blade in blades], -1)
 
 
-def embed_scalar(scalars: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 16"]:
-    """Numbers that no motion changes, as the component 1 (of either algebra)."""
-    return functional.pad(scalars[..., None], (0, 15))
-
-
-def extract_scalar(multivectors: Float[Tensor, "*batch 16"]) -> Float[Tensor, "*batch"]:
-    """The component 1."""
-    return multivectors[..., 0]
-
-
 def embed_point(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
     """Points [m] as trivectors e123 - x e023 + y e013 - z e012, where the planes of their coordinates meet."""
     x, y, z = points.unbind(-1)

@@ -223,7 +223,7 @@ class OptionalMethods(Protocol):
         """The rendering of a batch without all else, to be timed."""
 
     def learnt_room(self, links: Links) -> object:
-        """The room learnt from the links, a ``gaigs.report.shapes.LearntRoom`` for figures."""
+        """The room learnt from the links, a ``gaigs.placement.learnt_room.LearntRoom`` for figures."""
 
     def export(self, folder: Path) -> None:
         """Writes files for other programs into a run's folder."""

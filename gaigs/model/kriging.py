@@ -58,7 +58,7 @@ class Kriging(Model):
     def __init__(self, scene: Scene, trend: dict | Model, fallback: dict | None = None):
         super().__init__(scene)
         self.trend = trend if isinstance(trend, Model) else registry("model").build(trend, scene=scene)
-        if not any(parameter.requires_grad for parameter in self.trend.parameters()):
+        if not [*self.trend.parameters()]:
             raise ValueError(f"kriging needs a trained model, got {name_of(self.trend)}; leave kriging out")
         self.fallback_options = {"name": "mean"} if fallback is None else fallback
         self.fallback = registry("model").build(self.fallback_options, scene=scene)
@@ -169,6 +169,8 @@ class Kriging(Model):
         length, _, scale = self.hyperparameters
         # A part without weight is not evaluated: that would cost its time, and a NaN of it would count.
         trend = self.trend(batch).value if trend_weight > 0 or weight < 1 else None
+        if weight == 0:
+            return Prediction(trend, {})
         value = 0 if trend_weight == 0 else trend_weight * trend
         if trend_weight < 1:
             value = value + (1 - trend_weight) * self.fallback(batch).value

@@ -220,6 +220,44 @@ def test_segments_through_the_unit_cube(start, end, hits):
     assert passes(end, start, *cube).item() is hits
 
 
+def test_channel_is_reciprocal():
+    there = trace(ROOM, TRANSMITTERS, RECEIVER, FREQUENCY, 2)
+    wavenumber = 2 * math.pi / WAVELENGTH
+    field = lambda paths, at: (
+        paths.gains * torch.polar(1 / (paths.images - at).norm(dim=-1), -wavenumber * (paths.images - at).norm(dim=-1))
+    ).sum(-1)
+    forward = field(there, RECEIVER)
+    back = torch.stack([field(trace(ROOM, RECEIVER[None], t, FREQUENCY, 2), t)[0] for t in TRANSMITTERS])
+    torch.testing.assert_close(forward, back, rtol=1e-9, atol=0)
+
+
+def test_turning_room_receiver_and_transmitters_changes_nothing():
+    """A quarter turn about the vertical, (x, y) to (5 - y, x), which leaves the polarisation as it is."""
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    shift = torch.tensor([5.0, 0.0, 0.0], dtype=torch.float64)
+    move = lambda point: torch.as_tensor(point, dtype=torch.float64) @ turn.T + shift
+    boxes = []
+    for box in ROOM.furniture:
+        corners = torch.stack((move(box.lower), move(box.upper)))
+        boxes.append(Box(box.name, tuple(corners.amin(0).tolist()), tuple(corners.amax(0).tolist()), box.loss_db))
+    west, east, south, north, floor, ceiling = WALLS
+    turned = Room((5.0, 7.0, 3.0), (north, south, west, east, floor, ceiling), tuple(boxes))
+    first = pose(RECEIVER.tolist(), (45, 130, 20))
+    second = Pose(move(first.position).float(), turn.float() @ first.rotation)
+    grid = Grid.degrees(range(1, 91, 4), range(0, 360, 10))
+    offsets = frequency_offsets(ROOM, 200e6, 2)
+
+    def spectra(room, transmitters, pose):
+        responses = respond(room, transmitters, Receiver("gateway1", pose, PATCHES), FREQUENCY, offsets, 2)
+        return bartlett(responses, grid, PATCHES, FREQUENCY)
+
+    here, there = spectra(ROOM, TRANSMITTERS, first), spectra(turned, move(TRANSMITTERS), second)
+    torch.testing.assert_close(here, there, rtol=1e-4, atol=1e-4 * here.max().item())
+    # The receiver left behind sees something else.
+    other = spectra(turned, move(TRANSMITTERS), Pose(second.position, first.rotation))
+    assert (here - other).abs().max() > 0.1 * here.max()
+
+
 def test_permittivity_is_that_of_the_recommendation():
     """Its own form of the imaginary part: 17.98 sigma / f with f in GHz."""
     at_2, at_10 = permittivity("concrete", 2e9), permittivity("concrete", 10e9)

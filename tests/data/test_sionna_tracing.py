@@ -96,6 +96,15 @@ def test_a_wave_bends_around_a_corner(tracer):
     assert 0.01 < abs(gains[0]) < 0.5  # at the shadow's boundary it is half the field
 
 
+def test_channel_is_reciprocal(tracer):
+    here, there = RECEIVER, torch.tensor([[1.5, -0.5, 0.7]])
+    forth = strong(tracer.trace([FLOOR, WALL], here, there, FREQUENCY))
+    back = strong(tracer.trace([FLOOR, WALL], there[0], here[None], FREQUENCY))
+    field = lambda found, start: sorted(np.linalg.norm(found[0] - start, axis=1).round(4))
+    assert field(forth, here.numpy()) == pytest.approx(field(back, there[0].numpy()), abs=2e-4)
+    assert forth[1].sum() == pytest.approx(back[1].sum(), abs=0.02)
+
+
 @pytest.mark.parametrize("frequency", [1e8, 5e10, math.nan])
 def test_frequencies_out_of_range_are_refused(frequency):
     with pytest.raises(ValueError, match=r"frequency must lie in 3e\+08\.\.4e\+10 Hz, got"):
