@@ -19,7 +19,7 @@ from gaigs.scene import Scene
 KEY = "gaigs"
 """Key of gaigs's entries in a Lightning checkpoint."""
 
-VERSION = 2
+VERSION = 3
 """The only format that is read."""
 
 SEAL = b"gaigs sha256 "

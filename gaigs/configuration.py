@@ -327,8 +327,7 @@ def explain(error: Exception) -> str | None:
             place, _, word = key.rpartition(".")
             has = [str(name) for name in cause.parent_node]
             told = f"{place or 'the configuration'} has no key {suggest(word, has)}; it has: {_listed(sorted(has))}"
-            # Hydra composes the defaults of a sweep first, and then each job: all of them must have the key.
-            return f"{told}\nin a sweep over parts that lack it write ++{key}=VALUE" if is_multirun() else told
+            return f"{told}\nall parts of a sweep must have its keys; sweep this part alone" if is_multirun() else told
         case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:
             kind, _, name = file.rpartition("/")
             packages = OmegaConf.load(conf_dir() / "published.yaml").packages if kind == "model" else {}

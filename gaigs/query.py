@@ -42,7 +42,10 @@ def as_numbers(name: str, values: object, expected: str) -> Tensor:
         ValueError: The values are not real numbers.
     """
     try:
-        tensor = torch.as_tensor(values)
+        native = values
+        if isinstance(values, np.ndarray):  # torch takes no negative strides and no other byte order
+            native = np.array(values, dtype=values.dtype.newbyteorder("="), order="C")
+        tensor = torch.as_tensor(native)
         if tensor.is_complex() or tensor.dtype == torch.bool or np.ma.is_masked(values):
             raise TypeError(str(tensor.dtype))
     except (TypeError, ValueError, RuntimeError, OverflowError):  # torch's errors for words and ragged lists

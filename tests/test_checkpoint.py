@@ -78,7 +78,7 @@ torch.save(model.predict(torch.load(sys.argv[2])), sys.argv[3])
 
 def test_a_checkpoint_holds_all_that_a_run_is(folder, content):
     identity = content[checkpoint.KEY]
-    assert identity["version"] == checkpoint.VERSION == 2
+    assert identity["version"] == checkpoint.VERSION == 3
     assert identity["config"] == yaml.safe_load((folder / "config.yaml").read_text())
     assert identity["model"] == identity["config"]["model"]
     split = identity["split"]
@@ -150,8 +150,8 @@ DEFECTS = {
     "another program's": (lambda content: content.pop(checkpoint.KEY), "it lacks the entry 'gaigs'"),
     "another meaning": (lambda content: content.update({checkpoint.KEY: 3}), "it lacks the entry 'gaigs'"),
     "code": (lambda content: content.update(callback=Foreign()), "is damaged, or no checkpoint of this version"),
-    "an earlier format": (lambda content: content[checkpoint.KEY].update(version=1), "has checkpoint format 1, and"),
-    "a later format": (lambda content: content[checkpoint.KEY].update(version=3), "format 3, and this gaigs reads"),
+    "an earlier format": (lambda content: content[checkpoint.KEY].update(version=2), "has checkpoint format 2, and"),
+    "a later format": (lambda content: content[checkpoint.KEY].update(version=4), "format 4, and this gaigs reads"),
     "no format": (lambda content: content[checkpoint.KEY].pop("version"), "has checkpoint format None, and"),
     "no receivers": (lambda content: SCENE(content).pop("receivers"), "KeyError: 'receivers'"),
     "no name": (lambda content: MODEL(content).pop("name"), "needs the key 'name'"),

@@ -168,7 +168,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("data=nerf2_spectrum", "data.root must be given, as it has no default; add data.root=..."),
         ("data=nerf2_spectrum data.root=nowhere", "nowhere must be the folder of a data set"),
         ("-m model=knn,mean model.k=3", "; it has: deformation, gaussians, name, placement, pooling, projection, "
-            "rasterizer, tokenizer, trend\nin a sweep over parts that lack it write ++model.k=VALUE"),
+            "rasterizer, tokenizer, trend\nall parts of a sweep must have its keys; sweep this part alone"),
     ],
 )  # fmt: skip
 def test_a_wrong_word_gives_one_message(overrides, message, run):

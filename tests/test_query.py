@@ -142,6 +142,14 @@ def test_impossible_directions_are_refused(directions, error, message):
         as_directions(directions, OWN, "spectrum")
 
 
+@pytest.mark.parametrize("view", [lambda x: x[::-1], lambda x: x.astype(">f8"), lambda x: np.asfortranarray(x)])
+def test_arrays_of_any_layout_are_positions(view):
+    points = np.arange(12.0).reshape(4, 3)
+    query, shape = Query.from_positions(view(points), 0, None, ["west"], torch.zeros(0))
+    assert torch.equal(query.transmitters, torch.from_numpy(np.ascontiguousarray(view(points), np.float32)))
+    assert shape == (4,)
+
+
 def test_directions_become_lists_in_float32():
     assert as_directions(None, OWN, "spectrum") is OWN
     assert as_directions(None, None, "rssi") is None

@@ -27,7 +27,8 @@ def check_fit(links: Links, scene: Scene | None = None) -> None:
     if not are_alike(*places):
         names = [", ".join(each.name for each in receivers) for receivers in (scene.receivers, links.receivers)]
         raise ValueError(
-            f"links must have the model's receivers in the same order, at the same places: {names[0]}; got {names[1]}"
+            f"links must have the model's receivers in the same order, with the same poses and arrays: "
+            f"{names[0]}; got {names[1]}"
         )
 
 
