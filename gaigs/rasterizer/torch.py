@@ -76,7 +76,7 @@ class _Tiles:
             coordinate = coordinate.flatten(1)
             low, high = coordinate.amin(1, keepdim=True), coordinate.amax(1, keepdim=True)
             offset = _nearest(means[:, axis], (low + high) / 2, period).abs()
-            # A few roundings' slack: splats listed in vain are dropped pixel by pixel.
+            # A few roundings' slack: splats listed needlessly are dropped pixel by pixel.
             touches = touches & ~(offset > (halves[:, axis] + (high - low) / 2) * (1 + 1e-5) + 1e-6)
         self.chunks = self._chunks(touches, len(opacities))
 

@@ -65,7 +65,7 @@ class Revision(Callback):
             log.info("step %d: %s", trainer.global_step, done)
 
     def _batch(self, module, index: Int[Tensor, " k"], number: int) -> Batch | None:
-        """Some of the links, thinned as those of a step; None where there are none."""
+        """Some of the links, thinned as those of a step; None for an empty part."""
         if not len(index):
             return None
         generator = seeded(self.seed, number, len(index))

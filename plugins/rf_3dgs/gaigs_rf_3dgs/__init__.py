@@ -26,7 +26,7 @@ class Rf3dgs(GaussianSplatting):
     """The splatting pipeline, trained in two stages.
 
     1. Geometry. Without a file everything is trained, and each Gaussian sends alike for all transmitters, as a
-       photograph shows the room whoever sends: it learns what the training spectra have in common. With a
+       photograph does not depend on the transmitter: it learns what the training spectra have in common. With a
        file there is no training: Gaussians stand at its points.
     2. Radio. Centres, orientations and scales are frozen and the signal is reset. Trained are opacities and spherical
        harmonics over the direction in which a transmitter sees a Gaussian.
