@@ -1,12 +1,13 @@
 """Losses compare predicted values with labels."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
 from gaigs.query import Batch
 
 
+@runtime_checkable
 class Loss(Protocol):
     """The contract of kind ``loss``; a loss is built with the labels' ``task``."""
 

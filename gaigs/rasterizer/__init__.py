@@ -1,7 +1,7 @@
 """Rasterizers composite splats front to back into a map over directions."""
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor, cat
@@ -26,6 +26,7 @@ STEEPEST = 1e-30
 """Attenuation below which the gradient is that at this value, as its own would overflow float32."""
 
 
+@runtime_checkable
 class Rasterizer(Protocol):
     """The contract of kind ``rasterizer``.
 
