@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gaigs.antenna import Receiver
+from gaigs.io.images import GreyImages
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.scene import Scene
@@ -40,18 +41,16 @@ class Links:
     Attributes:
         query: Transmitter positions (float32), receivers and frequencies.
         receivers: Receivers that the query points to.
-        labels: Indexed by an integer tensor (k,) it gives labels (k, *task.shape) of the task's dtype. A tensor, or
-            an object that reads its labels when asked.
+        labels: Tensor, or object that reads labels from files; an index (k,) gives labels (k, *task.shape).
         task: Task of the labels.
         rows: Row of each link in the order of measurement, from 0 (n,). Links of one transmission to several
             receivers, or at several frequencies, share a row. None: each link has its own.
-        official: Function that gives the training and test links that came with the data, or None. It may read files,
-            and is called for the official split alone.
+        official: Reads the training and test links that came with the data, for the official split only; or None.
         split: Train, validation and test links; None until a split is chosen, see ``load``.
-        bandwidth: Width of the band around each carrier that a label's power is averaged over, 0 for a carrier alone
-            [Hz]; None if unknown.
+        bandwidth: Band around each carrier that a label's power is averaged over, 0 for a carrier alone [Hz]; None if
+            unknown.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
-        remarks: Counts of what was read and what was left out, with the reason.
+        remarks: Counts of links read and left out, with the reason.
         origin: Configurations of ``data`` and ``split``; empty for arrays in memory.
 
     Example:
@@ -65,7 +64,7 @@ class Links:
 
     query: Query
     receivers: tuple[Receiver, ...]
-    labels: Tensor
+    labels: Tensor | GreyImages
     task: Task
     rows: Int[Tensor, " n"] | None = None
     official: Callable[[], Parts] | None = None
@@ -97,11 +96,7 @@ class Links:
 
     @property
     def scene(self) -> Scene:
-        """The scene that a model is built from.
-
-        Raises:
-            ValueError: All training transmitters stand at one point.
-        """
+        """The scene that a model is built from; a ``ValueError`` if all training transmitters stand at one point."""
         training = self.query[self.split.train]
         train = training.transmitters.unique(dim=0)
         if len(train) < 2:
@@ -112,28 +107,21 @@ class Links:
 
 
 def median_spacing(places: Float[Tensor, "n 3"]) -> float:
-    """Median distance from a place to the nearest other one [m]; there must be two different places or more."""
+    """Median distance from a place to the nearest other one [m]; takes two places or more."""
     distances, _ = cKDTree(places.double().numpy()).query(places.double().numpy(), k=2)
     return float(np.median(distances[:, 1]))
 
 
 def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
-    """A data set with its split.
-
-    Args:
-        data: Configuration of a registered data set.
-        split: Configuration of a registered split.
-        task: Name of the expected task; None for any.
+    """A data set with its split, by the configurations of both; ``task`` names the expected task, None for any.
 
     Raises:
-        FileNotFoundError: The data are not there.
+        FileNotFoundError: The data are missing.
         ValueError: A file, an option or the split has a defect, or the labels are of another task.
     """
     links = registry("data").build(data)
     if task not in (None, links.task.name):
-        raise ValueError(
-            f"the labels of data {data['name']!r} are of task {links.task.name!r}, and the configuration is for "
-            f"{task!r}; add task={links.task.name}"
-        )
+        found = f"the labels of data {data['name']!r} are of task {links.task.name!r}"
+        raise ValueError(f"{found}, and the configuration is for {task!r}; add task={links.task.name}")
     origin = {"data": dict(data), "split": dict(split)}
     return replace(links, split=registry("split").build(split, links=links), origin=origin)

@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -10,9 +11,6 @@ from gaigs.data import csi_npz, load, nerf2_spectrum, rssi_csv, sionna, syntheti
 from gaigs.data.sionna.meshes import wavefront_obj
 from gaigs.io.files import write_text
 from gaigs.io.tables import check_empty
-
-WRITERS = {"spectrum": nerf2_spectrum.write, "rssi": rssi_csv.write, "csi": csi_npz.write}
-"""Writer of each task's labels."""
 
 
 def main() -> None:
@@ -28,14 +26,15 @@ def main() -> None:
     folder = arguments.folder
     try:
         check_empty(folder)
-        options = OmegaConf.to_container(OmegaConf.from_dotlist(arguments.options))
+        options: dict[str, Any] = OmegaConf.to_container(OmegaConf.from_dotlist(arguments.options))
         links = load({"name": arguments.data, **options}, {"name": "official", "validation": 0})
         if arguments.data.startswith("synthetic"):
             geometry = synthetic.wavefront_obj(synthetic.ROOM)
         else:
             geometry = wavefront_obj(sionna.ROOMS[options.get("room", "furnished")].meshes())
         folder.mkdir(parents=True, exist_ok=True)
-        WRITERS[links.task.name](folder, links)
+        writers = {"spectrum": nerf2_spectrum.write, "rssi": rssi_csv.write, "csi": csi_npz.write}
+        writers[links.task.name](folder, links)
         write_text(folder / "geometry.obj", geometry)
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, OmegaConfBaseException) as error:
         parser.error(str(error))

@@ -1,8 +1,7 @@
 """Complex channels in one file of numpy arrays; docs/data.md describes them."""
 
 import warnings
-import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -33,19 +32,17 @@ STRENGTHS = 1e-18, 1e18
 
 @register("data", "csi_npz")
 def read(file: str | Path) -> Links:
-    """A data set from an ``.npz`` file, which is only read: one link for each channel.
+    """A data set from an ``.npz`` file: one link for each channel.
 
     Receivers are named ``rx0``, ``rx1`` ... by their rows in ``rx``, and look along the world's axes. The links of one
-    transmitter position share a row. Links whose channel is zero throughout are left out, and so are receivers without
-    links; the remarks count them. The middle of the subcarriers' band counts as the carrier. There is no official
-    split.
+    transmitter position share a row. Channels of zeros and receivers without links are left out; the remarks count
+    them. The middle of the subcarriers' band counts as the carrier. There is no official split.
 
     Args:
-        file: Holds ``tx`` (n, 3), the transmitters' positions [m]; ``rx`` (k, 3), the receivers' [m]; ``rx_index``
-            (n,), the receiver of each link, from 0; ``frequencies`` (s,), those of the subcarriers [Hz]; ``h``
-            (n, e, s), complex channels in linear amplitude; and optionally ``elements`` (e, 3), the offsets of an
-            array's elements from its receiver's position along the world's axes [m]. Without it all elements count as
-            standing at that position, and the remarks say so. Other arrays are named in the remarks.
+        file: Arrays ``tx`` (n, 3), positions of the transmitters [m]; ``rx`` (k, 3), positions of the receivers [m];
+            ``rx_index`` (n,), receiver of each link, from 0; ``frequencies`` (s,), subcarriers [Hz]; ``h`` (n, e, s),
+            complex channels, linear amplitude; optionally ``elements`` (e, 3), offsets of an array's elements from
+            its receiver's position along the world's axes [m], by default 0. The remarks name other arrays.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -73,10 +70,7 @@ def read(file: str | Path) -> Links:
     if absent := [receiver.name for k, receiver in enumerate(everyone) if k not in present]:
         remarks.append(f"receivers without links are left out: {', '.join(absent)}")
     if count > 1 and "elements" not in arrays:
-        remarks.append(
-            f"the file does not say where the {count} elements stand, so all count as standing at their receiver's "
-            "position, and no geometry tells their phases apart"
-        )
+        remarks.append(f"positions of the {count} elements are unknown: all count as standing at their receiver's")
     if ignored:
         remarks.append(f"arrays ignored: {', '.join(ignored)}")
     return Links(
@@ -90,67 +84,50 @@ def read(file: str | Path) -> Links:
 
 
 def write(folder: str | Path, links: Links) -> None:
-    """Writes channels to one receiver as ``room.npz`` in a folder, a file that ``read`` reads.
-
-    Raises:
-        OSError: The file cannot be written.
-        ValueError: There is more than one receiver.
-    """
+    """Writes channels to one receiver as ``room.npz`` in a folder, for ``read``."""
     (receiver,) = links.receivers
+    task: Csi = links.task
     with atomic_write(Path(folder) / "room.npz") as part:
         np.savez(
             part,
             tx=links.query.transmitters.numpy(),
             rx=receiver.pose.position.numpy()[None],
             rx_index=links.query.receivers.numpy(),
-            frequencies=links.task.frequencies.numpy(),
+            frequencies=task.frequencies.numpy(),
             h=links.labels.numpy(),
             elements=(receiver.array.elements.double() @ receiver.pose.rotation.double().T).numpy(),
         )
 
 
 def _load(file: Path) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The arrays by name, and the names of others, which are not read.
-
-    Raises:
-        ValueError: The file is no archive of arrays, or an array is missing, repeated or damaged.
-    """
-    arrays = {}
+    """The arrays by name, read to the end where zipfile compares checksums, and the names of ignored arrays."""
+    arrays, place = {}, ""
     try:
         # Opened here, since numpy leaves a damaged file open; it warns of headers written by Python 2.
         with file.open("rb") as stream, warnings.catch_warnings(action="ignore"):
             content = np.load(stream, allow_pickle=False)
-            if not isinstance(content, Mapping):
+            if not isinstance(content, np.lib.npyio.NpzFile):
                 raise ValueError(f"a single array of shape {content.shape}")
             members = [name.removesuffix(".npy") for name in content.zip.namelist()]
             for name, (kind, sizes) in ARRAYS.items():
-                if name in members or name != "elements":
-                    arrays[name] = _read(content.zip, name, members.count(name), f"{kind} numbers of {_shape(sizes)}")
+                if name == "elements" and name not in members:
+                    continue
+                place = f"{name}: "
+                if (count := members.count(name)) != 1:
+                    shape = str(sizes).replace("'", "")
+                    raise ValueError(f"expected one array of {kind} numbers of {shape}, got {count}")
+                with content.zip.open(f"{name}.npy") as member:
+                    arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
+                    if member.read(1):
+                        raise ValueError(f"more numbers than its shape {arrays[name].shape} has")
     except Exception as error:  # damaged files make numpy and zipfile raise exceptions of many types
-        raise ValueError(f"cannot parse {file}: {error}; expected an .npz file as numpy.savez writes it") from error
+        expected = "an .npz file as numpy.savez writes it"
+        raise ValueError(f"cannot parse {file}: {place}{error}; expected {expected}") from error
     return arrays, [name for name in members if name not in ARRAYS]
 
 
-def _read(archive: zipfile.ZipFile, name: str, count: int, expected: str) -> np.ndarray:
-    """An array, read to the end of its member, where zipfile compares the checksum.
-
-    Raises:
-        ValueError: The array is not there once, or damaged.
-    """
-    if count != 1:
-        raise ValueError(f"{name}: expected one array of {expected}, got {count}")
-    try:
-        with archive.open(f"{name}.npy") as stream:
-            array = np.lib.format.read_array(stream, allow_pickle=False)
-            if stream.read(1):
-                raise ValueError(f"more numbers than its shape {array.shape} has")
-    except Exception as error:
-        raise ValueError(f"{name}: {error}") from error
-    return array
-
-
 def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises a ``ValueError`` for an array of another kind or shape; each size is that of the first array with it."""
+    """Raises a ``ValueError`` for other kinds and shapes of arrays; the first array with a size fixes it."""
     known: dict[object, int] = {}
     kinds = {"real": "iuf", "whole": "iu", "complex": "c"}  # of numpy's data types
     for name, array in arrays.items():
@@ -158,52 +135,43 @@ def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
         if array.dtype.kind not in kinds[kind]:
             hint = "; join real and imaginary parts by re + 1j * im" if kind == "complex" else ""
             raise ValueError(f"{file}: {name}: expected {kind} numbers, got {array.dtype}{hint}")
-        sizes = [known.get(letter, letter) for letter in letters]
+        sizes = tuple(known.get(letter, letter) for letter in letters)
         fits = [isinstance(size, str) or size == got for size, got in zip(sizes, array.shape, strict=False)]
         if array.ndim != len(sizes) or not all(fits) or not array.size:
             hint = "; for one antenna add an axis, h[:, None, :]" if name == "h" and array.ndim == 2 else ""
-            raise ValueError(f"{file}: {name}: expected the shape {_shape(sizes)}, got {_shape(array.shape)}{hint}")
+            expected = str(sizes).replace("'", "")
+            raise ValueError(f"{file}: {name}: expected the shape {expected}, got {array.shape}{hint}")
         known |= dict(zip(letters, array.shape, strict=True))
 
 
 def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Raises a ``ValueError`` for a number out of range; arrays become of the types to compute with."""
+    """Converts arrays to the types of the computation; a ``ValueError`` for a number out of range."""
     for name, array in arrays.items():
-        with np.errstate(all="ignore"):  # numbers too large for a type become infinite, and are refused
+        with np.errstate(all="ignore"):  # numbers too large for a type become infinite, which fails below
             dtype = {"h": np.complex64, "rx_index": np.int64}.get(name, np.float64)
             arrays[name] = array = array.astype(dtype, copy=False)
-        match name:
-            case "h":
-                low, high = STRENGTHS
-                with np.errstate(over="ignore"):
-                    strengths = np.abs(array)
-                strongest = strengths.max((1, 2), keepdims=True)
-                holds = (strengths < high) & ~((strongest > 0) & (strongest < low))
-                expected = f"magnitudes below {high:g}, the largest of a link {low:g} or more unless all are 0"
-            case "rx_index":
-                count = len(arrays["rx"])
-                holds, expected = (array >= 0) & (array < count), f"a row of rx, 0..{count - 1}"
-            case "frequencies":
-                low, high = CARRIERS
-                holds, expected = (low <= array) & (array <= high), f"a frequency from {low:g} to {high:g} Hz"
-            case _:
-                holds, expected = np.abs(array) < FAR, WITHIN
+            match name:
+                case "h":
+                    (low, high), strengths = STRENGTHS, np.abs(array)
+                    strongest = strengths.max((1, 2), keepdims=True)
+                    holds = (strengths < high) & ~((strongest > 0) & (strongest < low))
+                    expected = f"magnitudes below {high:g}, the largest of a link {low:g} or more unless all are 0"
+                case "rx_index":
+                    count = len(arrays["rx"])
+                    holds, expected = (array >= 0) & (array < count), f"a row of rx, 0..{count - 1}"
+                case "frequencies":
+                    low, high = CARRIERS
+                    holds, expected = (low <= array) & (array <= high), f"a frequency from {low:g} to {high:g} Hz"
+                case _:
+                    holds, expected = np.abs(array) < FAR, WITHIN
         for rule, good in (("a number", ~np.isnan(array)), (expected, holds)):
             wrong = np.argwhere(~good)
             if len(wrong):
                 value, rows = array[tuple(wrong[0])], len(np.unique(wrong[:, 0]))
-                hint = unit_hint(value) if name == "frequencies" else ""
-                got = "NaN" if np.isnan(value) else value
-                raise ValueError(
-                    f"{file}: {name}{wrong[0].tolist()}: expected {rule}, got {got}{hint} (in {rows} of "
-                    f"{len(array)} rows)"
-                )
+                got = "NaN" if np.isnan(value) else f"{value}{unit_hint(value) if name == 'frequencies' else ''}"
+                count = f"in {rows} of {len(array)} rows"
+                raise ValueError(f"{file}: {name}{wrong[0].tolist()}: expected {rule}, got {got} ({count})")
     if len(np.unique(arrays["frequencies"])) < len(arrays["frequencies"]):
         raise ValueError(f"{file}: frequencies: expected different ones, got one twice; leave one subcarrier out")
     if not arrays["h"].any():
         raise ValueError(f"{file}: h: expected a channel that is not zero throughout, got none")
-
-
-def _shape(sizes: Sequence) -> str:
-    """A shape as Python writes it; a letter stands for any size."""
-    return f"({', '.join(map(str, sizes))}{',' if len(sizes) == 1 else ''})"

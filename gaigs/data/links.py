@@ -2,11 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from gaigs import configuration
 from gaigs.antenna import Receiver
@@ -18,18 +17,17 @@ from gaigs.registry import registry
 from gaigs.task import Task
 
 
-def links(reader: str | None = None, /, **options) -> Links:
+def links(reader: str | None = None, /, **options: Any) -> Links:
     """Links of a registered reader, or of arrays in memory, with their split.
 
     Args:
-        reader: Name of a data set's reader, e.g. ``"synthetic"``, ``"nerf2_spectrum"``, ``"rssi_csv"``; None for
+        reader: Name of a registered reader, e.g. ``"synthetic"``, ``"nerf2_spectrum"``, ``"rssi_csv"``; None for
             arrays.
-        options: ``split``, the name of a registered split, by default the reader's own, ``"random"`` for arrays; and
-            the options of reader and split by their names. For arrays those of ``from_arrays``:
-            ``task``, ``transmitters`` (n, 3) [m], ``receivers``, ``labels``.
+        options: Options of reader and split by their names, and ``split``, the name of a registered split. For arrays
+            those of ``from_arrays``: ``task``, ``transmitters`` (n, 3) [m], ``receivers``, ``labels``.
 
     Raises:
-        FileNotFoundError: The reader finds no data there.
+        FileNotFoundError: The reader finds no data.
         TypeError: An option has a wrong type.
         ValueError: A name is unknown, or files, arrays or the split do not fit.
 
@@ -43,11 +41,8 @@ def links(reader: str | None = None, /, **options) -> Links:
     """
     if reader is None:
         needed = ("task", "transmitters", "receivers", "labels")
-        if missing := [key for key in needed if key not in options]:
-            raise ValueError(
-                f"links takes the name of a reader first, or arrays: {', '.join(needed)}; {', '.join(missing)} must be "
-                "given"
-            )
+        if missing := ", ".join(key for key in needed if key not in options):
+            raise ValueError(f"links takes a reader's name first, or arrays: {', '.join(needed)}; missing: {missing}")
         return from_arrays(**options)
     config = configuration.composed([f"data={reader}"], options, ("data", "split"))
     return load(config["data"], config["split"])
@@ -55,28 +50,26 @@ def links(reader: str | None = None, /, **options) -> Links:
 
 def from_arrays(
     task: str | Task,
-    transmitters: Float[Tensor, "n 3"],
-    receivers: Receiver | Sequence[Receiver] | Float[Tensor, "k 3"],
-    labels: Tensor,
-    index: Int[Tensor, " n"] | None = None,
-    frequency: float | Float[Tensor, " n"] | None = None,
+    transmitters: Any,
+    receivers: Any,
+    labels: Any,
+    index: Any = None,
+    frequency: Any = None,
     split: str | Mapping = "random",
-    **options,
+    **options: Any,
 ) -> Links:
-    """Links of arrays in memory, with their split; every argument that torch can convert is an array.
+    """Links of arrays in memory, or of values that torch converts, with their split.
 
     Args:
         task: Task of the labels: ``"rssi"`` (scalars [dBm]), or a task with its axes, e.g.
             ``gaigs.task.spectrum.Spectrum(elevations, azimuths, "")`` or ``gaigs.task.csi.Csi(elements, frequencies)``.
         transmitters: Positions, world frame (n, 3) [m].
-        receivers: ``Receiver`` objects, or positions (3,) or (k, 3) [m] of single antennas that look along the axes.
-        labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver, (n, k, ...). A
-            reading that is NaN and a channel of zeros was not heard, and is left out.
-        index: Receiver of each link (n,), from 0. Not needed with one receiver; with n positions, each of one link; or
-            with labels (n, k, ...).
+        receivers: ``Receiver`` or several, or positions (3,) or (k, 3) [m] of single antennas that look along the axes.
+        labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver, (n, k, ...).
+            Readings of NaN and channels of zeros were not heard, and are left out.
+        index: Receiver of each link (n,), from 0; not needed with one receiver, n positions, or labels (n, k, ...).
         frequency: Carrier, one or one a link [Hz]; None if unknown, for channels the middle of the subcarriers.
-        split: Name of a registered split.
-        options: Options of the split.
+        split: Name of a registered split; ``options`` are its own.
 
     Raises:
         TypeError: An option has a wrong type.
@@ -96,10 +89,9 @@ def from_arrays(
         receivers = [gateway(f"rx{k}", place) for k, place in enumerate(stands)]
     if np.ma.is_masked(labels):
         raise ValueError("labels must be plain numbers, got a masked array; fill it with nan where nothing was heard")
-    if task.dtype.is_complex:
-        labels = torch.as_tensor(labels).detach().to(task.dtype)
-    else:
-        labels = as_numbers("labels", labels, f"labels of task {task.name!r}").detach().to(task.dtype)
+    if not task.dtype.is_complex:
+        labels = as_numbers("labels", labels, f"labels of task {task.name!r}")
+    labels = torch.as_tensor(labels).detach().to(task.dtype)
     count, most, shape = len(places), len(receivers), tuple(task.shape)
     rows = torch.arange(count)
     if tuple(labels.shape) == (count, most, *shape) and index is None:
@@ -126,10 +118,9 @@ def from_arrays(
         carriers = as_numbers("frequency", frequency, "a carrier in Hz")
         if carriers.ndim and carriers.shape != (count,):
             raise ValueError(f"frequency must be one number, or {count}, one for each transmitter, got {len(carriers)}")
-        carriers = carriers.expand(count)[rows]
+        carriers = carriers.expand(count)[rows][heard]
         for carrier in carriers.unique().tolist():
             check_carrier("frequency", carrier)
-        carriers = carriers[heard]
     made = Links(
         query=Query(places[rows][heard], index[heard].long(), carriers),
         receivers=tuple(receivers),

@@ -1,5 +1,7 @@
 """Links against the scene that a model was made for."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -8,31 +10,26 @@ from gaigs.scene import Scene
 
 
 def check_fit(links: Links, scene: Scene | None = None) -> None:
-    """Raises a ``ValueError`` unless links have a split, and the receivers and labels of a model's scene if given."""
+    """Raises a ``ValueError`` unless links have a split and, with a model's scene, its receivers and labels."""
     if links.split is None:
         raise ValueError("links must have a split; gaigs.links(..., split='random') gives one")
     if scene is None:
         return
-    there, here = scene.task, links.task
-    axes = lambda task: {key: value for key, value in task.state().items() if key != "normalisation"}
-    if there.name != here.name or tuple(there.shape) != tuple(here.shape) or not are_alike(axes(there), axes(here)):
+    axes = [task.state() | {"normalisation": ""} for task in (scene.task, links.task)]
+    if not are_alike(*axes):
+        expected, got = (f"{task.name!r} {tuple(task.shape)}" for task in (scene.task, links.task))
+        raise ValueError(f"links must have the model's labels, {expected} with the same axes, got {got}")
+    both = scene.receivers, links.receivers
+    antennas = [[(r.pose.position, r.pose.rotation, r.array.elements, r.array.pattern) for r in each] for each in both]
+    if not are_alike(*antennas):
+        expected, got = (", ".join(receiver.name for receiver in each) for each in both)
         raise ValueError(
-            f"links must have the model's labels, {there.name!r} {tuple(there.shape)} with the same axes, got "
-            f"{here.name!r} {tuple(here.shape)}"
-        )
-    places = [
-        [(each.pose.position, each.pose.rotation, each.array.elements, each.array.pattern) for each in receivers]
-        for receivers in (scene.receivers, links.receivers)
-    ]
-    if not are_alike(*places):
-        names = [", ".join(each.name for each in receivers) for receivers in (scene.receivers, links.receivers)]
-        raise ValueError(
-            f"links must have the model's receivers in the same order, with the same poses and arrays: "
-            f"{names[0]}; got {names[1]}"
+            f"links must have the model's receivers in the same order, with the same poses and arrays: {expected}; "
+            f"got {got}"
         )
 
 
-def are_alike(a: object, b: object) -> bool:
+def are_alike(a: Any, b: Any) -> bool:
     """True if nested values are equal, tensors to 1e-5."""
     if isinstance(a, Tensor):
         is_same = isinstance(b, Tensor) and a.shape == b.shape

@@ -12,19 +12,7 @@ from torch import Tensor
 
 from gaigs.data import Links, Parts
 from gaigs.data.readings import gateway, to_dbm
-from gaigs.io.tables import (
-    find_folder,
-    has_file,
-    quote,
-    read_lines,
-    read_parts,
-    read_points,
-    split_cells,
-    split_rows,
-    to_index,
-    to_number,
-)
-from gaigs.io.walls import read_walls
+from gaigs.io import tables
 from gaigs.io.yaml import read_mapping, to_position
 from gaigs.query import Query
 from gaigs.registry import register
@@ -36,7 +24,7 @@ NOT_HEARD = -100.0
 
 @register("data", "nerf2_rssi")
 def read(root: str | Path) -> Links:
-    """A data set from its folder, which is only read: one link for each reading that a gateway heard.
+    """A data set from its folder: one link for each reading that a gateway heard.
 
     Readings of -100 dBm were not heard. They, and gateways that heard nothing, are left out and counted in the remarks.
     Gateways look along the world's axes. The readings of one measurement share a row.
@@ -46,13 +34,13 @@ def read(root: str | Path) -> Links:
             ``train_index.txt`` and ``test_index.txt``, and optionally ``layout.csv``.
 
     Raises:
-        FileNotFoundError: There is no such folder.
+        FileNotFoundError: The folder does not exist.
         ValueError: A file has a defect; the message names file, line and value.
 
     Source: NeRF², https://github.com/XPengZhao/NeRF2.
     """
-    root = find_folder(root)
-    positions = read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one measurement a line")
+    root = tables.find_folder(root)
+    positions = tables.read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one measurement a line")
     file = root / "gateway_position.yml"
     gateways = {
         name: to_position(f"{file}: {name}", value)
@@ -60,11 +48,9 @@ def read(root: str | Path) -> Links:
     }
     names, readings = _read_readings(root / "gateway_rssi.csv", [*gateways])
     if len(positions) != len(readings):
-        raise ValueError(
-            f"{root}: tx_pos.csv has {len(positions)} positions, and gateway_rssi.csv {len(readings)} rows"
-        )
+        raise ValueError(f"{root}: tx_pos.csv has {len(positions)} positions, gateway_rssi.csv {len(readings)} rows")
     layout = root / "layout.csv"
-    walls = read_walls(layout) if has_file(layout) else torch.zeros(0, 2, 3)
+    walls = tables.read_walls(layout) if tables.has_file(layout) else torch.zeros(0, 2, 3)
 
     dbm = torch.tensor(readings, dtype=torch.float64)
     heard = dbm > NOT_HEARD
@@ -91,40 +77,34 @@ def read(root: str | Path) -> Links:
 
 def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list[list[float]]]:
     """The gateway of each column, and the readings [dBm] of each row."""
-    lines = read_lines(file, "an RSSI [dBm] of each gateway, one measurement a line")
-    first = split_cells(lines[0])
-    header = any(cell in gateways for cell in first) or all(math.isnan(to_number(cell)) for cell in first)
+    lines = tables.read_lines(file, "an RSSI [dBm] of each gateway, one measurement a line")
+    first = tables.split_cells(lines[0])
+    header = any(cell in gateways for cell in first) or all(math.isnan(tables.to_number(cell)) for cell in first)
     names = first if header else [*gateways]
     for name in names:
         if name not in gateways:
-            raise ValueError(f"{file}, line 1: column {quote(name)} has no position in gateway_position.yml")
+            raise ValueError(f"{file}, line 1: column {tables.quote(name)} has no position in gateway_position.yml")
     for name in gateways:
         if names.count(name) != 1:
-            raise ValueError(f"{file}, line 1: expected one column {quote(name)}, got {names.count(name)}")
-    if header and len(lines) == 1:
-        raise ValueError(f"{file}: no readings below the header")
-    readings = to_dbm(file, split_rows(file, lines, names, int(header)), names, NOT_HEARD, NOT_HEARD)
+            raise ValueError(f"{file}, line 1: expected one column {tables.quote(name)}, got {names.count(name)}")
+    readings = to_dbm(file, tables.split_rows(file, lines, names, int(header)), names, NOT_HEARD, NOT_HEARD)
     if all(value == NOT_HEARD for row in readings for value in row):
         raise ValueError(f"{file}: expected readings above {NOT_HEARD:g} dBm, got none; no gateway heard anything")
     return names, readings
 
 
 def _read_official(root: Path, heard: Bool[Tensor, "rows gateways"], names: Sequence[str]) -> Parts:
-    """Training and test links of the index files, which list rows, or pairs of row and gateway.
-
-    Raises:
-        ValueError: A file has a defect; the message names file, line and value.
-    """
+    """Training and test links of the index files, which list rows, or pairs of row and gateway."""
     # A gateway has its column's number as a second name, unless names are numbers.
     columns = {} if any(name.isdecimal() for name in names) else {str(k): k for k in range(len(names))}
     columns |= {name: k for k, name in enumerate(names)}
 
-    def parse(line: str) -> tuple[int, ...] | None:
+    def parse(line: str) -> tuple[int | None, ...] | None:
         row, *column = re.split(r"\s*,\s*|\s+", line, maxsplit=1)
-        entry = to_index(row), *(columns.get(name) for name in column)
+        entry = tables.to_index(row), *(columns.get(name) for name in column)
         return None if None in entry or entry[0] >= len(heard) else entry
 
-    parts = read_parts(root, parse, f"a row in 0..{len(heard) - 1}, or a row and a gateway")
+    parts = tables.read_parts(root, parse, f"a row in 0..{len(heard) - 1}, or a row and a gateway")
     if len({len(entry) for part in parts for entry in part}) > 1:
         raise ValueError(f"{root}: index files must list rows, or pairs of row and gateway, got both")
     found = []
@@ -132,7 +112,7 @@ def _read_official(root: Path, heard: Bool[Tensor, "rows gateways"], names: Sequ
         listed = torch.zeros_like(heard)
         for entry in part:
             listed[entry] = True
-        found.append(listed[heard].nonzero()[:, 0])  # links are the readings that were heard, row by row
+        found.append(listed[heard].nonzero()[:, 0])  # links are heard readings, row by row
         if not len(found[-1]):
             raise ValueError(f"{root}/{name}_index.txt: expected a reading that was heard, got none")
     return found[0], found[1]

@@ -17,21 +17,9 @@ from torch import Tensor
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Parts
 from gaigs.geometry import Grid, Pose
+from gaigs.io import tables
 from gaigs.io.files import atomic_write, write_text
 from gaigs.io.images import GreyImages
-from gaigs.io.tables import (
-    check_empty,
-    find_folder,
-    has_file,
-    number_places,
-    quote,
-    read_lines,
-    read_parts,
-    read_points,
-    refuse,
-    to_index,
-    to_number,
-)
 from gaigs.io.yaml import read_mapping, to_position, to_vector
 from gaigs.query import CARRIERS, Query, check_carrier, unit_hint
 from gaigs.registry import register
@@ -50,23 +38,22 @@ def read(
     frequency: float | None = 920e6,
     bandwidth: float | None = None,
 ) -> Links:
-    """A data set from its folder, which is only read.
+    """A data set from its folder. Everything but the pixels is checked here; images are decoded when requested.
 
-    Everything but the pixels is checked here; images are decoded when their labels are first asked for. Where links
-    have carriers of their own, those of one position share a row.
+    With a carrier for each link, the links of one position share a row.
 
     Args:
         root: Folder with ``tx_pos.csv``, ``gateway_info.yml``, ``spectrum/``, for the official split
-            ``train_index.txt`` and ``test_index.txt``, and where links have carriers of their own ``freq.txt``.
+            ``train_index.txt`` and ``test_index.txt``, and optionally ``freq.txt``, the carrier of each link.
         elements: Rows and columns of the receiver's planar array, half a wavelength of the highest carrier apart; None
             if unknown.
-        frequency: Carrier of all links where there is no ``freq.txt`` [Hz]; None if unknown, and with it the pitch of
-            the elements. An array that is not fully known counts as a single antenna.
+        frequency: Carrier of all links without ``freq.txt`` [Hz]; None if unknown. An array of unknown elements or
+            carrier counts as a single antenna.
         bandwidth: Width of the band around each carrier that powers were averaged over, 0 for a carrier alone [Hz];
             None if unknown.
 
     Raises:
-        FileNotFoundError: There is no such folder.
+        FileNotFoundError: The folder does not exist.
         ValueError: An option is out of range, or a file has a defect; the message names file, line and value.
 
     Source: NeRF², https://github.com/XPengZhao/NeRF2; its spectra s23 are of a 4 x 4 array at about 920 MHz.
@@ -78,21 +65,21 @@ def read(
     is_pair = isinstance(elements, Sequence) and len(elements) == 2
     if elements is not None and not (is_pair and all(isinstance(count, int) and count > 0 for count in elements)):
         raise ValueError(f"elements must be the array's rows and columns, such as [4, 4], or null, got {elements!r}")
-    root = find_folder(root)
-    positions = read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one spectrum a line")
+    root = tables.find_folder(root)
+    positions = tables.read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one spectrum a line")
     receiver = _read_receiver(root / "gateway_info.yml")
     files = _find_images(root, len(positions))
     carriers = root / "freq.txt"
-    has_own = has_file(carriers)
+    has_own = tables.has_file(carriers)
     frequencies = None if frequency is None else torch.full((len(files),), float(frequency))
     remarks = []
     if has_own:
         frequencies = _read_frequencies(carriers, len(files))
-        low, high = (frequencies.min().item() / 1e6, frequencies.max().item() / 1e6)
+        low, high = frequencies.min().item() / 1e6, frequencies.max().item() / 1e6
         remarks.append(f"{len(frequencies.unique())} carriers of {carriers.name}, {low:.6g} to {high:.6g} MHz")
     array = Array.single()
     if elements is not None and frequencies is not None:
-        array = Array.planar(*elements, speed_of_light / frequencies.double().max().item() / 2)
+        array = Array.planar(elements[0], elements[1], speed_of_light / frequencies.double().max().item() / 2)
     elif elements is not None:
         remarks.append("the array counts as a single antenna, since without a frequency its extent is unknown")
     grid = Grid.degrees()
@@ -101,7 +88,7 @@ def read(
         receivers=(replace(receiver, array=array),),
         labels=GreyImages(files, SHAPE),
         task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
-        rows=number_places(positions)[1] if has_own else None,
+        rows=tables.number_places(positions)[1] if has_own else None,
         official=partial(_read_official, root, len(files)),
         bandwidth=bandwidth,
         remarks="; ".join(remarks),
@@ -111,23 +98,21 @@ def read(
 def write(folder: str | Path, links: Links) -> None:
     """Writes a data set of spectra in the layout that ``read`` reads; labels are rounded to 8 bits.
 
-    The index files hold the split's training and validation links together, and its test links. ``freq.txt`` holds the
-    carriers where they are known; the layout has no place for the array.
+    The index files hold the split's training and validation links together, and its test links. ``freq.txt`` holds
+    known carriers; the layout has no place for the array.
 
     Raises:
-        FileExistsError: There is something in the folder.
-        OSError: A file cannot be written, e.g. as the disk is full.
-        ValueError: There is more than one receiver, the labels are not spectra on the format's grid, or there is no
-            split.
+        OSError: The folder is not empty, or a file cannot be written.
+        ValueError: The links have several receivers, no split, or no spectra on the format's grid.
     """
     folder = Path(folder)
-    check_empty(folder)
+    tables.check_empty(folder)
     if len(links.receivers) != 1 or not isinstance(links.task, Spectrum) or links.task.shape != SHAPE:
         raise ValueError(
             f"the layout holds spectra of {SHAPE[0]} x {SHAPE[1]} directions at one receiver, got labels of "
             f"{links.task.name} {links.task.shape} at {len(links.receivers)}"
         )
-    split = links.split
+    split, query = links.split, links.query
     if split is None:
         raise ValueError("the layout's index files hold a split, got links without one; make them by gaigs.data.load")
     (folder / "spectrum").mkdir(parents=True)
@@ -136,25 +121,23 @@ def write(folder: str | Path, links: Links) -> None:
         with atomic_write(folder / "spectrum" / f"{k + 1:05d}.png") as part:
             Image.fromarray(pixels.numpy()).save(part)
     # Nine digits give the same float32.
-    rows = ["x,y,z", *(",".join(f"{value:.9g}" for value in row) for row in links.query.transmitters.tolist())]
+    rows = ["x,y,z", *(",".join(f"{value:.9g}" for value in row) for row in query.transmitters.tolist())]
     write_text(folder / "tx_pos.csv", "\n".join(rows) + "\n")
-    frequencies = links.query.frequencies
-    if frequencies is not None:
-        write_text(folder / "freq.txt", "".join(f"{value / 1e9:.9g}\n" for value in frequencies.tolist()))
+    if query.frequencies is not None:
+        write_text(folder / "freq.txt", "".join(f"{value / 1e9:.9g}\n" for value in query.frequencies.tolist()))
     receiver = links.receivers[0]
     quaternion = Rotation.from_matrix(receiver.pose.rotation.double().numpy()).as_quat()
     pose = {"position": receiver.pose.position.tolist(), "orientation": quaternion.tolist()}
     write_text(folder / "gateway_info.yml", yaml.safe_dump({receiver.name: pose}, default_flow_style=None))
-    for name, part in (("train", torch.cat((split.train, split.validation))), ("test", split.test)):
-        text = "".join(f"{k + 1:05d}\n" for k in part.tolist())
-        write_text(folder / f"{name}_index.txt", text)
+    for name, index in (("train", torch.cat((split.train, split.validation))), ("test", split.test)):
+        write_text(folder / f"{name}_index.txt", "".join(f"{k + 1:05d}\n" for k in index.tolist()))
 
 
 def _read_receiver(file: Path) -> Receiver:
     expected = "one gateway with position [m] and orientation (quaternion x, y, z, w)"
     gateways = {name: pose for name, pose in read_mapping(file, expected).items() if isinstance(pose, dict)}
     if len(gateways) != 1:
-        raise ValueError(f"{file}: expected {expected}, got {quote(', '.join(gateways) or 'none')}")
+        raise ValueError(f"{file}: expected {expected}, got {tables.quote(', '.join(gateways) or 'none')}")
     ((name, pose),) = gateways.items()
     position = to_position(f"{file}: {name}: position", pose.get("position"))
     orientation = to_vector(f"{file}: {name}: orientation", pose.get("orientation"), "xyzw")
@@ -166,26 +149,22 @@ def _read_receiver(file: Path) -> Receiver:
 
 def _read_frequencies(file: Path, count: int) -> Float[Tensor, " n"]:
     """The carrier of each link [Hz]."""
-    lines = read_lines(file, "the carrier [GHz] of one spectrum a line")
+    lines = tables.read_lines(file, "the carrier [GHz] of one spectrum a line")
     if len(lines) != count:
         raise ValueError(f"{file}: expected {count} lines, one for each row of tx_pos.csv, got {len(lines)}")
-    gigahertz = [to_number(line) for line in lines]
+    gigahertz = [tables.to_number(line) for line in lines]
     low, high = (bound / 1e9 for bound in CARRIERS)
     wrong = {
-        number: f"{quote(line)}{unit_hint(value)}"
+        number: f"{tables.quote(line)}{unit_hint(value)}"
         for number, (line, value) in enumerate(zip(lines, gigahertz, strict=True), 1)
         if not low <= value <= high
     }
-    refuse(file, wrong, f"one carrier from {low:g} to {high:g} GHz")
+    tables.refuse(file, wrong, f"one carrier from {low:g} to {high:g} GHz")
     return (1e9 * torch.tensor(gigahertz, dtype=torch.float64)).float()
 
 
 def _find_images(root: Path, count: int) -> list[Path]:
-    """The image of each position.
-
-    Raises:
-        ValueError: An image is missing, or belongs to no position.
-    """
+    """The image of each position; a ``ValueError`` for a missing image or one without a position."""
     folder = root / "spectrum"
     files = [folder / f"{k:05d}.png" for k in range(1, count + 1)]
     found = {file.name for file in folder.glob("*.png")}
@@ -200,15 +179,11 @@ def _find_images(root: Path, count: int) -> list[Path]:
 
 
 def _read_official(root: Path, count: int) -> Parts:
-    """Training and test links of the index files, from 0.
-
-    Raises:
-        ValueError: A file has a defect; the message names file, line and value.
-    """
+    """Training and test links of the index files, from 0."""
 
     def parse(line: str) -> int | None:
-        number = to_index(line)
+        number = tables.to_index(line)
         return number - 1 if number is not None and 1 <= number <= count else None
 
-    train, test = read_parts(root, parse, f"one image number in 1..{count}")
+    train, test = tables.read_parts(root, parse, f"one image number in 1..{count}")
     return torch.tensor(sorted(train)), torch.tensor(sorted(test))

@@ -1,20 +1,22 @@
-"""Received signal strength: what its readers share."""
+"""Readings of received signal strength: their bounds and receivers."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gaigs.antenna import Receiver
 from gaigs.geometry import Pose
 from gaigs.io.tables import Rows, to_numbers
 
 LOUDEST = 0.0
-"""Upper bound of readings [dBm]. Over 0.3 m alone 2.4 GHz loses 30 dB, more than the 20 dBm that Bluetooth may send, so
-0 and above are other units, a lost sign or other marks of "not heard"."""
+"""Upper bound of readings [dBm]. Bluetooth sends at most 20 dBm and loses 30 dB over 0.3 m, so 0 and above are another
+unit, a lost sign or another mark of "not heard"."""
 
 
-def gateway(name: str, position: Sequence[float]) -> Receiver:
+def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiver:
     """A receiver without orientation at a position [m]: its axes are the world's."""
     return Receiver(name, Pose(torch.as_tensor(position), torch.eye(3)))
 

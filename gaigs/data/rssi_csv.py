@@ -1,6 +1,5 @@
 """Received signal strength in one table; docs/data.md describes its columns."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +7,8 @@ import torch
 
 from gaigs.data import Links
 from gaigs.data.readings import LOUDEST, gateway, to_dbm
+from gaigs.io import tables
 from gaigs.io.files import write_text
-from gaigs.io.tables import find_file, number_places, quote, read_lines, split_cells, split_rows, to_coordinates
-from gaigs.io.walls import read_walls
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.task.rssi import Rssi
@@ -25,52 +23,41 @@ QUIETEST = -200.0
 
 @register("data", "rssi_csv")
 def read(
-    file: str | Path,
-    layout: str | Path | None = None,
-    fixed: str | None = None,
-    not_heard: float = -100.0,
+    file: str | Path, layout: str | Path | None = None, fixed: str | None = None, not_heard: float = -100.0
 ) -> Links:
     """A data set from a table with a heading, one reading a line: one link for each reading that was heard.
 
-    By default the end with fewer places is the fixed one, the receiver's in a tie. Its places become the receivers,
-    ``rx1`` ... or ``tx1`` ... in the order of their first appearance, and look along the world's axes. The other end
-    moves and gives the transmitters. A fixed transmitter with a moving receiver is thus read as the reverse, which
-    reciprocity allows: a channel attenuates alike either way, so where an antenna's gain is the same for sending and
-    hearing, the reading is what the fixed end would hear if the moving one sent with the fixed one's power.
-
-    Readings of ``not_heard`` were not heard. They, and fixed places that nothing was heard at, are left out and counted
-    in the remarks, which also count levels below it. The readings of one place of the moving end share a row. There is
-    no official split.
+    The places of the fixed end become the receivers, ``rx1`` ... or ``tx1`` ... in the order of their first appearance,
+    and look along the world's axes. The places of the moving end become the transmitters: by reciprocity a channel
+    attenuates alike either way. The readings of one such place share a row. Readings of ``not_heard``, and fixed places
+    without others, are left out and counted in the remarks. There is no official split.
 
     Args:
         file: Table with the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m] and ``rss_dbm`` in
-            any order and in any case; others are ignored, and named in the remarks.
+            any order and in any case; the remarks name other columns.
         layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; None for no walls.
-        fixed: End that stands still, ``tx`` or ``rx``.
+        fixed: End that stands still, ``tx`` or ``rx``; None for the end with fewer places, the receiver in a tie.
         not_heard: Value of readings that were not heard [dBm]; all others lie in [-200, 0).
 
     Raises:
-        FileNotFoundError: There is no such file.
+        FileNotFoundError: The file does not exist.
         ValueError: An option is out of range, the fixed end has more than 64 places, or a file has a defect; the
             message names file, line and value.
     """
     if fixed not in (None, *ENDS):
         raise ValueError(f"fixed must be tx or rx, or null for the end with fewer places, got {fixed!r}")
-    if not isinstance(not_heard, int | float) or not math.isfinite(not_heard):
-        raise ValueError(f"not_heard must be a finite number [dBm], got {not_heard!r}; write such a number in the file")
-    file = find_file(file, "a table of readings")
+    file = tables.find_file(file, "a table of readings")
     points, dbm, ignored = _read_table(file, not_heard)
-    walls = torch.zeros(0, 2, 3) if layout is None else read_walls(Path(layout).expanduser())
+    walls = torch.zeros(0, 2, 3) if layout is None else tables.read_walls(Path(layout).expanduser())
 
-    numbered = {end: number_places(points[end]) for end in ENDS}
+    numbered = {end: tables.number_places(points[end]) for end in ENDS}
     tx, rx = (len(numbered[end][0]) for end in ENDS)
-    fixed, is_chosen = fixed or ("rx" if rx <= tx else "tx"), fixed is not None
+    fixed = fixed or ("rx" if rx <= tx else "tx")
     moving = "tx" if fixed == "rx" else "rx"
     places, at = numbered[fixed]
-    most = 64  # each fixed place is a receiver of its own
+    most = 64  # each fixed place is a separate receiver
     if len(places) > most:
-        is_other_better = is_chosen and min(tx, rx) <= most
-        advice = f"set fixed={moving} or null" if is_other_better else "keep the readings of a few places of one end"
+        advice = "keep the readings of a few places of one end" if min(tx, rx) > most else f"set fixed={moving} or null"
         raise ValueError(
             f"{file}: the fixed end must stand at {most} places at most, got {tx} of the transmitter and {rx} of the "
             f"receiver; {advice}"
@@ -101,11 +88,7 @@ def read(
 
 
 def write(folder: str | Path, links: Links) -> None:
-    """Writes readings as ``room.csv`` in a folder, a table that ``read`` reads.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Writes readings as ``room.csv`` in a folder, for ``read``."""
     receivers = np.array([receiver.pose.position.numpy() for receiver in links.receivers])
     index = links.query.receivers.numpy()
     table = np.column_stack((links.query.transmitters.numpy(), receivers[index], links.labels.numpy()))
@@ -115,19 +98,15 @@ def write(folder: str | Path, links: Links) -> None:
 
 def _read_table(file: Path, not_heard: float) -> tuple[dict[str, list], list[float], list[str]]:
     """Positions of either end [m], readings [dBm], and the names of other columns."""
-    lines = read_lines(file, f"a heading with {','.join(COLUMNS)}")
-    written = split_cells(lines[0])
+    lines = tables.read_lines(file, f"a heading with {','.join(COLUMNS)}")
+    written = tables.split_cells(lines[0])
     names = [name.lower() for name in written]
-    if ";" in lines[0]:
-        raise ValueError(f"{file}, line 1: expected commas between columns, got semicolons in {quote(lines[0])}")
     for name in COLUMNS:
         if (count := names.count(name)) != 1:
-            raise ValueError(f"{file}, line 1: expected one column {name}, got {count} in {quote(lines[0])}")
-    if len(lines) == 1:
-        raise ValueError(f"{file}: no readings below the heading")
+            raise ValueError(f"{file}, line 1: expected one column {name}, got {count} in {tables.quote(lines[0])}")
     at = [names.index(name) for name in COLUMNS]
-    rows = {number: [cells[k] for k in at] for number, cells in split_rows(file, lines, names, 1).items()}
-    positions = to_coordinates(file, {number: cells[:6] for number, cells in rows.items()}, COLUMNS)
+    rows = {number: [cells[k] for k in at] for number, cells in tables.split_rows(file, lines, names, 1).items()}
+    positions = tables.to_coordinates(file, {number: cells[:6] for number, cells in rows.items()}, COLUMNS)
     levels = {number: cells[6:] for number, cells in rows.items()}
     dbm = [value for (value,) in to_dbm(file, levels, COLUMNS[6:], QUIETEST, not_heard)]
     if all(value == not_heard for value in dbm):

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
@@ -22,8 +23,7 @@ from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
 
 PART = 64
-"""Transmitters simulated at a time: the waves of all paths, elements and frequencies at once would need a hundred times
-the memory of the labels."""
+"""Transmitters simulated at a time, since the waves of all paths take a hundred times the memory of the labels."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class SimulatedRoom:
         pose: Position and orientation of the receiver with an array.
         gateways: Receivers with a single antenna.
         edges: Line segments to draw in figures (k, 2, 3) [m].
-        place: Function from a count and a seed to random places of transmitters (count, 3) [m].
-        frequency_offsets: Function from a bandwidth to frequencies that sample the band, relative to its middle [Hz].
-        respond: Function from places (n, 3), a receiver, a frequency and offsets (f,) to the response of each element
-            to unit-power transmitters, ``PART`` of them at a time (part, elements, f).
+        place: From a count and a seed, random places of transmitters (count, 3) [m].
+        frequency_offsets: From a bandwidth, frequencies that sample the band, relative to its middle [Hz].
+        respond: From places (n, 3), a receiver, a frequency and offsets (f,), the response of each element to
+            unit-power transmitters, ``PART`` of them at a time (part, elements, f).
     """
 
     pose: Pose
@@ -57,16 +57,15 @@ def simulate_spectra(
     seed: int,
 ) -> Links:
     """Spectra of transmitters at random places; ``gaigs.data.synthetic.furnished_room`` describes the options."""
-    carriers = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
+    carriers: list[Any] = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
     for carrier in carriers:
         check_type("frequency", carrier, float)
         check_carrier("frequency", carrier)
     if not carriers or len(set(carriers)) < len(carriers):
         raise ValueError(f"frequency must be a carrier or several different ones [Hz], got {frequency}")
-    check_spectrum(spectrum)
+    offsets = spectrum_offsets(spectrum, room.frequency_offsets, bandwidth)
     places = room.place(transmitters, seed)
     receiver = patch_array(room.pose, max(carriers))
-    offsets = room.frequency_offsets(bandwidth) if spectrum == "band" else torch.zeros(1)
     grid = Grid.degrees()
     labels = [to_spectra(room.respond(places, receiver, f, offsets), grid, receiver.array, f) for f in carriers]
     rows = torch.arange(transmitters).repeat_interleave(len(carriers))
@@ -87,16 +86,15 @@ def simulate_channels(
 ) -> Links:
     """Channels of transmitters at random places; ``gaigs.data.synthetic_csi`` describes the options.
 
-    A channel is in Friis' unit: its magnitude is the square root of the power that an element receives of a unit power
-    sent, between antennas of unit gain. Its time dependence is exp(+j omega t). There is no noise.
+    A channel's squared magnitude is the power that an element receives of unit power sent, between antennas of unit
+    gain. Its time dependence is exp(+j omega t). There is no noise.
     """
     if not 0 < bandwidth < math.inf:
         raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
     if subcarriers < 1:
         raise ValueError(f"subcarriers must be at least 1, got {subcarriers}")
-    offsets = torch.zeros(1, dtype=torch.float64)
-    if subcarriers > 1:
-        offsets = torch.linspace(-bandwidth / 2, bandwidth / 2, subcarriers, dtype=torch.float64)
+    edge = bandwidth / 2 if subcarriers > 1 else 0.0
+    offsets = torch.linspace(-edge, edge, subcarriers, dtype=torch.float64)
     places = room.place(transmitters, seed)
     receiver = patch_array(room.pose, frequency)
     rows = torch.arange(transmitters)
@@ -114,8 +112,7 @@ def simulate_channels(
 def simulate_readings(room: SimulatedRoom, transmitters: int, noise: float, sensitivity: float, seed: int) -> Links:
     """Signal strength of transmitters of 0 dBm at random places; ``gaigs.data.synthetic_rssi`` describes the options.
 
-    Power is averaged over the band of Bluetooth's advertising channels before it becomes dB. The links of one place
-    share a row.
+    Power is averaged over the band of Bluetooth's advertising channels. The links of one place share a row.
     """
     if not 0 <= noise < math.inf:
         raise ValueError(f"noise must be a standard deviation, 0 or more [dB], got {noise}")
@@ -125,16 +122,12 @@ def simulate_readings(room: SimulatedRoom, transmitters: int, noise: float, sens
     strengths = torch.stack(
         [torch.cat([*map(rss_dbm, room.respond(places, each, frequency, offsets))]) for each in room.gateways], 1
     )
-    # A seed of its own: the places come from the random numbers of ``seed`` itself.
-    generator = torch.Generator().manual_seed(hash((seed, 1)) % 2**63)
+    generator = torch.Generator().manual_seed(hash((seed, 1)) % 2**63)  # the places use ``seed`` itself
     readings = strengths + noise * torch.randn(strengths.shape, dtype=strengths.dtype, generator=generator)
     heard = readings >= sensitivity
-    for receiver, any_heard in zip(room.gateways, heard.any(0), strict=True):
-        if not any_heard:
-            raise ValueError(
-                f"sensitivity must let each gateway hear a reading, but {receiver.name!r} hears none of {len(places)} "
-                f"at {sensitivity:g} dBm; lower it"
-            )
+    if deaf := [each.name for each, any_heard in zip(room.gateways, heard.any(0), strict=True) if not any_heard]:
+        none = f"{deaf[0]!r} hears none of {len(places)} at {sensitivity:g} dBm"
+        raise ValueError(f"sensitivity must let each gateway hear a reading, but {none}; lower it")
     rows, columns = heard.nonzero(as_tuple=True)
     return Links(
         query=Query(places[rows], columns, torch.full((len(rows),), frequency)),
@@ -152,24 +145,21 @@ def simulate_readings(room: SimulatedRoom, transmitters: int, noise: float, sens
     )
 
 
-def check_spectrum(spectrum: str) -> None:
-    """Raises a ``ValueError`` for another kind of spectrum than ``band`` and ``carrier``."""
+def spectrum_offsets(spectrum: str, sample: Callable[[float], Tensor], bandwidth: float) -> Float[Tensor, " f"]:
+    """Frequencies of a spectrum, ``band`` or ``carrier``, relative to the carrier [Hz]."""
     if spectrum not in ("band", "carrier"):
         raise ValueError(f"spectrum must be 'band' or 'carrier', got {spectrum!r}")
+    return sample(bandwidth) if spectrum == "band" else torch.zeros(1)
 
 
 def patch_array(pose: Pose, frequency: float) -> Receiver:
-    """A receiver with 4 x 4 patches, as in the NeRF² spectra, half a wavelength of the frequency [Hz] apart.
-
-    Raises:
-        ValueError: The frequency is out of range.
-    """
+    """A receiver with 4 x 4 patches, as in the NeRF² spectra, half a wavelength of the frequency [Hz] apart."""
     check_carrier("frequency", frequency)
     return Receiver("gateway1", pose, Array.planar(4, 4, speed_of_light / frequency / 2, "cosine"))
 
 
 def last_fifth(transmitters: int, rows: Int[Tensor, " n"]) -> Parts:
-    """Official parts of links, given the transmitter of each; the last fifth of the transmitters tests."""
+    """Official parts of links by the transmitter of each; the last fifth of the transmitters tests."""
     training = transmitters - max(1, round(transmitters / 5))
     return (rows < training).nonzero()[:, 0], (rows >= training).nonzero()[:, 0]
 
@@ -181,11 +171,7 @@ def draw_places(
     count: int,
     seed: int,
 ) -> Float[Tensor, "count 3"]:
-    """Random places [m], uniform over the free part of a box.
-
-    Raises:
-        ValueError: There are fewer than 2.
-    """
+    """Two or more random places [m], uniform over the free part of a box."""
     if count < 2:
         raise ValueError(f"transmitters must be at least 2, one to train and one to test on, got {count}")
     generator = torch.Generator().manual_seed(seed)
@@ -197,11 +183,7 @@ def draw_places(
 
 
 def sample_band(bandwidth: float, longest: float) -> Float[Tensor, " f"]:
-    """Frequencies that sample a band, relative to its middle [Hz]; dense enough for paths up to a length [m].
-
-    Raises:
-        ValueError: The bandwidth is not positive.
-    """
+    """Frequencies that sample a band, relative to its middle [Hz]: no beat of paths up to a length [m] is aliased."""
     if not 0 < bandwidth < math.inf:
         raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}; one frequency is the spectrum 'carrier'")
     count = math.ceil(bandwidth * longest / speed_of_light) + 1

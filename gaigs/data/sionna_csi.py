@@ -17,20 +17,6 @@ def traced_room_csi(
 ) -> Links:
     """Channels of transmitters at random places in a room, at each element of its 4 x 4 array.
 
-    Places, paths and array are those of ``sionna``; unit and time dependence are those of
-    ``gaigs.data.simulation.simulate_channels``. The official split tests on the last fifth of the places.
-
-    Args:
-        room: ``l_shape``, ``slanted`` or ``furnished``.
-        transmitters: Number of places.
-        frequency: Carrier [Hz].
-        bandwidth: From the lowest subcarrier to the highest, about the carrier [Hz].
-        subcarriers: Number of subcarriers, evenly over the band; a single one is the carrier.
-        seed: Seed of the places.
-
-    Raises:
-        ImportError: Sionna RT is not installed.
-        RuntimeError: There is no libLLVM that it can use.
-        ValueError: An option is out of range.
+    Rooms, places, array and errors are those of ``sionna``, channels and other options those of ``synthetic_csi``.
     """
     return simulate_channels(find_room(room), transmitters, frequency, bandwidth, subcarriers, seed)

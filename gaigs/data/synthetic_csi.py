@@ -17,16 +17,12 @@ def furnished_room_csi(
 ) -> Links:
     """Channels of transmitters at random places in the default room, at each element of its 4 x 4 array.
 
-    Places, array and band are those of ``synthetic``; unit and time dependence are those of
+    Places, array and other options are those of ``synthetic``; unit and time dependence are those of
     ``gaigs.data.simulation.simulate_channels``. The official split tests on the last fifth of the places.
 
     Args:
-        transmitters: Number of places.
-        frequency: Carrier [Hz].
         bandwidth: From the lowest subcarrier to the highest, about the carrier [Hz].
-        subcarriers: Number of subcarriers, evenly over the band; a single one is the carrier.
-        order: Largest number of reflections of a path.
-        seed: Seed of the places.
+        subcarriers: Evenly over the band; a single one is the carrier.
 
     Raises:
         ValueError: An option is out of range.

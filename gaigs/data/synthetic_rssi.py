@@ -8,23 +8,15 @@ from gaigs.registry import register
 
 @register("data", "synthetic_rssi")
 def furnished_room_rssi(
-    transmitters: int = 600,
-    noise: float = 2.0,
-    sensitivity: float = -95.0,
-    order: int = 2,
-    seed: int = 0,
+    transmitters: int = 600, noise: float = 2.0, sensitivity: float = -95.0, order: int = 2, seed: int = 0
 ) -> Links:
     """Signal strength of transmitters of 0 dBm at random places in the default room, at four gateways.
 
-    Every antenna is isotropic, so a gateway has no orientation: its axes are the world's. The links of one place share
-    a row; the official split tests on the last fifth of the places.
+    Antennas are isotropic. Links of one place share a row. The official split tests on the last fifth of the places.
 
     Args:
-        transmitters: Number of places.
         noise: Standard deviation of the Gaussian error of each reading [dB].
         sensitivity: Readings below it are not heard, and left out [dBm].
-        order: Largest number of reflections of a path.
-        seed: Seed of places and noise.
 
     Raises:
         ValueError: An option is out of range, or a gateway hears nothing.

@@ -1,1 +1,1 @@
-"""Reading and writing files: tables, meshes, YAML, and files written at once."""
+"""Files: tables, images, meshes, YAML and atomic writes."""

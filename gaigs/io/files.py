@@ -1,4 +1,4 @@
-"""Atomic writes: a file is complete or not there."""
+"""Atomic writes: a file is complete or missing."""
 
 import contextlib
 import errno
@@ -11,10 +11,10 @@ from pathlib import Path
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path with the same ending, which replaces the file once it is written and on the disk.
 
-    Where writing fails or is stopped, the temporary file is removed and the old file stays.
+    If writing fails or is interrupted, the temporary file is removed and the old file stays.
 
     Raises:
-        OSError: The file cannot be written, e.g. because the disk is full or the folder is gone; with its ``errno``.
+        OSError: The file cannot be written; with the ``errno`` of the cause.
     """
     path = Path(path)
     part = path.with_name(f"{path.stem}.part{path.suffix}")
@@ -39,22 +39,13 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Writes a text file in UTF-8 by ``atomic_write``.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Writes a text file in UTF-8 by ``atomic_write``."""
     with atomic_write(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 def file_message(error: OSError, folder: Path) -> str:
-    """The message of a file's error: its own, or for a plain error of the system the file, the cause and a remedy.
-
-    Args:
-        error: Raised while a file was read or written.
-        folder: Folder of the file, if the error names no file.
-    """
+    """The message of a file's error: its own, or for a plain system error the file or folder, cause and remedy."""
     if error.errno is None or error.strerror != os.strerror(error.errno):
         return str(error.strerror or error)
     path = error.filename or f"a file in {folder}"

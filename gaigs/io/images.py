@@ -13,19 +13,15 @@ from torch import Tensor
 
 
 class GreyImages:
-    """Images that are decoded when first asked for, and then kept at one byte a pixel.
-
-    Args:
-        files: An 8-bit grey PNG for each image.
-        shape: Rows and columns of each.
+    """8-bit grey PNGs (rows, columns), decoded when first requested and then kept at one byte a pixel.
 
     Raises:
-        ValueError: A file has no whole PNG header, or one of another kind or shape.
+        ValueError: A file has no PNG header, or another mode or shape; when requested: its pixels are damaged.
     """
 
     def __init__(self, files: Sequence[Path], shape: tuple[int, int]):
         for file in files:
-            with _opened(file) as image:  # reads the header, decodes nothing
+            with _opened(file) as image:  # reads the header only
                 mode, (width, height) = image.mode, image.size
             if (mode, height, width) != ("L", *shape):
                 raise ValueError(
@@ -40,11 +36,7 @@ class GreyImages:
         return len(self.files)
 
     def __getitem__(self, indices: Int[Tensor, " k"]) -> Float[Tensor, "k rows columns"]:
-        """Images with pixels in [0, 1], float32.
-
-        Raises:
-            ValueError: A file cannot be decoded.
-        """
+        """Images with pixels in [0, 1], float32."""
         for k in indices[~self._decoded[indices]].tolist():
             with _opened(self.files[k]) as image:
                 image.verify()  # compares the checksums, which decoding does not
@@ -56,11 +48,7 @@ class GreyImages:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[Image.Image]:
-    """A PNG file whose header is read.
-
-    Raises:
-        ValueError: The file is damaged, or Pillow warns of it.
-    """
+    """A PNG file with its header read; a ``ValueError`` if it is damaged or Pillow warns of it."""
     try:
         with warnings.catch_warnings(action="error"), Image.open(file, formats=["PNG"]) as image:
             yield image

@@ -22,20 +22,12 @@ NO_NAME = "mesh", "unnamed"
 
 
 def read_obj(file: Path) -> tuple[Float[np.ndarray, "v 3"], Groups]:
-    """Vertices [m] and faces of a Wavefront OBJ file.
-
-    Raises:
-        ValueError: The file cannot be read, or has a defect.
-    """
+    """Vertices [m] and faces of a Wavefront OBJ file, as by ``parse_obj``."""
     return parse_obj(read_lines(file, "a mesh of 'v x y z' and 'f i j k'"), str(file))
 
 
 def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3"], Groups]:
-    """Vertices [m] and faces of the lines of a Wavefront OBJ file; errors name the source.
-
-    Raises:
-        ValueError: A line lacks numbers, a vertex is too far away, or a face refers to a vertex that is not above it.
-    """
+    """Vertices [m] and faces of the lines of a Wavefront OBJ file; a ``ValueError`` names the source and the line."""
     vertices: list[list[float]] = []
     groups: Groups = {}
     name, material = NO_NAME
@@ -48,7 +40,11 @@ def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3
                 case "usemtl":
                     material = " ".join(rest) or NO_NAME[1]
                 case "v":
-                    vertices.append(_vertex(rest[:3]))
+                    if len(rest) < 3 or not all(map(NUMBER.fullmatch, rest[:3])):
+                        raise ValueError("numbers x y z")
+                    vertices.append([float(word) for word in rest[:3]])
+                    if not all(abs(value) < FAR for value in vertices[-1]):
+                        raise ValueError(WITHIN)
                 case "f":
                     face = _face([part.split("/")[0] for part in rest], len(vertices))
                     groups.setdefault((name, material), []).append(face)
@@ -56,15 +52,6 @@ def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3
             shown = line.strip() if len(line) < 80 else f"{line.strip()[:80]} ..."
             raise ValueError(f"{source}, line {number}: expected {error}, got {shown!r}") from error
     return np.array(vertices, dtype=float).reshape(-1, 3), groups
-
-
-def _vertex(words: list[str]) -> list[float]:
-    if len(words) < 3 or not all(map(NUMBER.fullmatch, words)):
-        raise ValueError("numbers x y z")
-    point = [float(word) for word in words]
-    if not all(abs(value) < FAR for value in point):
-        raise ValueError(WITHIN)
-    return point
 
 
 def _face(words: list[str], count: int) -> Face:
@@ -83,15 +70,16 @@ def read_ply(file: Path) -> tuple[np.ndarray, list[Face]]:
     """Vertices, as a structured array with x, y and z [m] among its columns, and faces of a PLY file.
 
     Raises:
-        ValueError: The file is damaged, a column of the vertices holds no numbers, a vertex is too far away, or a face
-            refers to a missing vertex.
+        ValueError: The file is damaged, a column holds no numbers, or the mesh has a defect, see ``check_mesh``.
     """
     try:
         content = PlyData.read(str(file), mmap=False)
         vertices = content["vertex"].data
         vertices = vertices.astype([(column, float) for column in vertices.dtype.names])
         points = positions(vertices)
-        faces = [tuple(map(int, face)) for face in _indices(content)]
+        columns = content["face"].data.dtype.names if "face" in content else ()
+        key = next((name for name in ("vertex_indices", "vertex_index") if name in columns), None)
+        faces = [] if key is None else [tuple(map(int, face)) for face in content["face"].data[key]]
     except Exception as error:  # damaged headers make plyfile and numpy raise exceptions of many types
         cause = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"cannot parse {file}: {cause}; expected a .ply file of vertices x, y, z") from error
@@ -118,10 +106,3 @@ def check_mesh(points: Float[np.ndarray, "v 3"], faces: Sequence[Face], source: 
         if len(face) < 3 or not all(0 <= corner < len(points) for corner in face):
             expected = f"three or more of the {len(points)} vertices"
             raise ValueError(f"{source}, face {number}: expected {expected}, got {face}")
-
-
-def _indices(content: PlyData) -> Iterable:
-    """Vertices of each face of a file; empty if the file has no faces, or these no such list."""
-    columns = content["face"].data.dtype.names if "face" in content else ()
-    key = next((name for name in ("vertex_indices", "vertex_index") if name in columns), None)
-    return [] if key is None else content["face"].data[key]

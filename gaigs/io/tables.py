@@ -1,7 +1,4 @@
-"""Text files of data sets: lines, tables of numbers, points and index files.
-
-An error names the file, the first line with a defect, what it holds, and how many other lines have the same defect.
-"""
+"""Text files of data sets: lines, tables of numbers, points and index files. Errors name file, line and content."""
 
 import csv
 import math
@@ -12,15 +9,13 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.geometry import FAR, WITHIN
 
 Rows = Mapping[int, Sequence[str]]
 """Cells of each line of a table, by the line's number from 1."""
-
-BESIDE_QUOTE = re.compile(r"(?<=\")[ \t]+(?=,|$)")
-"""Blanks behind a quoted cell."""
 
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 """A decimal number; ``float`` also accepts 1_0, digits of other scripts and infinities."""
@@ -33,11 +28,7 @@ def quote(value: object) -> str:
 
 
 def find_folder(root: str | Path) -> Path:
-    """The folder of a data set.
-
-    Raises:
-        FileNotFoundError: There is no such folder.
-    """
+    """The folder of a data set; a ``FileNotFoundError`` if it does not exist."""
     root = Path(os.path.expanduser(root))
     if not os.path.isdir(root):  # Path.is_dir raises where a name is too long or a folder is closed
         raise FileNotFoundError(f"{root} must be the folder of a data set, and is no folder; set the data's root")
@@ -45,11 +36,7 @@ def find_folder(root: str | Path) -> Path:
 
 
 def find_file(file: str | Path, content: str) -> Path:
-    """The file of a data set that is one file.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-    """
+    """The file of a data set that is one file; a ``FileNotFoundError`` if it does not exist."""
     file = Path(os.path.expanduser(file))
     if not os.path.isfile(file):
         raise FileNotFoundError(f"{file} must be {content}, and is no file; set the data's file")
@@ -68,11 +55,7 @@ def check_empty(folder: Path) -> None:
 
 
 def read_lines(file: Path, content: str) -> list[str]:
-    """Lines of a text file without the blank ones at its end; errors name the expected content.
-
-    Raises:
-        ValueError: The file is missing, cannot be read, is not UTF-8, or is empty.
-    """
+    """Lines of a UTF-8 file without the blank ones at its end; a ``ValueError`` for an empty file."""
     if not os.path.isfile(file):  # reading a pipe would block
         state = "no file, but a folder, a device or a broken link" if has_file(file) else "missing"
         raise ValueError(f"{file}: {state}; expected {content}")
@@ -80,15 +63,13 @@ def read_lines(file: Path, content: str) -> list[str]:
         lines = file.read_text(encoding="utf-8-sig").rstrip().splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"cannot parse {file}: not UTF-8 at byte {error.start}; expected {content}") from None
-    except OSError as error:
-        raise ValueError(f"cannot read {file}: {error.strerror}; expected {content}") from None
     if not lines:
         raise ValueError(f"{file}: empty; expected {content}")
     return lines
 
 
 def refuse(file: Path, wrong: Mapping[int, str], expected: str) -> None:
-    """Raises a ``ValueError`` if there are wrong lines, given the content of each by its number."""
+    """Raises a ``ValueError`` that names the first wrong line and counts the others, given each content by number."""
     if wrong:
         number, got = next(iter(wrong.items()))
         others = {1: "", 2: " and 1 other line"}.get(len(wrong), f" and {len(wrong) - 1} other lines")
@@ -96,12 +77,7 @@ def refuse(file: Path, wrong: Mapping[int, str], expected: str) -> None:
 
 
 def read_points(file: Path, names: Sequence[str], content: str) -> list[list[float]]:
-    """Coordinates [m], one point a line; the first line may hold their names.
-
-    Raises:
-        ValueError: The file cannot be read, a line has another number of columns, or a coordinate is not finite or too
-            far away.
-    """
+    """Coordinates [m], one point a line; the first line may hold their names."""
     lines = read_lines(file, content)
     header = [cell.lower() for cell in split_cells(lines[0])] == [*names]
     if header and len(lines) == 1:
@@ -109,11 +85,20 @@ def read_points(file: Path, names: Sequence[str], content: str) -> list[list[flo
     return to_coordinates(file, split_rows(file, lines, names, int(header)), names)
 
 
+def read_walls(file: Path) -> Float[Tensor, "k 2 3"]:
+    """Walls of a floor plan, at z = 0 [m]: segments between consecutive vertices x,y of a file, two or more."""
+    vertices = read_points(file, "xy", "consecutive wall vertices x,y [m], one a line")
+    if len(vertices) == 1:
+        raise ValueError(f"{file}: expected two wall vertices or more, got 1")
+    corners = torch.nn.functional.pad(torch.tensor(vertices), (0, 1))
+    return torch.stack((corners[:-1], corners[1:]), 1)
+
+
 def split_cells(line: str) -> list[str]:
     """Cells of a line with commas, without the blanks around them."""
     try:
-        # csv joins text beside a quoted cell to it, so that only blanks may stand there.
-        (cells,) = csv.reader([BESIDE_QUOTE.sub("", line)], skipinitialspace=True, strict=True)
+        # csv appends blanks behind a quoted cell to it.
+        (cells,) = csv.reader([re.sub(r"(?<=\")[ \t]+(?=,|$)", "", line)], skipinitialspace=True, strict=True)
     except csv.Error:  # a quote inside a cell or without its end, or a cell of 100,000 characters
         cells = []
     return [cell.strip() for cell in cells] or [line]
@@ -160,11 +145,7 @@ def to_index(text: str) -> int | None:
 
 
 def read_parts(root: Path, parse: Callable[[str], Hashable | None], expected: str) -> tuple[list, list]:
-    """Entries of ``train_index.txt`` and ``test_index.txt``, one a line; ``parse`` gives None for a wrong line.
-
-    Raises:
-        ValueError: A file cannot be read, a line is wrong, or an entry is there twice.
-    """
+    """Distinct entries of ``train_index.txt`` and ``test_index.txt``, one a line; ``parse`` gives None for a defect."""
     places: dict[Hashable, str] = {}
     parts = []
     for file in (root / "train_index.txt", root / "test_index.txt"):
@@ -173,9 +154,9 @@ def read_parts(root: Path, parse: Callable[[str], Hashable | None], expected: st
         refuse(file, {number: quote(lines[number]) for number, entry in entries.items() if entry is None}, expected)
         repeated = {}
         for number, entry in entries.items():
-            if entry in places:
+            place = f"{file.name}, line {number}"
+            if places.setdefault(entry, place) != place:
                 repeated[number] = f"{quote(lines[number])}, which is in {places[entry]} already"
-            places.setdefault(entry, f"{file.name}, line {number}")
         refuse(file, repeated, "each entry once")
         parts.append([*entries.values()])
     return parts[0], parts[1]

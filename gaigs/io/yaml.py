@@ -1,7 +1,4 @@
-"""YAML files of data sets, whose numbers are read as they are written.
-
-PyYAML reads 010 as 8, 1:30 as 90, 1e-3 as a word, and keeps the last of two equal keys.
-"""
+"""YAML files of data sets, with numbers as written: PyYAML reads 010 as 8, 1:30 as 90 and 1e-3 as a word."""
 
 import math
 import re
@@ -13,12 +10,9 @@ import yaml
 from gaigs.geometry import FAR, WITHIN
 from gaigs.io.tables import quote, read_lines, to_number
 
-OCTAL = re.compile(r"[+-]?0[0-9]+")
-"""8 in YAML 1.1 and 10 in YAML 1.2 for 010, so that it is refused."""
-
 
 class TextLoader(yaml.SafeLoader):
-    """Loads scalars as text, and refuses repeated keys and unknown tags."""
+    """Loads scalars as text, and refuses repeated keys, where PyYAML keeps the last, and unknown tags."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         """The mapping of a node."""
@@ -32,17 +26,11 @@ TextLoader.yaml_implicit_resolvers = {}
 
 
 def read_mapping(file: Path, content: str) -> dict[str, object]:
-    """The mapping of names to text, lists and mappings that a file holds.
-
-    Raises:
-        ValueError: The file cannot be read, is no YAML, holds no mapping, or holds a key twice or one that is no name.
-    """
+    """The mapping of names to text, lists and mappings in a file; a ``ValueError`` for any other content."""
     text = "\n".join(read_lines(file, content))
     try:
         mapping = yaml.load(text, TextLoader)
-    except RecursionError:
-        raise ValueError(f"cannot parse {file}: brackets are nested too deeply; expected {content}") from None
-    except (yaml.YAMLError, ValueError, OverflowError) as error:  # PyYAML does not check escapes such as \UFFFFFFFF
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:  # of escapes and deep nesting
         cause = " ".join(str(error).split())[:300]
         raise ValueError(f"cannot parse {file}: {cause}; expected {content}") from None
     if not isinstance(mapping, dict) or not mapping:
@@ -55,7 +43,8 @@ def read_mapping(file: Path, content: str) -> dict[str, object]:
 def to_vector(place: str, value: object, axes: str) -> list[float]:
     """A list of finite numbers, one for each axis; another value is a ``ValueError`` with its place."""
     items = value if isinstance(value, list) else []
-    numbers = [to_number(item) for item in items if isinstance(item, str) and not OCTAL.fullmatch(item)]
+    octal = re.compile(r"[+-]?0[0-9]+")  # 010 is 8 in YAML 1.1 and 10 in YAML 1.2
+    numbers = [to_number(item) for item in items if isinstance(item, str) and not octal.fullmatch(item)]
     if len(items) != len(axes) or len(numbers) != len(axes) or not all(map(math.isfinite, numbers)):
         expected = f"{len(axes)} finite numbers {', '.join(axes)}, written as 1.5 or -2e-3"
         raise ValueError(f"{place} must be {expected}, got {'none' if value is None else quote(value)}")

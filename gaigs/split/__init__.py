@@ -1,9 +1,4 @@
-"""Splits of links into training, validation and test; docs/data.md describes the purpose of each.
-
-A component of kind ``split`` is a function of the links and its own options. Validation links are taken from the
-training links as the test links are taken from all links, so that they predict the test error. Only the official parts
-may separate links of one row: these share a place, and so mostly its shadows.
-"""
+"""Splits of links into training, validation and test; only official parts may separate links of one row."""
 
 import torch
 from jaxtyping import Int
@@ -24,42 +19,42 @@ def part(
     test: float,
     validation: float,
     seed: int,
+    train: int | None = None,
 ) -> Split:
-    """Holds out whole groups of links, first for the test and then for validation.
+    """Holds out whole groups of links, first for the test and then in the same way for validation.
 
     Args:
         name: Name of the protocol, with its own options.
         links: All links.
-        groups: Number of each link's group, which stays whole.
+        groups: Number of each link's group.
         test: Fraction of the links to test on.
         validation: Fraction of the training links to validate on; 0 for none.
         seed: Seed of all random numbers.
+        train: Groups to train and validate on; None for all that do not test.
 
     Raises:
         ValueError: An option is out of range, or there are too few groups.
     """
-    check_fractions(test, validation)
+    check("test", test, 0 < test < 1, "in (0, 1)")
+    check("validation", validation, 0 <= validation < 1, "in [0, 1)")
     generator = generator_of(seed)
-    train, testing = hold_out("test", torch.arange(len(links)), groups, test, generator)
-    train, validating = hold_out("validation", train, groups, validation, generator)
+    training, testing = hold_out("test", torch.arange(len(links)), groups, test, generator)
+    if train is not None:
+        present = groups[training].unique()
+        check("train", train, 1 <= train <= len(present), f"in 1..{len(present)}, the rows that do not test")
+        chosen = present[torch.randperm(len(present), generator=generator)[:train]]
+        training = training[torch.isin(groups[training], chosen)]
+    training, validating = hold_out("validation", training, groups, validation, generator)
     words = [name, f"test {test:g}", *([f"validation {validation:g}"] if validation else []), f"seed {seed}"]
-    return Split(", ".join(words), train, validating, testing)
+    return Split(", ".join(words), training, validating, testing)
 
 
 def hold_out(
     name: str, links: Int[Tensor, " k"], groups: Int[Tensor, " n"], fraction: float, generator: torch.Generator
 ) -> tuple[Int[Tensor, " kept"], Int[Tensor, " held"]]:
-    """Holds out random whole groups, as near to a fraction of the links as possible.
+    """Holds out random whole groups, as near to a fraction of some ascending links as possible.
 
-    Args:
-        name: Name of the option with the fraction, for errors.
-        links: Numbers of the links to divide, ascending.
-        groups: Number of the group of every link of the data.
-        fraction: Fraction of ``links`` to hold out; 0 for none.
-        generator: Generator that draws the groups.
-
-    Raises:
-        ValueError: There are fewer than two groups.
+    The groups are those of all links of the data; there must be two or more. An error calls the fraction ``name``.
     """
     if not fraction:
         return links, links[:0]
@@ -78,25 +73,19 @@ def hold_out(
 
 
 def generator_of(seed: int) -> torch.Generator:
-    """The random numbers of a seed; a ``ValueError`` for a seed that torch does not take."""
+    """The random numbers of a seed; a ``ValueError`` unless torch accepts it."""
     check("seed", seed, 0 <= seed < 2**63, "a whole number from 0 to 2**63 - 1")
     return torch.Generator().manual_seed(seed)
 
 
 def runs_of(links: Links, length: int) -> Int[Tensor, " n"]:
-    """Number of each link's run of ``length`` rows; a ``ValueError`` for a run without rows."""
+    """Number of each link's run of ``length`` rows; a ``ValueError`` unless it is 1 or more."""
     check("length", length, length >= 1, "a whole number of rows, at least 1")
     rows = rows_of(links)
-    return rows // min(length, int(rows.max()) + 1)  # a longer run holds all rows too, and may be beyond int64
-
-
-def check_fractions(test: float, validation: float) -> None:
-    """Raises a ``ValueError`` for fractions out of range."""
-    check("test", test, 0 < test < 1, "in (0, 1)")
-    check("validation", validation, 0 <= validation < 1, "in [0, 1)")
+    return rows // min(length, int(rows.max()) + 1)  # the length may exceed int64
 
 
 def check(name: str, value: float, holds: bool, bounds: str) -> None:
-    """Raises a ``ValueError`` for an option that is not within its bounds."""
+    """Raises a ``ValueError`` for an option out of its bounds."""
     if not holds:
         raise ValueError(f"split.{name} must be {bounds}, got {value}")

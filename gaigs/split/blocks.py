@@ -12,16 +12,10 @@ def blocks(links: Links, edge: float, test: float = 0.2, validation: float = 0.1
     """Random cubes test: places where nothing was measured.
 
     Args:
-        links: All links.
-        edge: Edge of a cube [m]; cubes are counted from the lower corner of all transmitters.
-        test: Fraction of the links to test on.
-        validation: Fraction of the training links to validate on; 0 for none.
-        seed: Seed of all random numbers.
-
-    Raises:
-        ValueError: An option is out of range, or there are too few cubes.
+        edge: Edge of a cube [m]; the first cube starts at the lower corner of all transmitters. Other options and
+            errors are those of ``gaigs.split.part``.
     """
-    low, high = 1e-6, 1e6  # float32 resolves nothing smaller, and no data are larger
+    low, high = 1e-6, 1e6  # float32 has no finer resolution, and data no larger extent
     check("edge", edge, low <= edge <= high, f"from {low:g} to {high:g} m")
     places = links.query.transmitters.double()
     cubes = ((places - places.amin(0)) / edge).floor().long()

@@ -10,13 +10,11 @@ def official(links: Links, length: int = 1, validation: float = 0.1, seed: int =
     """The data's own training and test links; validation links are drawn from the training links.
 
     Args:
-        links: All links.
-        length: Rows in a run that validates; more than 1 where the test is a run of its own.
+        length: Rows in a run that validates; more than 1 if the test is a separate run.
         validation: Fraction of the training links to validate on; 0 for none.
-        seed: Seed of the validation links.
 
     Raises:
-        ValueError: The data came without such parts, or an option is out of range.
+        ValueError: The data have no such parts, or an option is out of range.
     """
     if links.official is None:
         raise ValueError("this data has no official split; choose split=random, sparse, runs or blocks")

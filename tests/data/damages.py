@@ -39,21 +39,10 @@ def insert(content, draw):
     return content[:at] + draw.choice([draw.randbytes(3), b"\0", b'"', b"[", b"\\", b"\x0c", b"\xe9"]) + content[at:]
 
 
-def delete(content, draw):
-    at = draw.randrange(len(content))
-    return content[:at] + content[at + draw.randint(1, 8) :]
-
-
 def renumber(content, draw):
     places = [match.span() for match in re.finditer(rb"-?\d+\.?\d*", content)]
     start, stop = draw.choice(places)
     return content[:start] + draw.choice(WORDS).encode() + content[stop:]
-
-
-def drop_line(content, draw):
-    lines = content.splitlines(keepends=True)
-    lines.pop(draw.randrange(len(lines)))
-    return b"".join(lines)
 
 
 def repeat_line(content, draw):
@@ -69,10 +58,5 @@ def recode(content, draw):
     return coded[name].encode(name)
 
 
-def nest(content, draw):
-    at = content.index(b"[") if b"[" in content else draw.randrange(len(content))
-    return content[:at] + 600 * draw.choice([b"[", b"{", b"- ", b'"']) + content[at:]
-
-
-BYTES = [flip, flip, truncate, insert, delete]
-TEXTS = [*BYTES, renumber, renumber, renumber, drop_line, repeat_line, recode, nest]
+BYTES = [flip, flip, truncate, insert]
+TEXTS = [*BYTES, renumber, renumber, renumber, repeat_line, recode]

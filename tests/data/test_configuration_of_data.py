@@ -6,7 +6,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from gaigs.configuration import conf_dir
-from gaigs.data import load
 from gaigs.registry import registry
 
 CHOICES = {
@@ -50,10 +49,3 @@ def test_a_split_on_the_command_line_precedes_the_datas_own(configured):
     config = configured("data=nerf2_rssi", "split=blocks", "split.edge=0.5")
     assert config.task.name == "rssi"
     assert config.split == {"name": "blocks", "edge": 0.5, "test": 0.2, "validation": 0.1, "seed": 0}
-
-
-def test_several_carriers_come_from_the_command_line(configured):
-    config = configured("data=synthetic", "data.transmitters=3", "data.frequency=[5e9,6e9]", "data.order=0")
-    links = load(OmegaConf.to_container(config.data), config.split)
-    assert links.task.name == config.task.name
-    assert links.query.frequencies.tolist() == [5e9, 6e9] * 3

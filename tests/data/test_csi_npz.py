@@ -81,19 +81,11 @@ def test_channels_of_zeros_are_left_out_and_counted(file):
     check_data(links)
 
 
-def test_a_single_antenna_needs_no_elements(file):
-    links = read(changed(file, elements=None, h=arrays()["h"][:, :1]))
-    assert links.task.shape == (1, 4)
-    assert all(torch.equal(r.array.elements, torch.zeros(1, 3)) for r in links.receivers)
-    assert "elements" not in links.remarks
-    check_data(links)
-
-
-def test_elements_in_unknown_places_stand_at_the_receiver_and_that_is_said(file):
+def test_unknown_elements_stand_at_the_receiver_with_a_remark(file):
     links = read(changed(file, elements=None))
     assert links.task.shape == (3, 4)
     assert all(torch.equal(r.array.elements, torch.zeros(3, 3)) for r in links.receivers)
-    assert "the file does not say where the 3 elements stand, so all count as standing at" in links.remarks
+    assert "positions of the 3 elements are unknown" in links.remarks
     check_data(links)
 
 
@@ -119,13 +111,6 @@ def test_arrays_of_other_types_are_read(file, types):
     check_data(links)
 
 
-def test_compressed_files_are_read_and_stay_as_they_are(file):
-    np.savez_compressed(file, **arrays())
-    before = file.read_bytes()
-    assert len(read(file)) == 10
-    assert file.read_bytes() == before
-
-
 def put(name, index, value):
     array = arrays()[name].copy()
     array[index] = value
@@ -138,38 +123,23 @@ LEVEL = "expected magnitudes below 1e+18, the largest of a link 1e-18 or more un
 
 DEFECTS = [
     ({"tx": None}, "tx: expected one array of real numbers of (n, 3), got 0"),
-    ({"rx_index": None}, "rx_index: expected one array of whole numbers of (n,), got 0"),
-    ({"h": None}, "h: expected one array of complex numbers of (n, e, s), got 0"),
     ({"tx": np.ones((10, 2))}, "tx: expected the shape (n, 3), got (10, 2)"),
-    ({"tx": np.ones((9, 3))}, "rx_index: expected the shape (9,), got (10,)"),
     ({"rx": np.ones(3)}, "rx: expected the shape (k, 3), got (3,)"),
     ({"h": np.ones((9, 3, 4), complex)}, "h: expected the shape (10, e, 4), got (9, 3, 4)"),
-    ({"frequencies": np.ones(5)}, "h: expected the shape (10, e, 5), got (10, 3, 4)"),
-    ({"frequencies": np.float64(2.4e9)}, "frequencies: expected the shape (s,), got ()"),
     ({"elements": np.ones((4, 3))}, "elements: expected the shape (3, 3), got (4, 3)"),
     ({"h": np.ones((10, 4), complex)}, "(10, e, 4), got (10, 4); for one antenna add an axis, h[:, None, :]"),
     ({"h": np.ones((10, 3, 4))}, "h: expected complex numbers, got float64; join real and imaginary parts by re + 1j"),
     ({"rx_index": np.zeros(10)}, "rx_index: expected whole numbers, got float64"),
-    ({"tx": np.full((10, 3), "near")}, "tx: expected real numbers, got <U4"),
-    ({"tx": np.ones((0, 3)), "rx_index": np.ones(0, int)}, "tx: expected the shape (n, 3), got (0, 3)"),
     ({"h": np.ones((10, 0, 4), complex)}, "h: expected the shape (10, e, 4), got (10, 0, 4)"),
     (put("rx_index", [3, 5], 3), "rx_index[3]: expected a row of rx, 0..2, got 3 (in 2 of 10 rows)"),
-    (put("rx_index", 0, -1), "rx_index[0]: expected a row of rx, 0..2, got -1 (in 1 of 10 rows)"),
     (put("tx", (6, 1), np.nan), "tx[6, 1]: expected a number, got NaN (in 1 of 10 rows)"),
-    (put("tx", (6, 1), np.inf), f"tx[6, 1]: {NEAR} inf (in 1 of 10 rows)"),
     (put("rx", (1, 0), -1e5), f"rx[1, 0]: {NEAR} -100000.0"),
-    (put("elements", (2, 2), 5e6), f"elements[2, 2]: {NEAR} 5000000.0"),
-    (put("frequencies", 0, 0), f"frequencies[0]: {CARRIER} 0.0"),
-    (put("frequencies", 3, np.nan), "frequencies[3]: expected a number, got NaN"),
     ({"frequencies": np.array([-3e7, -1e7, 1e7, 3e7])}, f"frequencies[0]: {CARRIER} -30000000.0 (in 2 of 4 rows)"),
-    (put("frequencies", 1, 2.4), f"frequencies[1]: {CARRIER} 2.4; in GHz? (in 1 of 4 rows)"),
     ({"frequencies": np.linspace(2400, 2460, 4)}, f"frequencies[0]: {CARRIER} 2400.0; in MHz? (in 4 of 4 rows)"),
-    (put("frequencies", 1, 1e300), "3e+11 Hz, got 1e+300 (in 1 of 4 rows)"),
     (put("frequencies", 1, 2.40e9), "frequencies: expected different ones, got one twice"),
     (put("h", (8, 1, 2), 1e19), f"h[8, 1, 2]: {LEVEL} (9.99"),
     ({"h": np.full((10, 3, 4), 1e-30j)}, f"h[0, 0, 0]: {LEVEL} 1.00000000"),
     (put("h", ([2, 8], 1, 2), np.nan), "h[2, 1, 2]: expected a number, got NaN (in 2 of 10 rows)"),
-    (put("h", (8, 1, 2), 1e60), f"{LEVEL} (inf+0j)"),
     ({"h": np.zeros((10, 3, 4), complex)}, "h: expected a channel that is not zero throughout, got none"),
     ({"tx": np.array([None] * 10)}, "tx: Object arrays cannot be loaded when allow_pickle=False"),
 ]
@@ -184,7 +154,7 @@ def test_a_defect_is_named_with_its_array(file, changes, message):
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_written_reads_back(file, tmp_path):
+def test_written_links_read_back(file, tmp_path):
     links = read(changed(file, rx_index=np.zeros(10, int)))
     (tmp_path / "copy").mkdir()
     csi_npz.write(tmp_path / "copy", links)
@@ -192,13 +162,6 @@ def test_what_is_written_reads_back(file, tmp_path):
     assert torch.equal(again.labels, links.labels)
     assert torch.equal(again.query.transmitters, links.query.transmitters)
     torch.testing.assert_close(again.receivers[0].array.elements, links.receivers[0].array.elements)
-
-
-UNREADABLE = "; expected an .npz file as numpy.savez writes it"
-
-
-def cut(file):
-    file.write_bytes(file.read_bytes()[:400])
 
 
 def damage(file):
@@ -209,22 +172,17 @@ def damage(file):
     file.write_bytes(content)
 
 
-def store(file, member, content):
-    """The file with one member of such bytes, whose checksum is right."""
-    with zipfile.ZipFile(file) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    members[member] = content(members[member])
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, stored in members.items():
-            archive.writestr(name, stored)
-
-
 def halve(file):
-    """A header of half the precision, as one damaged byte writes it, whose checksum is that of the whole."""
-    changed(file, rx=np.ones((2000, 3)))  # zipfile compares what it has read to the end, and reads 4 kB ahead
+    """A header of half the precision, as one damaged byte writes it, with a correct checksum of the rest."""
+    changed(file, rx=np.ones((2000, 3)))  # zipfile compares checksums at the end, and reads 4 kB ahead
     before, start, content = file.read_bytes().partition(b"rx.npy")
     assert b"'<f8'" in content[:200]
     file.write_bytes(before + start + content.replace(b"'<f8'", b"'<f4'", 1))
+
+
+def single(file):
+    with file.open("wb") as stream:
+        np.save(stream, arrays()["h"])
 
 
 def repeat(file):
@@ -237,36 +195,12 @@ def repeat(file):
     [
         (halve, "rx: more numbers than its shape (2000, 3) has"),
         (repeat, "tx: expected one array of real numbers of (n, 3), got 2"),
-        (lambda f: store(f, "tx.npy", lambda old: old + b"0"), "tx: more numbers than its shape"),
-        (lambda f: store(f, "tx.npy", lambda old: old.replace(b"(10, 3)", b"(10*3) ")), ": tx: "),
-        (lambda f: store(f, "tx.npy", lambda old: old.replace(b"(10, 3)", b"(9**9,)")), ": tx: "),
-        (lambda f: store(f, "tx.npy", lambda old: old.replace(b"        ", b"0" * 8)), ": tx: "),
-        (
-            lambda f: f.write_text("tx,rx\n1,2\n"),
-            UNREADABLE,
-        ),
-        (lambda f: f.write_bytes(b""), UNREADABLE),
-        (cut, UNREADABLE),
         (damage, "h: Bad CRC-32 for file 'h.npy'"),
-        (
-            lambda f: f.write_bytes(np.ones((2, 3)).dumps()),
-            UNREADABLE,
-        ),
+        (single, ": a single array of shape (10, 3, 4); expected"),
+        (lambda file: file.write_text("tx,rx\n1,2\n"), "; expected an .npz file as numpy.savez writes it"),
     ],
-    ids=["half", "twice", "longer", "no shape", "power", "header", "text", "empty", "cut", "damaged", "pickle"],
 )
-def test_files_that_are_no_whole_archive_are_refused(file, break_file, message):
+def test_damaged_archives_are_refused(file, break_file, message):
     break_file(file)
     with pytest.raises(ValueError, match=re.escape(message)):
         read(file)
-
-
-def test_a_single_array_is_refused(tmp_path):
-    np.save(tmp_path / "h.npy", arrays()["h"])
-    with pytest.raises(ValueError, match=r"cannot parse .*: a single array of shape \(10, 3, 4\); expected"):
-        read(tmp_path / "h.npy")
-
-
-def test_a_missing_file_is_named(file):
-    with pytest.raises(FileNotFoundError, match=r"none\.npz must be an \.npz file of channels, and is no file"):
-        read(file.with_name("none.npz"))

@@ -1,4 +1,4 @@
-"""Damaged files of every reader: the links are whole and within their bounds, or one error names the file."""
+"""Damaged files of every reader: the links keep the contract and their bounds, or one error names the file."""
 
 import io
 import random
@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 import torch
 from damages import BYTES, TEXTS
-from plyfile import PlyData, PlyElement
 
 from gaigs.data import csi_npz, nerf2_rssi, nerf2_spectrum, rssi_csv
 from gaigs.geometry import FAR
-from gaigs.io.meshes import read_obj, read_ply
-from gaigs.query import CARRIERS
+from gaigs.testing import check_data
 
 COUNT = 100
 """Damages of each reader's files."""
@@ -83,28 +81,15 @@ def within(values, low, high):
 
 
 def check_links(links):
+    check_data(links)
     places = [links.query.transmitters, links.edges]
     places += [place for receiver in links.receivers for place in (receiver.pose.position, receiver.array.elements)]
     assert all(within(place, -FAR, FAR) for place in places)
-    assert all(within(receiver.pose.rotation, -1.001, 1.001) for receiver in links.receivers)
-    assert all(receiver.name.isprintable() for receiver in links.receivers)
-    assert links.query.frequencies is None or within(links.query.frequencies, *CARRIERS)
     labels = links.labels[torch.arange(len(links))]
-    assert len(labels) == len(links) > 0
-    match links.task.name:
-        case "spectrum":
-            assert within(labels, 0, 1)
-        case "rssi":
-            assert within(labels, rssi_csv.QUIETEST, 0)
-        case "csi":
-            assert within(labels.abs().flatten(1).amax(1), *csi_npz.STRENGTHS)
-            assert within(links.task.frequencies, *CARRIERS)
-    if links.official:
-        train, test = links.official()
-        assert len(train)
-        assert len(test)
-        assert not set(train.tolist()) & set(test.tolist())
-        assert set(train.tolist()) | set(test.tolist()) <= {*range(len(links))}
+    if links.task.name == "rssi":
+        assert within(labels, rssi_csv.QUIETEST, 0)
+    if links.task.name == "csi":
+        assert within(labels.abs().flatten(1).amax(1), *csi_npz.STRENGTHS)
     return labels
 
 
@@ -144,44 +129,4 @@ def test_a_damaged_file_is_read_or_named(files, reader):
         # Bytes with checksums are as they were, or refused.
         if damage in BYTES and path.suffix in (".png", ".npz") and not refused[-1]:
             assert torch.equal(left, whole)
-    assert 0.1 < sum(refused) / COUNT < 0.95
-
-
-def mesh_outcome(file):
-    """The error's message; None if the mesh can be used."""
-    try:
-        points, faces = read_ply(file) if file.suffix == ".ply" else read_obj(file)
-    except ValueError as error:
-        return str(error)
-    if file.suffix == ".ply":
-        points = np.stack([points[axis] for axis in "xyz"], -1)
-    else:
-        faces = [face for group in faces.values() for face in group]
-    assert (np.abs(points) < FAR).all()
-    assert all(0 <= k < len(points) for face in faces for k in face)
-    return None
-
-
-@pytest.mark.parametrize("name", ["room.obj", "text.ply", "binary.ply"])
-def test_a_damaged_mesh_is_read_or_named(tmp_path, name):
-    file = tmp_path / name
-    if name == "room.obj":
-        file.write_text(
-            "o floor\nv 0 0 1\nv 4 0 1\nv 4.5 2e0 1\nv 0 2 1\nusemtl glass\nf 1/1 2/2 3/3\no roof\nf -4 -3 -2\n"
-        )
-    else:
-        vertices = np.array([(0, 0, 1), (4, 0, 1), (4.5, 2, 1)], [(axis, "f4") for axis in "xyz"])
-        faces = np.empty(1, [("vertex_indices", object)])
-        faces["vertex_indices"] = [np.array([0, 1, 2], "i4")]
-        parts = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-        PlyData(parts, text=name == "text.ply").write(str(file))
-    whole, draw, refused = file.read_bytes(), random.Random(0), 0
-    for _ in range(COUNT):
-        content = draw.choice(BYTES if name == "binary.ply" else TEXTS)(whole, draw)
-        file.write_bytes(content)
-        message = mesh_outcome(file)
-        if message is not None:
-            assert name in message, content
-            assert len(message) < 1000, content
-            refused += 1
-    assert 0.2 < refused / COUNT < 1
+    assert 0.1 < sum(refused) / COUNT < 1

@@ -17,33 +17,19 @@ def read(folder, split=OFFICIAL):
     return load({"name": "nerf2_rssi", "root": str(folder)}, split)
 
 
-@pytest.fixture
-def folder(rssi_folder):
-    return rssi_folder
-
-
 def named(links, index=slice(None)):
     """Links as (x of the transmitter, gateway, label)."""
     names = [links.receivers[k].name for k in links.query.receivers[index].tolist()]
     return [*zip(links.query.transmitters[index, 0].tolist(), names, links.labels[index].tolist(), strict=True)]
 
 
-def test_every_reading_that_was_heard_is_a_link(folder):
-    links = read(folder)
-    assert named(links) == [
-        (0.5, "west", -50.5),
-        (0.5, "east", -61),
-        (1.5, "west", -52),
-        (1.5, "attic", -80),
-        (2.5, "west", -54),
-        (2.5, "east", -65),
-        (4.5, "west", -58.25),
-        (4.5, "east", -69),
-        (4.5, "attic", -88),
-        (5.5, "west", -60),
-        (5.5, "east", -71),
-        (5.5, "attic", -90),
+def test_every_reading_that_was_heard_is_a_link(rssi_folder):
+    links = read(rssi_folder)
+    rows = [map(float, line.split(",")) for line in (rssi_folder / RSSI).read_text().splitlines()[1:]]
+    cells = [
+        (k + 0.5, *cell) for k, row in enumerate(rows) for cell in zip(("west", "east", "attic"), row, strict=True)
     ]
+    assert named(links) == [cell for cell in cells if cell[2] > -100]
     assert links.query.transmitters[6].tolist() == [4.5, -4, 0.25]
     positions = {r.name: r.pose.position.tolist() for r in links.receivers}
     assert positions == {"west": [0.5, 1, 2], "east": [5, 1, 2], "attic": [3, 1, 4.5]}
@@ -51,35 +37,24 @@ def test_every_reading_that_was_heard_is_a_link(folder):
     assert all(len(r.array) == 1 for r in links.receivers)
     assert (links.task.name, links.task.unit, links.query.frequencies) == ("rssi", "dBm", None)
     assert links.rows.tolist() == [0, 0, 1, 1, 2, 2, 4, 4, 4, 5, 5, 5]
+    assert links.split.train.tolist() == [0, 1, 2, 3, 6, 7, 8]
+    assert links.split.test.tolist() == [4, 5, 9, 10, 11]
     assert links.edges.shape == (0, 2, 3)
     assert links.remarks == "12 readings of 6 rows at 3 gateways; 6 of -100 dBm were not heard and are left out"
     check_data(links)
 
 
-def test_the_official_parts_are_those_of_the_index_files(folder):
-    split = read(folder).split
-    assert split.train.tolist() == [0, 1, 2, 3, 6, 7, 8]
-    assert split.test.tolist() == [4, 5, 9, 10, 11]
-
-
-def test_readings_in_no_index_file_are_in_no_part(folder):
-    (folder / "train_index.txt").write_text("0\n1\n")
-    split = read(folder).split
-    assert split.train.tolist() == [0, 1, 2, 3]
-    assert split.test.tolist() == [4, 5, 9, 10, 11]
-
-
-def test_a_gateway_that_heard_nothing_is_left_out(folder):
-    file = folder / "gateway_rssi.csv"
+def test_a_gateway_that_heard_nothing_is_left_out(rssi_folder):
+    file = rssi_folder / "gateway_rssi.csv"
     file.write_text(re.sub(r",-6[159]|,-71", ",-100", file.read_text()))
-    links = read(folder)
+    links = read(rssi_folder)
     assert [r.name for r in links.receivers] == ["west", "attic"]
     assert named(links)[-1] == (5.5, "attic", -90)
     assert links.remarks.endswith("10 of -100 dBm were not heard and are left out, and so are the gateways that heard "
                                   "nothing: east")  # fmt: skip
-    (folder / "train_index.txt").write_text("0 west\n1 east\n1 attic\n")
-    (folder / "test_index.txt").write_text("5 attic\n")
-    again = read(folder)
+    (rssi_folder / "train_index.txt").write_text("0 west\n1 east\n1 attic\n")
+    (rssi_folder / "test_index.txt").write_text("5 attic\n")
+    again = read(rssi_folder)
     assert named(again, again.split.train) == [(0.5, "west", -50.5), (1.5, "attic", -80)]
 
 
@@ -92,126 +67,77 @@ def test_a_gateway_that_heard_nothing_is_left_out(folder):
     ],
     ids=["columns", "separators", "names"],
 )
-def test_index_files_of_rows_and_gateways(folder, train, test):
-    (folder / "train_index.txt").write_text(train)
-    (folder / "test_index.txt").write_text(test)
-    links = read(folder)
+def test_index_files_of_rows_and_gateways(rssi_folder, train, test):
+    (rssi_folder / "train_index.txt").write_text(train)
+    (rssi_folder / "test_index.txt").write_text(test)
+    links = read(rssi_folder)
     assert named(links, links.split.train) == [(0.5, "west", -50.5), (0.5, "east", -61), (5.5, "attic", -90)]
     assert named(links, links.split.test) == [(2.5, "east", -65), (5.5, "west", -60)]
 
 
-def test_gateways_named_by_numbers_are_never_taken_for_columns(folder):
+def test_gateways_named_by_numbers_are_never_taken_for_columns(rssi_folder):
     for old, new in (("west", "1"), ("east", "2"), ("attic", "010")):
-        replace(folder / "gateway_rssi.csv", old, new)
-        replace(folder / "gateway_position.yml", old, new)
-    (folder / "train_index.txt").write_text("0 1\n4 010\n")
-    (folder / "test_index.txt").write_text("0 2\n")
-    links = read(folder)
+        replace(rssi_folder / "gateway_rssi.csv", old, new)
+        replace(rssi_folder / "gateway_position.yml", old, new)
+    (rssi_folder / "train_index.txt").write_text("0 1\n4 010\n")
+    (rssi_folder / "test_index.txt").write_text("0 2\n")
+    links = read(rssi_folder)
     assert named(links, links.split.train) == [(0.5, "1", -50.5), (4.5, "010", -88)]
     assert named(links, links.split.test) == [(0.5, "2", -61)]
-    (folder / "test_index.txt").write_text("0 0\n")
+    (rssi_folder / "test_index.txt").write_text("0 0\n")
     with pytest.raises(ValueError, match=r"line 1: expected a row in 0\.\.5, or a row and a gateway, got '0 0'"):
-        read(folder)
+        read(rssi_folder)
 
 
-def test_without_a_header_columns_are_in_the_order_of_the_gateways(folder):
-    replace(folder / "gateway_rssi.csv", "west,east,attic\n", "")
-    replace(folder / "tx_pos.csv", "x,y,z\n", "")
-    links = read(folder)
+def test_without_a_header_columns_are_in_the_order_of_the_gateways(rssi_folder):
+    replace(rssi_folder / "gateway_rssi.csv", "west,east,attic\n", "")
+    replace(rssi_folder / "tx_pos.csv", "x,y,z\n", "")
+    links = read(rssi_folder)
     assert named(links)[:2] == [(0.5, "east", -50.5), (0.5, "west", -61)]
     assert len(links.labels) == 12
 
 
 @pytest.mark.parametrize("header", ["x,y\n", ""])
-def test_walls_run_from_each_vertex_to_the_next(folder, header):
-    (folder / "layout.csv").write_text(f"{header}0,0\n4,0\n4,3.5\n0,0\n")
-    edges = read(folder).edges
+def test_walls_run_from_each_vertex_to_the_next(rssi_folder, header):
+    (rssi_folder / "layout.csv").write_text(f"{header}0,0\n4,0\n4,3.5\n0,0\n")
+    edges = read(rssi_folder).edges
     corners = [[0, 0, 0], [4, 0, 0], [4, 3.5, 0], [0, 0, 0]]
     assert edges.tolist() == [[*ends] for ends in pairwise(corners)]
 
 
-def test_index_files_are_read_for_the_official_split_only(folder):
-    (folder / "train_index.txt").unlink()
-    (folder / "test_index.txt").write_text("99\n")
-    assert len(read(folder, {"name": "runs", "length": 2, "validation": 0}).split.test) > 0
-    with pytest.raises(
-        ValueError, match=r"train_index\.txt: missing; expected a row in 0\.\.5, or a row and a gateway"
-    ):
-        read(folder)
-
-
-TX, RSSI, YML, TRAIN, TEST = (
-    "tx_pos.csv",
-    "gateway_rssi.csv",
-    "gateway_position.yml",
-    "train_index.txt",
-    "test_index.txt",
-)
+TX, RSSI, YML = "tx_pos.csv", "gateway_rssi.csv", "gateway_position.yml"
+TRAIN, TEST = "train_index.txt", "test_index.txt"
 
 DEFECTS = [
     (RSSI, "-54,-65,-100", "nan,nan,nan", ", line 4: expected an RSSI from -100 to below 0 dBm (-100 where nothing was "
      "heard), got 'nan' in column west"),
-    (RSSI, "-65", "", ", line 4: expected an RSSI from -100 to below 0 dBm (-100 where nothing was heard), got ''"),
-    (RSSI, "-60", "+20", ", line 7: expected an RSSI from -100 to below 0 dBm"),
     (RSSI, "-60", "0", ", line 7: expected an RSSI from -100 to below 0 dBm"),
     (RSSI, "-60", "-100.5", ", line 7: expected an RSSI from -100 to below 0 dBm"),
-    (RSSI, "west,east,attic\n-50.5", "120", ", line 1: expected an RSSI from"),
     (RSSI, "-52,-100,-80", "-52,-100", ", line 3: expected 3 columns 'west,east,attic', got 2: '-52,-100'"),
     (RSSI, None, ",west,east,attic\n0,-50,-60,-70\n", ", line 1: column '' has no position in gateway_position.yml"),
     (RSSI, "attic", "east", ", line 1: expected one column 'east', got 2"),
-    (RSSI, "-54,-65,-100\n", "", ": tx_pos.csv has 6 positions, and gateway_rssi.csv 5 rows"),
+    (RSSI, "-54,-65,-100\n", "", ": tx_pos.csv has 6 positions, gateway_rssi.csv 5 rows"),
     (RSSI, None, "west,east,attic\n" + 6 * "-100,-100,-100.0\n", ": expected readings above -100 dBm, got none"),
-    (RSSI, None, None, ": missing; expected an RSSI [dBm] of each gateway"),
-    (RSSI, None, "west,east,attic\n", ": no readings below the header"),
-    (TX, "2.5,-2,0.25", "nan,-2,inf", ", line 4: expected a finite number, got 'nan' in column x"),
-    (TX, "2.5,-2", "1e5,-2", ", line 4: expected positions within 1e5 m of the origin on each axis (subtract a common"),
     (YML, "attic: [3, 1, 4.5]\n", "", "gateway_rssi.csv, line 1: column 'attic' has no position in gateway_position"),
     (YML, "attic", "cellar: [3, 1, -2]\nattic", "gateway_rssi.csv, line 1: expected one column 'cellar', got 0"),
-    (YML, "[5.0, 1, 2]", "[5.0, 1]", ": east must be 3 finite numbers x, y, z, written as 1.5 or -2e-3, got ['5.0',"),
-    (YML, "5.0, 1, 2", "5.0, -100000, 2", ": east: expected positions within 1e5 m of the origin on each axis"),
-    (YML, "attic", "east", "cannot parse"),
-    (TEST, None, "\n\n", ": empty; expected a row in 0..5, or a row and a gateway"),
     (TRAIN, None, None, ": missing; expected a row in 0..5"),
     (TEST, "5", "6", ", line 1: expected a row in 0..5, or a row and a gateway, got '6'"),
-    (TRAIN, "4", "-4", ", line 1: expected a row in 0..5, or a row and a gateway, got '-4'"),
-    (TRAIN, "0", "0.0", ", line 2: expected a row"),
-    (TRAIN, "0", "", ", line 2: expected a row in 0..5, or a row and a gateway, got ''"),
     (TRAIN, "1", "4", ", line 3: expected each entry once, got '4', which is in train_index.txt, line 1 already"),
     (TEST, "2", "0", ", line 2: expected each entry once, got '0', which is in train_index.txt, line 2 already"),
     (TEST, "2", "2 east", ": index files must list rows, or pairs of row and gateway, got both"),
-    (TRAIN, None, "0 1 4\n", ", line 1: expected a row in 0..5, or a row and a gateway, got '0 1 4'"),
     (TRAIN, None, "0 west\n1 3\n", ", line 2: expected a row in 0..5, or a row and a gateway, got '1 3'"),
     (TEST, None, "3\n", ": expected a reading that was heard, got none"),
-    (TRAIN, None, "9" * 5000, ", line 1: expected a row in 0..5, or a row and a gateway, got '999"),
     ("layout.csv", None, "x,y\n1,2\n", ": expected two wall vertices or more, got 1"),
-    ("layout.csv", None, "1,2\n3,\n", ", line 2: expected a finite number, got '' in column y"),
-    ("layout.csv", None, "", ": empty; expected consecutive wall vertices"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("file", "old", "new", "message"), DEFECTS)
-def test_a_defect_is_named_with_its_place(folder, file, old, new, message):
-    replace(folder / file, old, new)
+def test_a_defect_is_named_with_its_place(rssi_folder, file, old, new, message):
+    replace(rssi_folder / file, old, new)
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
-        nerf2_rssi.read(folder).official()
-    assert str(folder) in str(caught.value)
+        nerf2_rssi.read(rssi_folder).official()
+    assert str(rssi_folder) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_pairs_are_known_by_name_and_column(folder):
-    (folder / TRAIN).write_text("0 west\n")
-    (folder / TEST).write_text("1 west\n0 0\n")
-    with pytest.raises(ValueError, match=r"line 2: expected each entry once, got '0 0', which is in train_index\.txt"):
-        read(folder)
-
-
-def test_a_position_without_a_column_in_a_table_without_header_is_refused(folder):
-    replace(folder / RSSI, "west,east,attic\n", "")
-    replace(folder / YML, "attic", "cellar: [3, 1, -2]\nattic")
-    with pytest.raises(
-        ValueError, match="line 1 and 5 other lines: expected 4 columns 'east,west,cellar,attic', got 3"
-    ):
-        read(folder)
 
 
 @pytest.fixture(scope="module")

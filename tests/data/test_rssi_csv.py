@@ -1,5 +1,6 @@
 """Reading one table of signal strengths; tables are written here by hand."""
 
+import math
 import re
 
 import pytest
@@ -66,12 +67,7 @@ def test_the_end_with_fewer_places_is_the_fixed_one(file, text, end, moving):
     check_data(links)
 
 
-def test_in_a_tie_the_receiver_is_the_fixed_one(file):
-    file.write_text(f"{BACK.splitlines()[0]}\n1,2,3,4,5,6,-50\n2,2,3,5,5,6,-51\n")
-    assert [receiver.name for receiver in read(file, split={**RANDOM, "test": 0.5}).receivers] == ["rx1", "rx2"]
-
-
-def test_the_fixed_end_can_be_told(file):
+def test_the_fixed_end_can_be_chosen(file):
     links = read(file, fixed="tx")
     assert [r.name for r in links.receivers] == ["tx1", "tx2", "tx3", "tx4"]
     assert [r.pose.position.tolist() for r in links.receivers] == [[x, 1, 1] for x in (1.5, 2.5, 3.5, 4.5)]
@@ -80,13 +76,11 @@ def test_the_fixed_end_can_be_told(file):
     assert read(file, fixed="rx").remarks == read(file).remarks
     with pytest.raises(ValueError, match="fixed must be tx or rx, or null for the end with fewer places, got 'both'"):
         read(file, fixed="both")
-
-
-def test_the_end_that_was_told_may_not_move(file):
-    file.write_text(FORTH.splitlines()[0] + "\n" + "".join(f"{k},1,1,5,0,2,-40\n" for k in range(65)))
-    assert len(read(file).receivers) == 1
-    with pytest.raises(ValueError, match=r"fixed end must stand at 64 places at most, got 65 .*; set fixed=rx or null"):
-        read(file, fixed="tx")
+    with pytest.raises(TypeError, match="'not_heard' must be a finite number, got nan"):
+        read(file, not_heard=math.nan)
+    file.write_text(f"{BACK.splitlines()[0]}\n1,2,3,4,5,6,-50\n2,2,3,5,5,6,-51\n")
+    tie = read(file, split=RANDOM | {"test": 0.5})
+    assert [receiver.name for receiver in tie.receivers] == ["rx1", "rx2"]
 
 
 def test_only_the_mark_is_not_heard(file):
@@ -99,22 +93,8 @@ def test_only_the_mark_is_not_heard(file):
     links = read(file, not_heard=-200)
     assert links.labels.tolist() == [-40, -50.25, -41, -100, -42, -100, -120.5]
     assert links.remarks.endswith("; 1 of -200 dBm were not heard and are left out")
-
-
-@pytest.mark.parametrize("mark", [127, 0, -999])
-def test_the_mark_need_not_be_a_level(file, mark):
-    file.write_text(FORTH.replace("-100.0", str(mark)).replace("-100", str(mark)))
-    links = read(file, not_heard=mark)
-    assert named(links) == [(x, f"rx{k}", dbm) for x, k, dbm in HEARD]
-    assert links.remarks.endswith(f"; 2 of {mark} dBm were not heard and are left out")
-
-
-@pytest.mark.parametrize("mark", [float("nan"), float("inf"), None, "none"])
-def test_the_mark_is_a_number(file, mark):
-    with pytest.raises((ValueError, TypeError), match=r"not_heard'? must be a (finite )?number"):
-        read(file, not_heard=mark)
-    with pytest.raises(ValueError, match="not_heard must be a finite number"):
-        rssi_csv.read(file, not_heard=mark)
+    file.write_text(FORTH.replace("-100.0", "127").replace("-100", "127"))
+    assert named(read(file, not_heard=127)) == [(x, f"rx{k}", dbm) for x, k, dbm in HEARD]
 
 
 def test_columns_are_found_by_name_and_others_named(file):
@@ -138,19 +118,8 @@ def test_a_fixed_place_that_nothing_was_heard_at_is_left_out(file):
 
 def test_walls_come_from_a_file_where_one_is_given(file, tmp_path):
     (tmp_path / "walls.csv").write_text("x,y\n0,0\n5,0\n5,4\n")
-    assert read(file).edges.shape == (0, 2, 3)
     edges = read(file, layout=str(tmp_path / "walls.csv")).edges
     assert edges.tolist() == [[[0, 0, 0], [5, 0, 0]], [[5, 0, 0], [5, 4, 0]]]
-    with pytest.raises(ValueError, match=r"no\.csv: missing; expected consecutive wall vertices x,y \[m\]"):
-        read(file, layout=str(tmp_path / "no.csv"))
-
-
-def test_quoted_cells_may_hold_commas(file):
-    heading, *rows = FORTH.splitlines()
-    file.write_text("\n".join([f'{heading},"note, if any"', *(f'{row}, "desk, left"' for row in rows)]))
-    links = read(file)
-    assert named(links) == [(x, f"rx{k}", dbm) for x, k, dbm in HEARD]
-    assert links.remarks.endswith("left out; columns ignored: note, if any")
 
 
 def test_both_ends_may_not_move(file):
@@ -163,22 +132,12 @@ def test_both_ends_may_not_move(file):
 
 
 DEFECTS = [
-    ("2.5,1,1,5,0,2,-41", "nan,nan,nan,5,0,2,-41", ", line 4: expected a finite number, got 'nan' in column tx_x"),
     ("2.5,1,1,5,0,2,-41", "2.5,-1e5,1,5,5400000,2,-41", ", line 4: expected positions within 1e5 m of the origin on "
      "each axis (subtract a common origin from all), got '-1e5' in column tx_y"),
     (",-41", ",nan", ", line 4: expected an RSSI from -200 to below 0 dBm (-100 where nothing was heard), got 'nan'"),
-    (",-41", ",20", ", line 4: expected an RSSI from -200 to below 0 dBm"),
     (",-41", ",-200.5", ", line 4: expected an RSSI from -200"),
-    (",-41", ",0", ", line 4: expected an RSSI"),
-    ("1.5,1,1,0", "1.5,one,1,0", ", line 3: expected a finite number, got 'one' in column tx_y"),
     (",-41", ",-41,9", ", line 4: expected 7 columns 'tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm', got 8: '2.5"),
-    ("2.5,1,1,5", "\n2.5,1,1,5", ", line 4: expected 7 columns"),
     ("rss_dbm", "rssi", ", line 1: expected one column rss_dbm, got 0 in 'tx_x,tx_y,tx_z,rx_x"),
-    ("tx_y", "TX_X", ", line 1: expected one column tx_x, got 2 in 'tx_x,TX_X,"),
-    (FORTH, FORTH.replace(",", ";"), ", line 1: expected commas between columns, got semicolons in 'tx_x;tx_y;"),
-    (FORTH.splitlines()[0] + "\n", "", ", line 1: expected one column tx_x, got 0 in '1.5,1,1,5,0,2,-40'"),
-    (FORTH, FORTH.splitlines()[0], ": no readings below the heading"),
-    (FORTH, "\n", ": empty; expected a heading with tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm"),
     (FORTH, FORTH.splitlines()[0] + "\n1,2,3,4,5,6,-100\n2,2,3,4,5,6,-100.0\n", ": expected a reading that was heard"),
 ]  # fmt: skip
 
@@ -190,7 +149,7 @@ def test_a_defect_is_named_with_its_place(file, old, new, message):
         rssi_csv.read(file)
 
 
-def test_what_is_written_reads_back(file, tmp_path):
+def test_written_links_read_back(file, tmp_path):
     links = read(file)
     rssi_csv.write(tmp_path, links)
     again = read(tmp_path / "room.csv", fixed="rx")

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pytest
 import torch
 from scipy.constants import speed_of_light
 
@@ -20,17 +19,6 @@ def channels(**options):
     return load({"name": "synthetic_csi", **options}, OFFICIAL)
 
 
-@pytest.fixture(scope="module")
-def links():
-    return load({"name": "synthetic_csi"}, {"name": "official"})
-
-
-@pytest.fixture(scope="module")
-def free():
-    """Without reflections: a direct path alone, that furniture dims."""
-    return channels(transmitters=40, order=0)
-
-
 def distances(links):
     """From each transmitter to each element [m]; world frame, float64."""
     (receiver,) = links.receivers
@@ -39,7 +27,8 @@ def distances(links):
     return np.linalg.norm(links.query.transmitters.double().numpy()[:, None] - elements, axis=-1)
 
 
-def test_the_default_channels_keep_the_contract(links):
+def test_the_default_channels_keep_the_contract():
+    links = load({"name": "synthetic_csi"}, {"name": "official"})
     check_data(links)
     assert links.labels.dtype == torch.complex64
     assert links.labels.shape == (500, 16, 26)
@@ -48,20 +37,6 @@ def test_the_default_channels_keep_the_contract(links):
     assert links.split.test.tolist() == list(range(400, 500))
     assert links.query.frequencies.tolist() == [CARRIER] * 500
     assert (links.labels != 0).flatten(1).any(1).all()
-
-
-def test_subcarriers_are_evenly_over_the_band(links):
-    expected = np.linspace(CARRIER - BANDWIDTH / 2, CARRIER + BANDWIDTH / 2, 26)
-    np.testing.assert_allclose(links.task.frequencies, expected, rtol=1e-12)
-
-
-def test_places_and_array_are_those_of_the_spectra():
-    links, spectra = channels(transmitters=8), load({"name": "synthetic", "transmitters": 8, "order": 0}, OFFICIAL)
-    assert torch.equal(links.query.transmitters, spectra.query.transmitters)
-    for ours, theirs in zip(links.receivers, spectra.receivers, strict=True):
-        assert torch.equal(ours.array.elements, theirs.array.elements)
-        assert torch.equal(ours.pose.rotation, theirs.pose.rotation)
-    assert torch.equal(links.split.test, spectra.split.test)
 
 
 def test_spectra_of_the_channels_are_those_of_the_room():
@@ -73,7 +48,8 @@ def test_spectra_of_the_channels_are_those_of_the_room():
     assert (min_max(steered) - spectra.labels).abs().max() < 1e-5
 
 
-def test_without_reflections_channels_are_friis_waves_that_furniture_dims(free):
+def test_without_reflections_channels_are_friis_waves_that_furniture_dims():
+    free = channels(transmitters=40, order=0)
     frequencies = np.linspace(CARRIER - BANDWIDTH / 2, CARRIER + BANDWIDTH / 2, 26)
     apart = distances(free)[..., None]
     waves = (
@@ -88,11 +64,3 @@ def test_without_reflections_channels_are_friis_waves_that_furniture_dims(free):
     assert np.ptp(losses_db, axis=(1, 2)).max() < 1e-2  # for all of a link's elements and subcarriers the same
     assert np.abs(losses_db.mean((1, 2)) - losses_db.mean((1, 2)).round()).max() < 1e-2  # furniture's are whole numbers
     assert 0.3 < (losses_db.mean((1, 2)) < 1e-2).mean() < 0.95
-
-
-def test_a_single_subcarrier_is_the_carrier():
-    links = channels(transmitters=5, subcarriers=1)
-    assert links.task.frequencies.tolist() == [CARRIER]
-    wide = channels(transmitters=5, subcarriers=3)
-    torch.testing.assert_close(links.labels[..., 0], wide.labels[..., 1])
-    check_data(links)

@@ -1,7 +1,6 @@
 """Grey images: headers are checked at once, pixels when they are asked for."""
 
 import re
-import zlib
 
 import numpy as np
 import pytest
@@ -45,26 +44,16 @@ def cut(size):
     return lambda file: file.write_bytes(file.read_bytes()[:size])
 
 
-def vast(file):
-    """A header of so many pixels that Pillow warns."""
-    content = file.read_bytes()
-    header = b"IHDR" + (10_000).to_bytes(4) + (10_000).to_bytes(4) + content[24:29]
-    file.write_bytes(content[:12] + header + zlib.crc32(header).to_bytes(4) + content[33:])
-
-
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
         (save(np.zeros((90, 361), np.uint8)), "of 90 x 360 pixels, got mode L of 90 x 361"),
-        (save(np.zeros((360, 90), np.uint8)), "got mode L of 360 x 90"),
         (
             save(np.zeros((90, 360, 3), np.uint8)),
             "expected 8-bit grey (Pillow's mode L) of 90 x 360 pixels, got mode RGB",
         ),
-        (save(np.zeros(SHAPE, np.uint16)), "got mode I;16"),
         (lambda file: Image.new("L", (360, 90)).save(file, format="jpeg"), "no whole PNG image (cannot identify image"),
         *((cut(size), "no whole PNG image (") for size in (0, 20, 40)),
-        (vast, "no whole PNG image (Image size"),
     ],
 )
 def test_a_header_with_a_defect_is_refused_at_once(files, damage, message):
@@ -80,12 +69,3 @@ def test_a_damaged_byte_is_no_other_pixel(files, place):
     files[1].write_bytes(content)
     with pytest.raises(ValueError, match=r"1\.png: no whole PNG image"):
         GreyImages(files, SHAPE)[torch.tensor([1])]
-
-
-@pytest.mark.parametrize("keep", [60, 5000, 32000])
-def test_a_truncated_image_is_refused_when_decoded(files, keep):
-    cut(keep)(files[1])
-    images = GreyImages(files, SHAPE)
-    images[torch.tensor([0])]
-    with pytest.raises(ValueError, match=r"1\.png: no whole PNG image"):
-        images[torch.tensor([0, 1])]

@@ -1,7 +1,6 @@
 """Text files of numbers: files that cannot be read, defects with their lines, and numbers in plain decimals only."""
 
 import os
-from pathlib import Path
 
 import pytest
 
@@ -9,7 +8,6 @@ from gaigs.io.tables import (
     check_empty,
     find_file,
     find_folder,
-    number_places,
     read_lines,
     read_parts,
     read_points,
@@ -30,11 +28,6 @@ def test_points_are_read(tmp_path, text):
     assert read_points(write(tmp_path, text), "xy", "points") == [[1, 2], [3, 4]]
 
 
-@pytest.mark.parametrize("cell", ["10", "+10.", "1e1", ".1E+2", '"10"', ' "10" ', "010"])
-def test_a_number_may_be_written_in_many_ways(tmp_path, cell):
-    assert read_points(write(tmp_path, f"0,0\n{cell},1\n"), "xy", "points") == [[0, 0], [10, 1]]
-
-
 @pytest.mark.parametrize(
     "cell", ["1_0", "１", "0x1", "1d3", "1e", '"1"0', '"1" 0', "1 0", '"1', "nan", "inf", "one", ""]
 )
@@ -47,16 +40,11 @@ def test_a_cell_without_a_plain_number_is_refused(tmp_path, cell):
     ("text", "message"),
     [
         ("", "points.csv: empty; expected points"),
-        ("\n \n", "points.csv: empty; expected points"),
         ("x,y\n", "points.csv: no positions below the header"),
         ("1,2\n3\n", "points.csv, line 2: expected 2 columns 'x,y', got 1: '3'"),
-        ("1;2\n3;4\n", "points.csv, line 1 and 1 other line: expected 2 columns 'x,y', got 1: '1;2'"),
-        ("y,x\n1,2\n", "line 1: expected a finite number, got 'y' in column x"),
         ("1,2\n" + 14 * "nan,2\n", "line 2 and 13 other lines: expected a finite number, got 'nan' in column x"),
         ("1,2\n3,1e5\n-1e5,0\n", "line 2 and 1 other line: expected positions within 1e5 m of the origin on each axis"),
-        (f"1,{'9' * 5000}\n", "9 ... in column y"),
         ("1,\x1b[31m\u202e\n", "got '\\x1b[31m\\u202e' in column y"),
-        (b"\xff\xfe1,2", "cannot parse FILE: not UTF-8 at byte 0; expected points"),
         ("x,y\n1,2\nZürich,3\n".encode("latin-1"), "cannot parse FILE: not UTF-8 at byte 9; expected points"),
     ],
 )
@@ -69,43 +57,18 @@ def test_a_defect_is_named_with_its_line(tmp_path, text, message):
     assert "\n" not in str(caught.value)
 
 
-STATES = {
-    "a link to nothing": lambda file: file.symlink_to("elsewhere"),
-    "a link to itself": lambda file: file.symlink_to(file),
-    "a folder": lambda file: file.mkdir(),
-    "a pipe": os.mkfifo,
-}
-
-
-@pytest.mark.parametrize("state", STATES)
-def test_a_path_that_is_no_file_is_named(tmp_path, state):
-    STATES[state](tmp_path / "points.csv")
-    with pytest.raises(
-        ValueError, match=r"points\.csv: no file, but a folder, a device or a broken link; expected points"
-    ):
+@pytest.mark.parametrize("make", [lambda file: file.symlink_to("elsewhere"), os.mkfifo, lambda file: None])
+def test_a_path_that_is_no_file_is_named(tmp_path, make):
+    make(tmp_path / "points.csv")
+    with pytest.raises(ValueError, match=r"points\.csv: (no file, .* or a broken link|missing); expected points"):
         read_lines(tmp_path / "points.csv", "points")
-    with pytest.raises(ValueError, match=r"none\.csv: missing; expected points"):
-        read_lines(tmp_path / "none.csv", "points")
-
-
-def test_a_closed_file_is_named(tmp_path, monkeypatch):
-    def closed(*arguments, **options):
-        raise PermissionError(13, "Permission denied")
-
-    file = write(tmp_path, "1,2\n")
-    monkeypatch.setattr(Path, "read_text", closed)
-    with pytest.raises(ValueError, match=r"cannot read .*points\.csv: Permission denied"):
-        read_lines(file, "points")
 
 
 @pytest.mark.parametrize("root", ["x" * 300, "~nobody-of-this-name/room", "a\0b"])
 def test_an_impossible_path_is_no_folder_and_no_file(root):
-    with pytest.raises(
-        FileNotFoundError, match="must be the folder of a data set, and is no folder; set the data's root"
-    ):
-        find_folder(root)
-    with pytest.raises(FileNotFoundError, match="must be a table, and is no file; set the data's file"):
-        find_file(root, "a table")
+    for find in (find_folder, lambda path: find_file(path, "a table")):
+        with pytest.raises(FileNotFoundError, match=r"and is no (folder|file); set the data's (root|file)"):
+            find(root)
 
 
 def test_a_folder_to_write_is_empty_or_missing(tmp_path):
@@ -129,14 +92,9 @@ def test_an_index_is_a_whole_number_in_decimals(text, index):
 @pytest.mark.parametrize(
     ("train", "test", "message"),
     [
-        (
-            "1\n2\n",
-            "3\n2\n",
-            r"test_index\.txt, line 2: expected each entry once, got '2', .* in train_index.txt, line 2",
-        ),
+        ("1\n2\n", "3\n2\n", r"test_index\.txt, line 2: .* once, got '2', .* in train_index.txt, line 2"),
         ("1\n01\n1\n", "3", r"train_index\.txt, line 2 and 1 other line: expected each entry once"),
         ("1\n\n2\n", "3", r"train_index\.txt, line 2: expected an index, got ''"),
-        ("1\n2\n", "\n", r"test_index\.txt: empty; expected an index"),
     ],
 )
 def test_index_files_hold_each_entry_once(tmp_path, train, test, message):
@@ -147,9 +105,3 @@ def test_index_files_hold_each_entry_once(tmp_path, train, test, message):
     (tmp_path / "train_index.txt").write_text("4\r\n 1\n")
     (tmp_path / "test_index.txt").write_text("2 \n\n")
     assert read_parts(tmp_path, to_index, "an index") == ([4, 1], [2])
-
-
-def test_places_are_numbered_in_their_order():
-    places, index = number_places([[1, 2], [0, 0], [1, 2]])
-    assert places == [(1, 2), (0, 0)]
-    assert index.tolist() == [0, 1, 0]

@@ -1,4 +1,4 @@
-"""Traced paths, kept on disk: they are the same for every spectrum, bandwidth and number of subcarriers."""
+"""Traced paths, stored on disk: they are the same for every spectrum, bandwidth and number of subcarriers."""
 
 import hashlib
 import json
@@ -25,27 +25,10 @@ VERSION = 1
 """Version of the files; to be raised with every change of ``tracing`` that changes its paths."""
 
 
-def folder() -> Path:
-    """Folder of the files: gaigs/sionna in the user's folder of caches."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "gaigs" / "sionna"
-
-
 def find_paths(
     room: MeshRoom, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
 ) -> Paths:
-    """The paths in a room, traced the first time and read afterwards.
-
-    Args:
-        room: Walls and furniture.
-        receiver: Position [m].
-        transmitters: Positions [m].
-        frequency: Carrier [Hz].
-
-    Raises:
-        ImportError, RuntimeError: As for ``tracing.trace``; the packages are needed in any case, since paths belong
-            to their versions.
-        ValueError: The frequency is out of range, or the file is damaged.
-    """
+    """The paths in a room, traced by ``tracing.trace`` the first time and read by ``keep`` afterwards."""
     key = {
         "meshes": [(mesh.material, mesh.vertices, mesh.faces) for mesh in room.meshes()],
         "thickness": tracing.THICKNESS,
@@ -64,25 +47,19 @@ def find_paths(
 
 
 def keep(key: Mapping[str, object], make: Callable[[], dict[str, np.ndarray]], task: str) -> dict[str, np.ndarray]:
-    """Arrays by name, made the first time and read afterwards.
+    """Arrays by name from a file in ``$XDG_CACHE_HOME/gaigs/sionna``, which is made the first time.
 
-    Args:
-        key: Everything that the arrays depend on beside the packages that trace, as JSON takes it.
-        make: Function that makes them.
-        task: Description of the making, for the log.
-
-    Raises:
-        ImportError: A package that traces is not installed.
-        ValueError: The file is damaged.
+    The key has all that the arrays depend on beside the packages, as JSON; ``task`` names the computation in the log. A
+    damaged file is a ``ValueError``.
     """
     key = {"version": VERSION, "packages": tracing.find_packages(), **key}
-    file = folder() / f"{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:32]}.npz"
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "gaigs" / "sionna"
+    file = folder / f"{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:32]}.npz"
     if not file.is_file():
         log.info("%s; next time they are read from %s", task, file)
         arrays = make()
         file.parent.mkdir(parents=True, exist_ok=True)
-        # Another process may make the same file at the same time: each writes a file of its own, and the first stays,
-        # since two tracings differ a little.
+        # Two processes may trace at once, with slightly different results: the first file stays.
         with tempfile.TemporaryDirectory(dir=file.parent) as own:
             with open(f"{own}/paths.npz", "wb") as stream:
                 np.savez_compressed(stream, **arrays)

@@ -1,5 +1,6 @@
-"""Rooms that are no boxes, as meshes of planar faces: an L, one with a leaning wall, one full of furniture."""
+"""Rooms of any shape as meshes of planar faces."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ THICKNESS = {
 """Thickness of the slab behind a face of each material [m]; furniture is hollow, of boards."""
 
 WALL_MARGIN, FURNITURE_MARGIN = 0.3, 0.05
-"""Least distance of transmitters from walls and from furniture [m]."""
+"""Smallest distance of transmitters from walls and from furniture [m]."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +33,9 @@ class Mesh:
     """One object of one material.
 
     Attributes:
-        name: Name of the object.
         material: One of ``THICKNESS``.
         vertices: Corners, world frame [m].
-        faces: Corners of each planar convex face, counted from 0, around it.
+        faces: Corners of each planar convex face, counted from 0, in order.
     """
 
     name: str
@@ -53,7 +53,6 @@ class Cuboid:
     """An upright piece of furniture, or a part of one.
 
     Attributes:
-        name: Kind of furniture.
         material: Material of its sides, one of ``THICKNESS``.
         lower, upper: Opposite corners before the rotation, world frame [m].
         turn: Rotation about the vertical through its middle, counterclockwise [deg].
@@ -67,30 +66,26 @@ class Cuboid:
 
     def mesh(self) -> Mesh:
         """The closed mesh of its six sides; seen from outside they run counterclockwise."""
-        (cos, sin), middle = self._axes(), self._middle()
+        cos, sin, (u, v, _) = self._frame()
         corners = []
-        for k in range(8):
-            x, y, z = (
-                (self.upper if k >> axis & 1 else self.lower)[axis] - (middle[axis] if axis < 2 else 0.0)
-                for axis in range(3)
-            )
-            corners.append((round(middle[0] + cos * x - sin * y, 6), round(middle[1] + sin * x + cos * y, 6), z))
+        for z, y, x in itertools.product(*zip(self.lower[::-1], self.upper[::-1], strict=True)):
+            x, y = x - u, y - v
+            corners.append((round(u + cos * x - sin * y, 6), round(v + sin * x + cos * y, 6), z))
         sides = (0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)
         return Mesh(self.name, self.material, tuple(corners), sides)
 
     def contains(self, points: Float[Tensor, "k 3"], margin: float) -> Bool[Tensor, " k"]:
         """True for points [m] within it, or less than a margin [m] from it along its axes."""
-        (cos, sin), middle = self._axes(), points.new_tensor(self._middle())
-        x, y, z = (points - middle).unbind(-1)
+        cos, sin, middle = self._frame()
+        x, y, z = (points - points.new_tensor(middle)).unbind(-1)
         own = torch.stack((cos * x + sin * y, cos * y - sin * x, z), -1).abs()
         half = (points.new_tensor(self.upper) - points.new_tensor(self.lower)) / 2
         return (own <= half + margin).all(-1)
 
-    def _axes(self) -> tuple[float, float]:
-        return math.cos(math.radians(self.turn)), math.sin(math.radians(self.turn))
-
-    def _middle(self) -> tuple[float, ...]:
-        return tuple((low + high) / 2 for low, high in zip(self.lower, self.upper, strict=True))
+    def _frame(self) -> tuple[float, float, tuple[float, ...]]:
+        """Cosine and sine of the rotation, and the middle [m]."""
+        middle = tuple((low + high) / 2 for low, high in zip(self.lower, self.upper, strict=True))
+        return math.cos(math.radians(self.turn)), math.sin(math.radians(self.turn)), middle
 
 
 @dataclass(frozen=True)
@@ -104,9 +99,7 @@ class MeshRoom:
         convex: Corners of the convex parts of floor and ceiling.
         walls: Material of each wall, from a corner to the next.
         slabs: Materials of floor and ceiling.
-        furniture: Cuboids in the room.
-        antenna: Position of the receiver with the array [m], the point that it faces [m], and its rotation about its
-            normal [deg].
+        antenna: Position of the array [m], the point that it faces [m], and its rotation about its normal [deg].
         gateways: Positions of the receivers with a single antenna, by name [m].
     """
 
@@ -118,7 +111,7 @@ class MeshRoom:
     slabs: tuple[str, str]
     furniture: tuple[Cuboid, ...]
     antenna: tuple[tuple[float, float, float], tuple[float, float, float], float]
-    gateways: tuple[tuple[str, tuple[float, float, float]], ...]
+    gateways: dict[str, tuple[float, float, float]]
 
     def meshes(self) -> list[Mesh]:
         """Walls, floor, ceiling and furniture. Neighbouring walls of one material are one mesh, with a true edge."""
@@ -147,7 +140,7 @@ class MeshRoom:
         outline = torch.lerp(points.new_tensor(self.floor), points.new_tensor(self.ceiling), share[..., None])
         start, end = outline, outline.roll(-1, 1)  # of each wall, at the height of each point
         along, to = end - start, points[:, None, :2] - start
-        # Even-odd rule: how many walls a ray along x meets.
+        # Even-odd rule: the number of walls that a ray along x meets.
         above, below = start[..., 1] > points[:, None, 1], end[..., 1] > points[:, None, 1]
         cross = along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
         meets = (above != below) & ((cross > 0) == (end[..., 1] > start[..., 1]))
@@ -167,8 +160,8 @@ def _compact(mesh: Mesh) -> Mesh:
 
 
 def edges(meshes: Sequence[Mesh]) -> Float[Tensor, "k 2 3"]:
-    """Outlines of meshes [m]: each edge once, and none between two faces of a mesh that lie in one plane."""
-    lines = {}
+    """Outlines of meshes [m]: each edge once, without those between two coplanar faces of a mesh."""
+    lines: dict[tuple, None] = {}
     for mesh in meshes:
         corners = torch.tensor(mesh.vertices, dtype=torch.float64)
         normals: dict[tuple[int, int], list[Tensor]] = {}
@@ -177,7 +170,7 @@ def edges(meshes: Sequence[Mesh]) -> Float[Tensor, "k 2 3"]:
             for start, end in zip(face, (*face[1:], face[0]), strict=True):
                 normals.setdefault((min(start, end), max(start, end)), []).append(normal / normal.norm())
         for (start, end), found in normals.items():
-            # Of planes alike the normals' product has length 1, but for rounding.
+            # The product of coplanar faces' normals is 1 or -1, up to rounding.
             if len(found) < 2 or (found[0] @ found[1]).abs() < 1 - 1e-9:
                 lines[tuple(sorted((mesh.vertices[start], mesh.vertices[end])))] = None
     return torch.tensor([*lines])

@@ -52,12 +52,7 @@ L_SHAPE = MeshRoom(
         Cuboid("sofa", "wood", (2.7, 4.4, 0.0), (3.6, 6.0, 0.75)),
     ),
     antenna=((7.75, 3.15, 2.5), (2.4, 2.0, 0.4), 30.0),
-    gateways=(
-        ("east", (7.9, 0.9, 2.2)),
-        ("south", (3.0, 0.1, 1.4)),
-        ("corner", (3.7, 6.2, 2.3)),
-        ("west", (0.1, 2.6, 1.8)),
-    ),
+    gateways={"east": (7.9, 0.9, 2.2), "south": (3.0, 0.1, 1.4), "corner": (3.7, 6.2, 2.3), "west": (0.1, 2.6, 1.8)},
 )
 """An L of 8 x 6.6 m: waves from one arm arrive around the corner alone."""
 
@@ -76,12 +71,7 @@ SLANTED = MeshRoom(
         Cuboid("screen", "glass", (2.9, 2.0, 0.0), (2.96, 3.2, 1.7), -30.0),
     ),
     antenna=((0.25, 0.25, 2.6), (4.3, 3.2, 0.5), -50.0),
-    gateways=(
-        ("west", (0.1, 4.2, 2.3)),
-        ("south", (2.4, 0.1, 1.5)),
-        ("north", (3.6, 5.1, 2.2)),
-        ("slope", (5.3, 1.4, 1.9)),
-    ),
+    gateways={"west": (0.1, 4.2, 2.3), "south": (2.4, 0.1, 1.5), "north": (3.6, 5.1, 2.2), "slope": (5.3, 1.4, 1.9)},
 )
 """A room under a roof of 6.8 x 5.2 m: its east wall leans inwards by 29 degrees and is oblique in plan by 9."""
 
@@ -118,12 +108,7 @@ FURNISHED = MeshRoom(
         *_stool("stool 5", 5.8, 2.0, -35.0),
     ),
     antenna=((7.35, 0.3, 2.45), (2.2, 3.3, 0.4), 70.0),
-    gateways=(
-        ("west", (0.1, 2.2, 2.2)),
-        ("south", (3.6, 0.1, 1.6)),
-        ("east", (7.5, 3.6, 2.4)),
-        ("north", (3.7, 5.5, 2.0)),
-    ),
+    gateways={"west": (0.1, 2.2, 2.2), "south": (3.6, 0.1, 1.6), "east": (7.5, 3.6, 2.4), "north": (3.7, 5.5, 2.0)},
 )
 """A flat of one room, 7.6 x 5.6 m, with 22 pieces of furniture that block many paths."""
 

@@ -7,12 +7,14 @@ import sys
 from collections.abc import Sequence
 from glob import glob
 from importlib import metadata
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from gaigs.antenna import Receiver
 from gaigs.data.simulation import sample_band
@@ -27,19 +29,15 @@ CHUNK = 10
 """Transmitters traced at a time. Chains of surfaces to all of them share a table, in which some displace others."""
 
 RAYS, CANDIDATES = 500_000, 1_000_000
-"""Rays shot from a receiver for each chunk, and chains tried, which is the size of that table too. For 50 transmitters
-with 4,000 chains, 80 to each, 1 to 6 dB of the power would be missing at one place in ten."""
+"""Rays from a receiver for each chunk, and chains tried, which is also the size of that table: 50 transmitters with 80
+chains each would lose 1 to 6 dB of the power at one place in ten."""
 
 WEAKEST = 1e-4
-"""Share of a transmitter's power that its weakest paths may have together to be left out, two in three of them."""
+"""Fraction of a transmitter's power in the weakest paths that are left out: two thirds of its paths."""
 
 
 def find_packages() -> dict[str, str]:
-    """Versions of the packages that trace, by name.
-
-    Raises:
-        ImportError: One is not installed.
-    """
+    """Versions of the packages that trace, by name; an ``ImportError`` if one is not installed."""
     try:
         return {name: metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
     except metadata.PackageNotFoundError as error:
@@ -47,19 +45,15 @@ def find_packages() -> dict[str, str]:
 
 
 def find_llvm() -> str:
-    """The file of libLLVM to compile the ray tracer's kernels: that of DRJIT_LIBLLVM_PATH, else the newest.
-
-    Raises:
-        RuntimeError: There is no libLLVM, or no new one.
-    """
+    """The libLLVM for the ray tracer's kernels: DRJIT_LIBLLVM_PATH, else the newest; a ``RuntimeError`` before 17."""
     oldest = 17  # with 15 and 16 the process aborts at the first kernel
     chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
     folders = f"{sys.prefix}/lib", "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib/llvm-*/lib", "/usr/local/lib"
     names = "libLLVM.so*", "libLLVM-[0-9]*.so*", "libLLVM.dylib"
     files = [chosen] if chosen else [file for folder in folders for name in names for file in glob(f"{folder}/{name}")]
     versions = {file: llvm_version(file) for file in dict.fromkeys(map(os.path.realpath, files))}
-    newest = max(versions, key=versions.get, default=None)
-    if newest is None or versions[newest] < oldest:
+    newest = max(versions, key=versions.__getitem__, default="")
+    if versions.get(newest, 0) < oldest:
         found = ", ".join(f"{file} ({version or 'no libLLVM of 16 or later'})" for file, version in versions.items())
         raise RuntimeError(
             f"the ray tracer needs libLLVM {oldest} or later, got {found or 'none'}; install it (Debian: apt-get "
@@ -69,10 +63,7 @@ def find_llvm() -> str:
 
 
 def llvm_version(file: str) -> int:
-    """Major version of a libLLVM; 0 if it is older than 16 or cannot be loaded.
-
-    Another process loads it, because an old one would make this process abort.
-    """
+    """Major version of a libLLVM, 0 before 16 and if loading fails; an old one aborts the process that loads it."""
     code = (
         "import ctypes, sys; number = ctypes.c_uint(); "
         "ctypes.CDLL(sys.argv[1]).LLVMGetVersion(ctypes.byref(number), None, None); print(number.value)"
@@ -84,21 +75,12 @@ def llvm_version(file: str) -> int:
 def trace(
     meshes: Sequence[Mesh], receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
 ) -> Paths:
-    """The paths from transmitters to a receiver point, by shooting and bouncing rays and the image method.
+    """The paths at a carrier [Hz] from transmitters to a receiver point [m], strongest first; gains are padded with 0.
 
     By reciprocity the rays leave the single receiver. Both ends have an isotropic, vertically polarised antenna: its
     field runs along the meridians about the vertical. A path that is reflected and passes through surfaces equals a
     straight one from an image of the transmitter, at the path's length in the direction of arrival. Length and
     direction of a diffracted path are exact at the receiver point, and its wave is more curved than that of its image.
-
-    Args:
-        meshes: Surfaces of the room.
-        receiver: Position [m].
-        transmitters: Positions [m].
-        frequency: Carrier [Hz].
-
-    Returns:
-        Paths by falling strength; gains are padded with 0.
 
     Raises:
         ImportError: Sionna RT is not installed.
@@ -122,22 +104,12 @@ def trace(
         scene.remove(names)
     if deaf := [k for k, (_, gains) in enumerate(found) if not len(gains)]:
         raise ValueError(f"a path must lead to each transmitter, got none to {transmitters[deaf[0]].tolist()}; move it")
-    most = max(len(gains) for _, gains in found)
-    images = receiver.double() + torch.ones(len(found), most, 3, dtype=torch.float64)
-    padded = torch.zeros(len(found), most, dtype=torch.complex128)
-    for row, (places, gains) in enumerate(found):
-        images[row, : len(gains)] = torch.from_numpy(places)
-        padded[row, : len(gains)] = torch.from_numpy(gains)
-    return Paths(images, padded)
+    images = pad_sequence([torch.from_numpy(places) for places, _ in found], batch_first=True, padding_value=1e3)
+    return Paths(images, pad_sequence([torch.from_numpy(gains) for _, gains in found], batch_first=True))
 
 
-def find_sionna():
-    """The module ``sionna.rt``, which computes on the processor.
-
-    Raises:
-        ImportError: Sionna RT is not installed.
-        RuntimeError: There is no libLLVM that it can use.
-    """
+def find_sionna() -> Any:
+    """The module ``sionna.rt``, set to compute on the processor; errors as for ``trace``."""
     find_packages()
     os.environ["DRJIT_LIBLLVM_PATH"] = find_llvm()  # read once, when the first kernel is compiled
     import mitsuba
@@ -148,39 +120,20 @@ def find_sionna():
     return rt
 
 
-def make_scene(meshes: Sequence[Mesh], frequency: float):
-    """A scene of Sionna RT, on the processor, with isotropic, vertically polarised antennas.
-
-    The object of mesh k is called ``mesh <k>``.
-
-    Args:
-        meshes: Surfaces of the room.
-        frequency: Carrier [Hz].
-
-    Raises:
-        ImportError, RuntimeError: As for ``find_sionna``.
-        ValueError: The frequency is out of range.
-    """
+def make_scene(meshes: Sequence[Mesh], frequency: float) -> Any:
+    """A scene of Sionna RT at a carrier [Hz], with isotropic, vertically polarised antennas; mesh k is ``mesh <k>``."""
     low, high = 0.3e9, 40e9  # below, furniture is no larger than the wavelength; above, materials are not tabulated
     if not low <= frequency <= high:
         raise ValueError(f"frequency must lie in {low:g}..{high:g} Hz, got {frequency:.6g}")
     rt = find_sionna()
+    import mitsuba
+
     scene = rt.load_scene()
     scene.frequency = frequency
-    _furnish(scene, meshes, frequency)
     scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-    return scene
-
-
-def _furnish(scene, meshes: Sequence[Mesh], frequency: float) -> None:
-    """Adds meshes to a scene, with numbers for materials: Sionna's own table refuses frequencies below 1 GHz."""
-    import mitsuba
-    from sionna import rt
-
-    objects = []
-    materials = {}
+    objects, materials = [], {}
     for name in sorted({mesh.material for mesh in meshes}):
-        permittivity, c, d = MATERIALS[name]
+        permittivity, c, d = MATERIALS[name]  # Sionna's own table refuses frequencies below 1 GHz
         materials[name] = rt.RadioMaterial(name, THICKNESS[name], permittivity, c * (frequency / 1e9) ** d)
     for number, mesh in enumerate(meshes):
         triangles = mesh.triangles()
@@ -194,9 +147,10 @@ def _furnish(scene, meshes: Sequence[Mesh], frequency: float) -> None:
         parameters.update()
         objects.append(rt.SceneObject(mi_mesh=shape, name=f"mesh {number}", radio_material=materials[mesh.material]))
     scene.edit(add=objects)
+    return scene
 
 
-def _strongest(paths, receiver: np.ndarray, wavelength: float) -> list[tuple[np.ndarray, np.ndarray]]:
+def _strongest(paths: Any, receiver: np.ndarray, wavelength: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Images (p, 3) [m] and gains (p,) of each transmitter's paths, without the weakest."""
     fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, 0, 0]
     lengths, zenith, azimuth = (array.numpy()[:, 0].astype(float) for array in (paths.tau, paths.theta_t, paths.phi_t))
@@ -219,14 +173,8 @@ def respond(
 ) -> Complex[Tensor, "b elements f"]:
     """Field at each element of a receiver's array along paths from unit-power transmitters.
 
-    The phase is that of a spherical wave from each image to each element; gains are those at the carrier, and so are
-    the elements' pattern at the array's centre.
-
-    Args:
-        paths: To the array's centre, at the carrier.
-        receiver: Pose and array.
-        frequency: Carrier [Hz].
-        offsets: Frequencies to evaluate, relative to the carrier [Hz].
+    The phase is that of a spherical wave from each image to each element. Gains and the elements' pattern are those of
+    paths to the array's centre at the carrier; ``offsets`` are relative to it [Hz].
 
     Raises:
         ValueError: A frequency is not positive.
@@ -246,10 +194,6 @@ def respond(
 
 
 def frequency_offsets(meshes: Sequence[Mesh], bandwidth: float) -> Float[Tensor, " f"]:
-    """Frequencies that sample a band, relative to its middle [Hz]; dense enough to alias no beat of two paths.
-
-    Raises:
-        ValueError: The bandwidth is not positive.
-    """
+    """Frequencies that sample a band, as by ``sample_band``, for the longest path among meshes."""
     corners = torch.tensor([corner for mesh in meshes for corner in mesh.vertices], dtype=torch.float64)
     return sample_band(bandwidth, (DEPTH + 1) * (corners.amax(0) - corners.amin(0)).norm().item())

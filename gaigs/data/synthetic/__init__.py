@@ -1,7 +1,7 @@
 """The built-in scene: a furnished room, simulated by the image-source method."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Float
@@ -10,14 +10,7 @@ from torch import Tensor
 from gaigs.antenna import Receiver
 from gaigs.data import Links
 from gaigs.data.readings import gateway
-from gaigs.data.simulation import (
-    PART,
-    SimulatedRoom,
-    check_spectrum,
-    draw_places,
-    simulate_spectra,
-    to_spectra,
-)
+from gaigs.data.simulation import PART, SimulatedRoom, draw_places, simulate_spectra, spectrum_offsets, to_spectra
 from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond
 from gaigs.geometry import Grid, Pose
 from gaigs.registry import register
@@ -66,7 +59,8 @@ def furnished_room(
     Each place sends at each carrier, and these links share a row.
 
     Args:
-        spectrum: ``band`` or ``carrier``, see ``spectra``.
+        spectrum: ``band``: power averaged over the band, as a channel sounder reports it; paths whose lengths differ by
+            more than speed of light / bandwidth do not interfere. ``carrier``: one frequency, with small-scale fading.
         transmitters: Number of places.
         frequency: One carrier or several [Hz]. The elements are half a wavelength of the highest apart.
         bandwidth: Width of the band around each carrier [Hz].
@@ -84,23 +78,24 @@ def furnished_room(
 
 def default_room(order: int) -> SimulatedRoom:
     """The default room with paths of at most ``order`` reflections."""
+
+    def respond_in_parts(places: Tensor, receiver: Receiver, frequency: float, offsets: Tensor) -> Iterator[Tensor]:
+        return (respond(ROOM, part, receiver, frequency, offsets, order) for part in places.split(PART))
+
     return SimulatedRoom(
         pose=POSE,
         gateways=tuple(gateway(name, position) for name, position in GATEWAYS.items()),
         edges=edges(ROOM),
         place=place,
         frequency_offsets=lambda bandwidth: frequency_offsets(ROOM, bandwidth, order),
-        respond=lambda places, *rest: (respond(ROOM, part, *rest, order) for part in places.split(PART)),
+        respond=respond_in_parts,
     )
 
 
 def place(count: int, seed: int) -> Float[Tensor, "count 3"]:
-    """Random places in the default room [m], uniform over the part of ``REGION`` that is free of furniture.
-
-    Raises:
-        ValueError: There are fewer than 2.
-    """
-    return draw_places(*torch.tensor(REGION), lambda points: is_free(ROOM, points), count, seed)
+    """Random places in the default room [m], uniform over the part of ``REGION`` that is free of furniture."""
+    lower, upper = torch.tensor(REGION)
+    return draw_places(lower, upper, lambda points: is_free(ROOM, points), count, seed)
 
 
 def spectra(
@@ -113,25 +108,12 @@ def spectra(
     bandwidth: float,
     order: int,
 ) -> Float[Tensor, "n rows columns"]:
-    """Labels of transmitters in any room, float32 in [0, 1].
-
-    Args:
-        room: Walls and furniture.
-        transmitters: Positions [m].
-        receiver: Pose and array.
-        grid: Directions of the pixels.
-        spectrum: ``band``: power averaged over the band, as a channel sounder reports it; paths whose lengths differ by
-            more than speed of light / bandwidth do not interfere, so lobes follow the room's geometry. ``carrier``: one
-            frequency, with all of the small-scale fading.
-        frequency: Carrier [Hz].
-        bandwidth: Width of the band around the carrier [Hz].
-        order: Largest number of reflections of a path.
+    """Spectra of transmitters [m] in any room, float32 in [0, 1]; the options are those of ``furnished_room``.
 
     Raises:
         ValueError: An option is out of range, or a transmitter does not stand free in the room.
     """
-    check_spectrum(spectrum)
-    offsets = frequency_offsets(room, bandwidth, order) if spectrum == "band" else torch.zeros(1)
+    offsets = spectrum_offsets(spectrum, lambda width: frequency_offsets(room, width, order), bandwidth)
     responses = (respond(room, part, receiver, frequency, offsets, order) for part in transmitters.split(PART))
     return to_spectra(responses, grid, receiver.array, frequency)
 
@@ -148,6 +130,8 @@ def edges(room: Room) -> Float[Tensor, "k 2 3"]:
 
 def wavefront_obj(room: Room) -> str:
     """The room as a Wavefront OBJ file [m]: one object a cuboid, with each wall's material."""
+    # Corners from 1 of the faces in the order of ``Room.walls``, counterclockwise as seen from outside.
+    sides = (1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)
     lines = []
     cuboids = [("room", (0.0, 0.0, 0.0), room.size, room.walls)]
     cuboids += [(box.name, box.lower, box.upper, (f"loss_{box.loss_db:g}_db",) * 6) for box in room.furniture]
@@ -155,11 +139,6 @@ def wavefront_obj(room: Room) -> str:
         lines.append(f"o {name}")
         corners = itertools.product(*zip(lower, upper, strict=True))
         lines += [f"v {x:g} {y:g} {z:g}" for x, y, z in corners]
-        for face, material in zip(FACES, materials, strict=True):
+        for face, material in zip(sides, materials, strict=True):
             lines += [f"usemtl {material}", "f " + " ".join(str(8 * number + corner) for corner in face)]
     return "\n".join(lines) + "\n"
-
-
-FACES = ((1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4))
-"""Corners of a cuboid's faces, counted as OBJ files count them, in the order of ``Room.walls``; seen from outside they
-run counterclockwise."""

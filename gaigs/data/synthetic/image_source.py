@@ -1,7 +1,4 @@
-"""The image-source method in a furnished box room: paths and responses of antenna arrays, in float64.
-
-docs/data.md has the formulas and their limits.
-"""
+"""The image-source method in a furnished box room, in float64; docs/data.md has the formulas and their limits."""
 
 import itertools
 import math
@@ -33,9 +30,8 @@ class Box:
     """A piece of furniture: a cuboid along the room's axes that dims every wave passing through it.
 
     Attributes:
-        name: Kind of furniture.
         lower, upper: Opposite corners, world frame [m].
-        loss_db: Penetration loss of one passage, however short [dB].
+        loss_db: Penetration loss of one passage of any length [dB].
     """
 
     name: str
@@ -51,7 +47,6 @@ class Room:
     Attributes:
         size: Extent along x, y and z [m].
         walls: Materials of the walls at x = 0, x = size, y = 0, y = size, of the floor and of the ceiling.
-        furniture: Cuboids in the room.
     """
 
     size: tuple[float, float, float]
@@ -60,10 +55,10 @@ class Room:
 
 
 def permittivity(material: str, frequency: float) -> complex:
-    """Complex relative permittivity of a building material at a frequency [Hz], time dependence exp(+j omega t).
+    """Complex relative permittivity of a material at a frequency [Hz], time dependence exp(+j omega t).
 
     Raises:
-        ValueError: The material is unknown, or the frequency outside the range of the tables.
+        ValueError: The material is unknown, or the frequency is outside the tables.
 
     Source: ITU-R P.2040-3, section 2.1.4.
     """
@@ -76,30 +71,26 @@ def permittivity(material: str, frequency: float) -> complex:
 
 
 def cells(order: int) -> Int[Tensor, "p 3"]:
-    """Mirrored copies of the room at the ends of paths with at most ``order`` reflections; the room itself is first.
-
-    Cell (i, j, k) lies i rooms along x, j along y and k along z; |i| + |j| + |k| is the number of reflections.
-    """
+    """Mirrored copies of the room, i along x, j along y, k along z, by |i| + |j| + |k| <= order reflections."""
     steps = range(-order, order + 1)
     found = [cell for cell in itertools.product(steps, repeat=3) if sum(map(abs, cell)) <= order]
     return torch.tensor(sorted(found, key=lambda cell: sum(map(abs, cell))))
 
 
-def mirror(points: Float[Tensor, "*batch 3"], cell: Int[Tensor, "*batch 3"], size: Float[Tensor, "3"]) -> Tensor:
+def mirror(points: Float[Tensor, "*#batch 3"], cell: Int[Tensor, "*#batch 3"], size: Float[Tensor, "3"]) -> Tensor:
     """Positions of the room's points [m] in a mirrored copy of it."""
     return cell * size + torch.where(cell % 2 == 0, points, size - points)
 
 
 def passes(
-    start: Float[Tensor, "*batch 3"],
-    end: Float[Tensor, "*batch 3"],
-    lower: Float[Tensor, "*batch 3"],
-    upper: Float[Tensor, "*batch 3"],
+    start: Float[Tensor, "*#batch 3"],
+    end: Float[Tensor, "*#batch 3"],
+    lower: Float[Tensor, "*#batch 3"],
+    upper: Float[Tensor, "*#batch 3"],
 ) -> Tensor:
-    """True for segments from ``start`` to ``end`` that pass through the inside of cuboids along the axes; exact.
+    """True for segments from ``start`` to ``end`` that pass through the inside of cuboids along the axes.
 
-    A segment meets each pair of faces' planes at two fractions of its length; it is inside between the last entry and
-    the first exit. A segment within a face has 0 / 0 there, hence NaN, and does not pass.
+    It lies between the last entry and the first exit. A segment within a face has 0 / 0, hence NaN, and does not pass.
     """
     ray = end - start
     first, second = (lower - start) / ray, (upper - start) / ray
@@ -124,21 +115,14 @@ class Paths:
 def trace(
     room: Room, transmitters: Float[Tensor, "b 3"], receiver: Float[Tensor, "3"], frequency: float, order: int
 ) -> Paths:
-    """Every path with at most ``order`` reflections.
+    """Every path with at most ``order`` reflections between positions [m], with gains at a frequency [Hz].
 
-    The field is vertically polarised: TE at the four walls, TM at floor and ceiling. Instead of folding a path at the
-    walls, the furniture is mirrored with the room: a path stays the straight line from the receiver to an image.
-
-    Args:
-        room: Walls and furniture.
-        transmitters: Positions [m].
-        receiver: Position [m].
-        frequency: Frequency of the reflections [Hz].
-        order: Largest number of reflections.
+    The field is vertically polarised: TE at the four walls, TM at floor and ceiling. The furniture is mirrored with the
+    room, so a path is the straight line from the receiver to an image.
 
     Raises:
-        ValueError: A transmitter or the receiver is not inside the room, or is inside a piece of furniture; the order
-            is negative; a material is unknown or not tabulated at the frequency.
+        ValueError: A transmitter or the receiver is outside the room or inside furniture; the order is negative; a
+            material is unknown or not tabulated at the frequency.
 
     Source: Allen and Berkley, Image method for efficiently simulating small-room acoustics, 1979; ITU-R P.2040-3.
     """
@@ -146,7 +130,12 @@ def trace(
         raise ValueError(f"order must be the largest number of reflections, 0 or more, got {order}")
     transmitters, receiver = transmitters.double(), receiver.double()
     size = transmitters.new_tensor(room.size)
-    check_free(room, torch.cat((receiver[None], transmitters)))
+    points = torch.cat((receiver[None], transmitters))
+    if len(blocked := points[~is_free(room, points)]):
+        raise ValueError(
+            f"transmitters and receiver must lie inside the room of {room.size} m and outside its furniture, "
+            f"got {blocked[0].round(decimals=4).tolist()}; move it"
+        )
     cell = cells(order).to(size.device)
     images = mirror(transmitters[:, None], cell, size)
     rays = images - receiver
@@ -156,7 +145,7 @@ def trace(
     for wall, material in enumerate(room.walls):
         axis, side = divmod(wall, 2)
         te, tm = fresnel(permittivity(material, frequency), cosines[..., axis])
-        # Of m reflections between two opposite walls the one on the image's side takes the odd one.
+        # The wall on the image's side takes the odd one of m reflections between two opposite walls.
         towards = cell[:, axis] > 0 if side else cell[:, axis] < 0
         bounces = (cell[:, axis].abs() + towards) // 2
         gains = gains * (tm if axis == 2 else te) ** bounces
@@ -170,17 +159,6 @@ def trace(
     return Paths(images, gains)
 
 
-def check_free(room: Room, points: Float[Tensor, "k 3"]) -> None:
-    """Raises a ValueError unless all points lie inside the room and outside its furniture."""
-    free = is_free(room, points)
-    if not free.all():
-        point = [round(value, 4) for value in points[~free][0].tolist()]
-        raise ValueError(
-            f"transmitters and receiver must lie inside the room of {room.size} m and outside its furniture, "
-            f"got {point}; move it"
-        )
-
-
 def is_free(room: Room, points: Float[Tensor, "*batch 3"]) -> Tensor:
     """True for points inside the room and outside its furniture."""
     free = ((points > 0) & (points < points.new_tensor(room.size))).all(-1)
@@ -190,11 +168,7 @@ def is_free(room: Room, points: Float[Tensor, "*batch 3"]) -> Tensor:
 
 
 def frequency_offsets(room: Room, bandwidth: float, order: int) -> Float[Tensor, " f"]:
-    """Frequencies that sample a band, relative to its middle [Hz]; dense enough to alias no beat of two paths.
-
-    Raises:
-        ValueError: The bandwidth is not positive.
-    """
+    """Frequencies that sample a band, as by ``sample_band``, for the longest path of the room."""
     return sample_band(bandwidth, (order + 1) * math.hypot(*room.size))
 
 
@@ -208,16 +182,8 @@ def respond(
 ) -> Complex[Tensor, "b elements f"]:
     """Field at each element of a receiver's array from a unit-power isotropic transmitter.
 
-    The phase is that of a spherical wave from each image to each element; reflection, penetration and the elements'
-    pattern are those at the array's centre.
-
-    Args:
-        room: Walls and furniture.
-        transmitters: Positions [m].
-        receiver: Pose and array.
-        frequency: Carrier [Hz].
-        offsets: Frequencies to evaluate, relative to the carrier [Hz].
-        order: Largest number of reflections.
+    The phase is that of a spherical wave from each image to each element. Reflection, penetration and the elements'
+    pattern are those at the carrier [Hz] and the array's centre; ``offsets`` are relative to the carrier [Hz].
 
     Raises:
         ValueError: A frequency is not positive, or as for ``trace``.

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.io.meshes import read_obj
-from gaigs.io.walls import read_walls
+from gaigs.io.tables import read_walls
 
 SHORTEST = 1e-3
 """Length below which walls and edges of faces have no direction [m]."""
