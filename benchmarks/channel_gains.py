@@ -5,7 +5,7 @@
 
 Gains are fitted to the training links, scores are of the validation links, a quarter of those that are not tested on.
 Prints a table in Markdown: median SNR and mean SINAD [dB], and by how much the gain changes [dB] where one training
-link is 1e-6 of what it was, ten are 1e-3, and one is 1e3. docs/results.md has the numbers.
+link is scaled by 1e-6, ten by 1e-3, and one by 1e3. docs/results.md has the numbers.
 """
 
 import sys
@@ -47,7 +47,7 @@ FITS = {
 
 
 def channels(links: Links, index: Tensor) -> tuple[Channels, Channels]:
-    """Labels, and what free space would give."""
+    """Labels, and channels of free space."""
     query, scene = links.query[index], links.scene
     waves = direct_gains(scene, query)[:, None, None] * direct_waves(scene, query, scene.task.frequencies)
     return links.labels[index].to(torch.complex128).flatten(1), waves.flatten(1)

@@ -35,7 +35,7 @@ POOLINGS = {"spectrum": "array_response", "rssi": "mean_power", "csi": "element_
 """Pooling of maps by task."""
 
 MAPS = 8
-"""Links of which maps are drawn at a time: a rasterizer takes one after the other anyway."""
+"""Links whose maps are drawn at a time: a rasterizer takes one after the other."""
 
 
 def build(overrides: list[str], checkpoint: Path | None) -> tuple[Model, Links]:
@@ -98,8 +98,8 @@ def main() -> None:
     rendering, prediction = (median_times(ways, options.repeats) for ways in (renderings, predictions))
     title = f"{paths} paths, task {links.task.name}; {device_name(torch.device('cpu'))}"
     table = Table("", *map(str, rendering), title=title, box=SIMPLE_HEAD)
-    for what, times in ("rendering", rendering), ("prediction", prediction):
-        table.add_row(f"{what} [ms]", *(f"{value:.3f}" for value in times.values()))
+    for title, times in ("rendering", rendering), ("prediction", prediction):
+        table.add_row(f"{title} [ms]", *(f"{value:.3f}" for value in times.values()))
         ratios = (value / times["paths"] for value in times.values()) if "paths" in times else ()
         table.add_row("over the paths'", *(f"{ratio:.1f}" for ratio in ratios))
     console = Console()

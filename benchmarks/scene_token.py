@@ -8,7 +8,7 @@ the token side by side, with overrides of ``python -m gaigs +experiment=spectrum
 the test links are not looked at.
 
 =================  =================================================================================================
-way                what the network sees
+way                input of the network
 =================  =================================================================================================
 static             nothing: every transmitter excites the Gaussians alike
 euclidean          E(P_x), E(P_TX)
@@ -70,7 +70,7 @@ class SceneAlone(MultiviewTokenizer):
 
 @register("tokenizer", "own_tokens")
 class OwnTokens(GATokenizer):
-    """All Gaussians among the tokens, and every token read: what the paper calls the naive implementation."""
+    """All Gaussians among the tokens, and every token read: the paper's naive implementation."""
 
     def __init__(self, scene, ga: dict, euclidean: dict):
         super().__init__(scene, **{key: value for key, value in ga.items() if key != "name"})
@@ -234,11 +234,11 @@ ROWS = (
     "R² of the place, look-up",
     "R² of them from the place, linear",
     "mean SSIM of a look-up of labels",
-    "what it moves in the network's first layer, RMS, at the start",
+    "its effect in the network's first layer, RMS, at the start",
     "the same, trained",
     "gradient of a parameter behind it, RMS",
     "mean SSIM of the model without it",
-    "what another anchor moves it by, over its spread over transmitters",
+    "its change by another anchor, over its spread over transmitters",
 )
 """Rows of ``probe``."""
 

@@ -104,7 +104,7 @@ class Process:
 
     Args:
         arguments: Of the command line.
-        says: File for what it says on stderr; the rest goes beside it.
+        says: File for stderr; stdout goes beside it.
         before: Called first in the new process.
     """
 
@@ -174,7 +174,7 @@ class Process:
 
 @dataclass
 class Trial:
-    """One disturbance: at which phase it came, how the run ended, training lost [s], and what went wrong."""
+    """One disturbance: at which phase it came, how the run ended, training lost [s], and the faults found."""
 
     fault: str
     phase: str
@@ -237,7 +237,7 @@ class Soak:
         return trial
 
     def go_on(self, folder: Path, trial: Trial) -> None:
-        """Looks at what is left, has the same command go on, and looks at its end."""
+        """Checks the files left, runs the same command again, and checks its result."""
         for path in folder.rglob("*.ckpt"):
             with contextlib.suppress(FileNotFoundError):
                 if ".part" not in path.name:
@@ -280,10 +280,10 @@ class Soak:
         predictions = [dict(np.load(top / "predictions.npz")) for top in tops]
         weights = [checkpoint.read(top / "best.ckpt")["state_dict"] for top in tops]
         logs = [curves.read_curves(sorted(top.glob("log/*/metrics.csv"))) for top in tops]
-        for what, (mine, other) in {"predictions": predictions, "weights": weights, "curves": logs}.items():
+        for part, (mine, other) in {"predictions": predictions, "weights": weights, "curves": logs}.items():
             same = lambda name, a=mine, b=other: np.array_equal(a[name], b[name], equal_nan=True)
             if mine.keys() != other.keys() or not all(map(same, mine)):
-                wrong.append(f"other {what}")
+                wrong.append(f"other {part}")
         return wrong
 
     # --- faults ---
@@ -386,7 +386,7 @@ FAULTS = {
 
 
 def untimed(metrics: dict) -> dict:
-    """Metrics without what differs between two runs of the same command."""
+    """Metrics without the keys that differ between two runs of the same command."""
     values = {key: value for key, value in metrics.items() if key not in TIMED}
     return {key: untimed(value) if isinstance(value, dict) else value for key, value in values.items()}
 

@@ -77,11 +77,9 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
         None with the other commands.
 
     Raises:
-        TypeError: A value of the configuration has the wrong type.
-        ValueError: The configuration does not fit the data, the folder holds another run, or a file in it is damaged.
-        FileNotFoundError: The data do not exist.
+        TypeError, ValueError: The configuration does not fit the data, or the folder holds another run.
         ImportError: A component needs a package that is not installed.
-        OSError: A file cannot be written, e.g. because the disk is full; no partial file is left.
+        OSError: A file cannot be read or written; no partial file is left.
         KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it and SIGTERM within a training.
 
     Example:

@@ -71,17 +71,7 @@ class Agreement:
 
 
 def run(config: dict, folder: Path) -> None:
-    """Compares the labels of a data set, prints the table, and writes it with its figure.
-
-    Args:
-        config: The resolved configuration; data, split, baselines and seed are used.
-        folder: Gets ``agreement.md`` and ``agreement.png``.
-
-    Raises:
-        ValueError: The configuration does not suit the data, or the labels cannot be compared; see ``measure``.
-        FileNotFoundError: The data are missing.
-        OSError: A file cannot be written.
-    """
+    """Compares the labels of a data set, prints the table, and writes it with its figure into a folder."""
     links = load(config["data"], config["split"], config["task"]["name"])
     name, task = config["data"]["name"], links.task
     log.info("data: %s, %s links%s", name, f"{len(links):,}", links.remarks and f"; {links.remarks}")
@@ -90,24 +80,22 @@ def run(config: dict, folder: Path) -> None:
     rows, remarks = on_split(agreement, links, random, config["baselines"])
     remarks = [f"data {name}, {len(links):,} links, seed {config['seed']}", *_remarks(agreement), *remarks]
     folder.mkdir(parents=True, exist_ok=True)
-    titles = {name: metric.title for name, metric in task.metrics().items()}
-    cells = agreement.cells(task.compared_by)
-    console = Console()
-    console.print(Markdown(write(folder, task.pair_score, titles, cells, rows, links.split.name, remarks)))
+    console, cells = Console(), agreement.cells(task.compared_by)
+    console.print(Markdown(write(folder, task, cells, rows, links.split.name, remarks)))
     console.print(f"results: {folder}", soft_wrap=True)
 
 
 def measure(
     links: Links, random: np.random.Generator, counted: int = 50_000_000, block: int = 1_000_000, most: int = 2_000
 ) -> Agreement:
-    """Counts the pairs of labels of one receiver and carrier by cell, and compares random ones of each.
+    """Counts the pairs of labels of one receiver and carrier by cell, and compares random pairs of each cell.
 
     The later label of a pair is scored with the earlier as its prediction.
 
     Args:
         links: All links in the order of the files, which counts as that of measurement.
         random: Draws the pairs.
-        counted: Largest number of pairs whose distance is computed; of more, those of random links with all others.
+        counted: Largest number of computed distances; of more pairs, those of random links with all others count.
         block: Number of distances in memory at a time.
         most: Largest number of pairs of a cell whose labels are compared; at least 30 of large labels.
 
@@ -124,16 +112,15 @@ def measure(
     edges = [np.nextafter(0, 1), round_step(median_spacing(links.query.transmitters.unique(dim=0)), 1)]
     while edges[-1] < 1.01 * extent:  # rounding takes no distance beyond
         edges.append(round_step(1.5 * edges[-1], 1))
-    limits, count = [], int(order.max()) + 1
-    while 3 * 10 ** len(limits) <= count / 10:  # nine tenths of all measurements are further apart
-        limits.append(3 * 10 ** len(limits))
+    limits = 3 * 10 ** np.arange(18)
+    limits = limits[limits <= (int(order.max()) + 1) / 10]  # nine tenths of all measurements are further apart
     shape = len(edges), len(limits) + 1
     first = np.unique(order, return_index=True)[1]
     steps = np.linalg.norm(np.diff(places[first], axis=0), axis=1)
     apart = np.linalg.norm(places[first] - places[first[random.permutation(len(first))]], axis=1)
     medians = [float(np.median(values)) if len(values) else 0.0 for values in (steps, apart)]
     share = min(1.0, counted / sum(len(group) ** 2 for group in groups))
-    empty = Agreement(np.array(edges), np.array(limits, int), np.zeros(shape, int), share, {}, *medians)
+    empty = Agreement(np.array(edges), limits, np.zeros(shape, int), share, {}, *medians)
     # SSIM of 4e8 numbers takes half a minute of one core.
     most = min(most, max(30, int(400_000_000 / math.prod((*shape, *links.task.shape)))))
     pairs, drawn = _draw(empty, places, order, groups, most, block, random)
@@ -142,10 +129,7 @@ def measure(
 
 
 def visits(links: Links) -> Int[ndarray, " n"]:
-    """Number of each link's measurement: one more where a link's row differs from that of the link before it.
-
-    A place that is measured again counts anew, though its row may not.
-    """
+    """Number of each link's measurement: one more at each change of the row, so a place measured again counts anew."""
     return np.concatenate(([0], (rows_of(links).diff() != 0).numpy().cumsum()))
 
 
@@ -161,13 +145,10 @@ def _groups(links: Links) -> list[Int[ndarray, " k"]]:
 def _draw(
     agreement: Agreement, places: ndarray, order: ndarray, groups: list[ndarray], most: int, block: int, random
 ) -> tuple[ndarray, dict[int, ndarray]]:
-    """Number of pairs of each cell, and at most ``most`` random ones of it: the earlier links and the later ones.
-
-    Each pair has a random key; the pairs with the smallest keys are drawn.
-    """
+    """Number of pairs of each cell, and the ``most`` pairs with the smallest random keys: earlier and later links."""
     size = agreement.pairs.size
     counts, bounds = np.zeros(size + 1, int), np.ones(size + 1)
-    bounds[size] = 0  # the last cell holds what is no pair
+    bounds[size] = 0  # the last cell holds links that are not a pair
     kept = {cell: (np.zeros(0), np.zeros((0, 2), int)) for cell in range(size)}
     for group in groups:
         number = math.ceil(agreement.share * len(group))
@@ -206,22 +187,14 @@ def on_split(
     baselines: list[Mapping],
     looked_up: int = 30_000_000,
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Expected metrics on the split's test links, beside those of the baselines.
+    """Expected metrics on the split's test links, beside those of the baselines, by row; and remarks.
 
     Each test link is looked up in the cell of its nearest known link of the same receiver and carrier, and stands for
-    the pairs compared there.
-
-    Args:
-        agreement: Agreement of all links.
-        links: Links with a split.
-        random: Draws the pairs.
-        baselines: Configurations of the baselines.
-        looked_up: Largest size of the known and test labels [numbers] for which the baselines are fitted.
-
-    Returns:
-        The task's metrics by row, empty if no test link can be looked up; and remarks.
+    the pairs compared there. The rows are empty if no test link can be looked up. Baselines are fitted if labels have
+    at most ``looked_up`` numbers.
     """
-    rows, remarks, task = {}, [], links.task
+    rows: dict[str, dict[str, float]] = {}
+    remarks, task = [], links.task
     distance, separation, alone = _nearest(links)
     if alone:
         remarks.append(f"{alone:,} test links have no known link of their receiver and carrier, and are left out")
@@ -261,19 +234,17 @@ def _nearest(links: Links) -> tuple[ndarray, ndarray, int]:
     """Distance [m] and separation of test links to the nearest known link, and the number of those without one."""
     places, order, test = links.query.transmitters.double().numpy(), visits(links), links.split.test.numpy()
     known = torch.cat((links.split.train, links.split.validation)).numpy()
-    distances, separations = [np.zeros(0)], [np.zeros(0)]
+    found = [(np.zeros(0), np.zeros(0))]
     for group in _groups(links):
         asked, there = np.intersect1d(group, test), np.intersect1d(group, known)
         if len(asked) and len(there):
             distance, nearest = cKDTree(places[there]).query(places[asked])
-            distances.append(distance)
-            separations.append(np.abs(order[asked] - order[there[nearest]]))
-    distances, separations = np.concatenate(distances), np.concatenate(separations)
+            found.append((distance, np.abs(order[asked] - order[there[nearest]])))
+    distances, separations = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return distances, separations, len(test) - len(distances)
 
 
 def _remarks(agreement: Agreement) -> list[str]:
-    """Remarks on the columns and on the pairs."""
     words = "in the order of the files, which counts as that of measurement"
     if not agreement.has_order:
         words = "in the order of the files, in which no place is near the one before: columns tell nothing of time"

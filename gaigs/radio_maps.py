@@ -3,24 +3,21 @@
 import math
 import time
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from numpy import ndarray
 
 from gaigs.geometry import ExtrapolationWarning
 from gaigs.io.files import atomic_write
-from gaigs.registry import check_type
 from gaigs.task import Task
 
-BATCH = 128
-"""Points predicted at a time."""
-
 POINTS = 128
-"""Approximate limit of points along the longer side of a map of no given pitch."""
+"""Approximate limit of points along the longer side of a map of no given pitch; points predicted at a time."""
 
 SECONDS, FEWEST = 60.0, 200
 """Approximate limit of the time of a map of no given pitch, unless it has fewer points than these."""
@@ -35,10 +32,10 @@ class RadioMap:
         x: One a column, world frame [m].
         y: One a row, world frame [m].
         height: Of the transmitters, world frame [m].
-        receivers: Names.
+        receivers: Names of the receivers.
         quantity: Name of the predicted quantity.
-        unit: Of a value; empty for a ratio.
-        frequency: Of the carrier [Hz]; None where it is unknown.
+        unit: Unit of a value; empty for a ratio.
+        frequency: Carrier [Hz]; None if unknown.
     """
 
     values: Float[ndarray, "receivers rows columns"]
@@ -51,13 +48,9 @@ class RadioMap:
     frequency: float | None = None
 
     def save(self, path: str | Path) -> None:
-        """Writes ``.npz`` with ``values_<unit>``, ``x``, ``y``, ``height``, ``receivers``, ``quantity`` and ``unit``.
+        """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and all other attributes that are known.
 
-        ``values_<unit>`` has the unit in lower case, e.g. ``values_dbm``; it is ``values`` where the unit is not of
-        plain letters alone. ``frequency`` [Hz] is there where it is known.
-
-        Raises:
-            OSError: It cannot be written, e.g. as the disk is full; what was there before stands.
+        The values are ``values`` if the unit has other signs than letters.
         """
         arrays = {_key(self.unit): self.values, "x": self.x, "y": self.y, "height": self.height}
         arrays |= {"receivers": self.receivers, "quantity": self.quantity, "unit": self.unit}
@@ -68,12 +61,7 @@ class RadioMap:
 
     @classmethod
     def load(cls, path: str | Path) -> "RadioMap":
-        """The inverse of ``save``.
-
-        Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: It holds something else, or is damaged.
-        """
+        """The inverse of ``save``; raises a ValueError for another or a damaged file."""
         try:
             with np.load(path) as file:
                 quantity, unit = str(file["quantity"]), str(file["unit"])
@@ -83,9 +71,7 @@ class RadioMap:
         except FileNotFoundError:
             raise
         except Exception as error:  # numpy raises many types for a file of another format
-            raise ValueError(
-                f"{path} must be a file of RadioMap.save, and is damaged or another one ({error}); make the map anew"
-            ) from error
+            raise ValueError(f"{path} is damaged or not a file of RadioMap.save: {error}") from error
 
 
 def _key(unit: str) -> str:
@@ -97,35 +83,30 @@ def has_radio_map(task: Task) -> bool:
     return task.shape == () and not task.dtype.is_complex
 
 
-MOST = 10**8
-"""Limit of points of a map: more would fill the memory."""
-
-
 def radio_map(
     model,
     pitch: float | None = None,
     height: float | None = None,
     margin: float = 0.5,
-    receivers: Sequence[str] | str | None = None,
+    receivers: str | Collection[str] | None = None,
     frequency: float | None = None,
 ) -> RadioMap:
     """Predictions on a horizontal plane over the box of training transmitters and all receivers, widened.
 
     Args:
-        model: A ``gaigs.model.Model`` of a task whose label is one real number, e.g. RSSI; fitted or loaded.
+        model: A fitted or loaded model of a task whose label is one real number, e.g. RSSI.
         pitch: Distance between neighbouring points [m]. The points are its multiples, so maps of one pitch share them.
-            None is 0.1, or more where the longer side would have over ``POINTS`` points; it is doubled until the map of
-            a slow model takes about ``SECONDS`` at most.
-        height: Of the transmitters, world frame [m]; None is half-way between the lowest and the highest of training.
+            None: 0.1, more in a room with a side above 12.8 m; doubled until the map of a slow model takes a minute.
+        height: Height of the transmitters [m]; None: half-way between the lowest and the highest of training.
         margin: Widening of the box on each side [m].
-        receivers: Names, or one name; None is all of them.
-        frequency: Of the carrier [Hz]; None is that of the training links, of several the middle one.
+        receivers: Names, or one name; None: all receivers.
+        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
 
     Warns:
         ExtrapolationWarning: The frequency is outside the training links' band.
 
     Raises:
-        TypeError: The model is not a ``gaigs.model.Model``, or an option is not of its type.
+        TypeError: The model is not a ``gaigs.Model``.
         ValueError: The model predicts something else, an option is out of range, or a receiver is unknown.
 
     Example:
@@ -136,14 +117,6 @@ def radio_map(
     """
     if not hasattr(model, "scene"):
         raise TypeError(f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint first")
-    # 0-d arrays are numbers, too.
-    pitch, height, margin = (v.item() if getattr(v, "ndim", None) == 0 else v for v in (pitch, height, margin))
-    for name, value in (("pitch", pitch), ("height", height), ("margin", margin)):
-        if not isinstance(value, float):  # an infinite one is out of range, below
-            check_type(name, value, float if name == "margin" else float | None)
-    if isinstance(receivers, Iterable) and not isinstance(receivers, str):
-        receivers = list(receivers)
-    check_type("receivers", receivers, Sequence[str] | str | None)
     scene = model.scene
     if not has_radio_map(scene.task):
         raise ValueError(
@@ -155,39 +128,39 @@ def radio_map(
     if not names or not {*names} <= {*known}:
         raise ValueError(f"receivers must be among {', '.join(known)}, got {', '.join(map(repr, names)) or 'none'}")
     lower, upper = scene.lower.double().numpy(), scene.upper.double().numpy()
+    pitch, margin = None if pitch is None else float(pitch), float(margin)
     height = float(lower[2] + upper[2]) / 2 if height is None else float(height)
     if not np.isfinite(height) or not 0 <= margin < np.inf:
         raise ValueError(f"height must be finite and margin at least 0 [m], got height {height} and margin {margin}")
     corners = np.stack((lower, upper, *(receiver.pose.position.numpy() for receiver in scene.receivers)))[:, :2]
     lower, upper = corners.min(0) - margin, corners.max(0) + margin
     longest = float((upper - lower).max())
-    if pitch is not None and not (0 < pitch <= longest and math.prod(((upper - lower) / pitch).tolist()) <= MOST):
+    if pitch is not None and not (0 < pitch <= longest and math.prod(((upper - lower) / pitch).tolist()) <= 1e8):
         raise ValueError(
-            f"pitch must be above 0, at most {longest:.3g} m, the longer side of the map, and give at most {MOST:.0e} "
+            f"pitch must be above 0, at most {longest:.3g} m, the longer side of the map, and give at most 1e+08 "
             f"points, got {pitch} m"
         )
-    # All receivers of a point in one batch, so that what a transmitter there excites is computed once.
+    # All receivers of a point in one batch, so that a transmitter's excitation is computed once.
     heard = np.array([known.index(name) for name in names])
     if frequency is None and len(scene.frequencies):
         frequency = float(scene.frequencies[len(scene.frequencies) // 2])
 
     def predict(points: ndarray) -> ndarray:
         shape = (*points.shape[:-1], len(names))
-        links = np.broadcast_to(points[..., None, :], (*shape, 3)).astype(np.float32)
-        index = np.broadcast_to(heard, shape).copy()
+        links = torch.from_numpy(np.broadcast_to(points[..., None, :], (*shape, 3)).astype(np.float32))
+        index = torch.from_numpy(np.broadcast_to(heard, shape).copy())
         with warnings.catch_warnings():
-            # The margin is asked for.
             warnings.filterwarnings("ignore", r"\d+ of \d+ positions are up to", ExtrapolationWarning)
-            return model.predict(links, index, frequency=frequency, batch_size=BATCH * len(names)).cpu().numpy()
+            return model.predict(links, index, frequency=frequency, batch_size=POINTS * len(names)).cpu().numpy()
 
     if pitch is None:
         pitch = max(0.1, longest / POINTS)
-        some = np.column_stack((np.linspace(lower, upper, BATCH), np.full(BATCH, height)))
+        some = np.column_stack((np.linspace(lower, upper, POINTS), np.full(POINTS, height)))
         with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):  # the whole map says it again
             predict(some[:1])  # the first prediction compiles and loads
             start = time.perf_counter()
             predict(some)
-        most = BATCH * SECONDS / (time.perf_counter() - start)  # points
+        most = POINTS * SECONDS / (time.perf_counter() - start)  # points
         while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, FEWEST):
             pitch *= 2
     x, y = _axes(lower, upper, pitch)

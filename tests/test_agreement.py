@@ -74,7 +74,7 @@ def test_a_jump_between_passes_is_seen_apart_from_the_slope_along_them():
     assert again.quantiles == pytest.approx((JUMP - SLOPE * STEP, JUMP, JUMP + SLOPE * STEP), abs=0.2)
 
 
-def test_what_the_cells_let_expect_on_a_split():
+def test_expected_scores_on_a_split():
     """The second pass tests: the nearest known label is always of the same place, and by the jump off."""
     links = two_passes()
     train, test = torch.arange(2 * LENGTH).split(LENGTH)
@@ -138,13 +138,7 @@ def test_of_many_pairs_random_ones_are_compared():
     assert "which counts as that of measurement" in remark
 
 
-def test_a_place_that_is_measured_again_counts_anew():
-    links = replace(two_passes(), rows=torch.tensor([0, 0, 1, 0, 2]))
-    links = replace(links, query=links.query[torch.arange(5)])
-    assert visits(links).tolist() == [0, 0, 1, 2, 3]
-
-
-def test_files_in_no_order_are_told():
+def test_files_in_no_order_are_noted():
     links = two_passes()
     shuffled = torch.randperm(len(links), generator=torch.Generator().manual_seed(0))
     links = replace(links, query=links.query[shuffled], labels=links.labels[shuffled])
@@ -159,7 +153,7 @@ def test_files_in_no_order_are_told():
 # --- the split ---
 
 
-def test_test_links_that_nothing_is_known_of_are_left_out_and_counted():
+def test_test_links_without_a_known_link_are_left_out_and_counted():
     links = two_passes()
     receivers = torch.zeros(len(links), dtype=torch.long)
     receivers[-3:] = 1
@@ -184,7 +178,7 @@ def test_baselines_of_large_labels_are_left_out():
     assert remarks[-1].startswith("the baselines are left out")
 
 
-# --- what cannot be compared ---
+# --- refused links ---
 
 
 def test_labels_at_one_place_are_refused():
@@ -193,23 +187,10 @@ def test_labels_at_one_place_are_refused():
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_links_of_which_no_two_are_alike_are_refused(n):
+def test_links_without_a_pair_are_refused(n):
     links = of_readings(torch.rand(n, 3), torch.zeros(n), torch.arange(n))
     with pytest.raises(ValueError, match=f"no two of {n} links have the same receiver and carrier"):
         measure(links, seeded())
-
-
-def test_two_links_are_enough():
-    found = measure(of_readings([[0.0, 0, 0], [1.0, 0, 0]], [1.0, 3.0]), seeded())
-    ((bounds, cell),) = by_bounds(found).items()
-    assert bounds == ((1.0, 2.0), (0, math.inf))
-    assert cell.quantiles == (2, 2, 2)
-
-
-def test_labels_of_another_task_are_refused(tmp_path):
-    config = composed("data=synthetic_rssi", "data.transmitters=10", "data.order=1", "task=csi")
-    with pytest.raises(ValueError, match="of task 'rssi', and the configuration is for 'csi'; add task=rssi"):
-        run(config, tmp_path)
 
 
 # --- the whole ---
@@ -232,3 +213,9 @@ def test_any_task(task, tmp_path, capsys):
     first, *cells = re.findall(r"\), ([\d,]+) ", page)
     pairs = sum(int(count.replace(",", "")) for count in (first, *cells))
     assert pairs == 40 * 39 // 2 * (4 if task == "rssi" else 1)
+
+
+def test_a_place_that_is_measured_again_counts_anew():
+    links = replace(two_passes(), rows=torch.tensor([0, 0, 1, 0, 2]))
+    links = replace(links, query=links.query[torch.arange(5)])
+    assert visits(links).tolist() == [0, 0, 1, 2, 3]

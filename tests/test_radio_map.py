@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-import gaigs
 from gaigs.antenna import Receiver
 from gaigs.geometry import ExtrapolationWarning, Grid, Pose
 from gaigs.model import Model, Prediction
-from gaigs.radio_maps import FEWEST, POINTS, RadioMap, radio_map
+from gaigs.radio_maps import FEWEST, RadioMap, radio_map
 from gaigs.scene import Scene
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
@@ -56,7 +55,7 @@ def test_each_value_is_that_of_its_place_and_receiver():
 
 def test_a_slow_model_draws_a_coarser_map_of_the_same_points(monkeypatch):
     fine = radio_map(Slope(scene()))
-    monkeypatch.setitem(radio_map.__globals__, "SECONDS", 0.0)  # any model is too slow
+    monkeypatch.setattr("gaigs.radio_maps.SECONDS", 0.0)  # any model is too slow
     coarse = radio_map(Slope(scene()))
     doublings = np.log2((coarse.x[1] - coarse.x[0]) / (fine.x[1] - fine.x[0]))
     assert doublings >= 1
@@ -71,7 +70,7 @@ def test_a_slow_model_draws_a_coarser_map_of_the_same_points(monkeypatch):
     )
 
 
-def test_what_the_first_prediction_loads_makes_no_map_coarser(monkeypatch):
+def test_a_slow_first_prediction_makes_no_map_coarser(monkeypatch):
     class Loading(Slope):
         """A model whose first prediction takes a minute, by a clock that it winds on itself."""
 
@@ -88,25 +87,11 @@ def test_what_the_first_prediction_loads_makes_no_map_coarser(monkeypatch):
 
 
 def test_map_covers_transmitters_gateways_and_the_margin_with_multiples_of_the_pitch():
-    drawn = radio_map(Slope(scene()), pitch=np.array(0.25), margin=torch.tensor(0.35, dtype=torch.float64))
+    drawn = radio_map(Slope(scene()), pitch=0.25, margin=0.35)
     for axis, lower, upper in ((drawn.x, -0.35, 5.35), (drawn.y, -0.55, 2.35)):
         assert lower - 0.25 < axis[0] <= lower < upper <= axis[-1] <= upper + 0.25
         np.testing.assert_allclose(axis, 0.25 * np.round(axis / 0.25), atol=1e-12)
         np.testing.assert_allclose(np.diff(axis), 0.25)
-
-
-def test_pitch_is_a_decimetre_unless_the_room_is_large():
-    drawn = radio_map(Slope(scene()))
-    np.testing.assert_allclose(np.diff(drawn.x), 0.1)
-    hall = radio_map(Slope(scene(upper=(300.0, 40.0, 1.5))))
-    assert POINTS <= len(hall.x) <= POINTS + 2
-    np.testing.assert_allclose(np.diff(hall.y), np.diff(hall.x)[0])
-
-
-def test_a_row_of_transmitters_still_makes_a_plane():
-    receivers = (Receiver("end", Pose(torch.zeros(3), torch.eye(3))),)
-    row = Scene(receivers, torch.tensor([0.0, 0, 1]), torch.tensor([2.0, 0, 1]), 0.3, Rssi())
-    assert radio_map(Slope(row), pitch=0.5, margin=0).values.shape == (1, 2, 6)
 
 
 def test_height_and_receivers_may_be_chosen():
@@ -118,41 +103,25 @@ def test_height_and_receivers_may_be_chosen():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        *(({"pitch": pitch}, f"pitch must be above 0, .* got {pitch} m") for pitch in (0, float("nan"), 1e9)),
-        *(({"pitch": pitch}, f"give at most 1e.08 points, got {pitch} m") for pitch in (1e-9, 1e-300)),
+        *(({"pitch": pitch}, "pitch must be above 0, .* give at most") for pitch in (0, float("nan"), 1e9, 1e-9)),
         ({"margin": -1.0}, "margin at least 0 .m., got height 1.0 and margin -1.0"),
         ({"height": float("inf")}, "height must be finite .* got height inf"),
         ({"receivers": []}, "receivers must be among door, window, got none"),
         ({"receivers": ["roof"]}, "receivers must be among door, window, got 'roof'"),
     ],
 )
-def test_what_makes_no_map_is_refused(options, message):
+def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         radio_map(Slope(scene()), **options)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"pitch": "1"}, "pitch must be a number or null, got '1'"),
-        ({"pitch": True}, "pitch must be a number or null, got True"),
-        ({"margin": None}, "margin must be a number, got None"),
-        ({"height": [1, 2]}, r"height must be a number or null, got \[1, 2\]"),
-        ({"receivers": 0}, "receivers must be a list or a string or null, got 0"),
-        ({"receivers": [0]}, "receivers, entry 0, must be a string, got 0"),
-        ({"model": "runs/room/best.ckpt"}, "model must be one that gaigs.load gives, got 'runs/room/best.ckpt'; load"),
-    ],
-)
-def test_options_of_another_type_are_refused(options, message):
-    with pytest.raises(TypeError, match=message):
-        radio_map(**{"model": Slope(scene()), **options})
+    with pytest.raises(TypeError, match=r"model must be one that gaigs\.load gives, got 'best\.ckpt'"):
+        radio_map("best.ckpt")
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"PK", "another"])
 def test_another_file_is_no_map(content, tmp_path):
     file = tmp_path / "map.npz"
     np.savez(file, y=3) if content == "another" else file.write_bytes(content)
-    with pytest.raises(ValueError, match=r"map\.npz must be a file of RadioMap\.save, and is damaged or another one"):
+    with pytest.raises(ValueError, match=r"map\.npz is damaged or not a file of RadioMap\.save"):
         RadioMap.load(file)
 
 
@@ -163,7 +132,7 @@ def test_another_file_is_no_map(content, tmp_path):
         (Narrow(1, torch.tensor([2.4e9])), r"'csi', whose labels are \(\) of torch.complex64"),
     ],
 )
-def test_what_is_no_real_number_makes_no_map(task, message):
+def test_a_task_without_one_real_number_a_link_is_refused(task, message):
     with pytest.raises(ValueError, match=f"takes a model of one real number a link, got one of task {message}"):
         radio_map(Slope(scene(task=task)))
 
@@ -225,7 +194,3 @@ def same(one, other):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     for name in ("height", "receivers", "quantity", "unit", "frequency"):
         assert getattr(one, name) == getattr(other, name)
-
-
-def test_public_name_is_the_function_though_its_module_bears_it_too():
-    assert gaigs.radio_map is radio_map

@@ -79,10 +79,6 @@ class Benchmark(ABC):
             minutes: No measurement begins that would end later, if it takes as long as the longest so far. 0 writes the
                 page of existing rows; None sets no limit.
             device: "cpu", "cuda", or None for all devices of this machine, one after the other.
-
-        Raises:
-            TypeError, ValueError: An option is out of range, or a file of the folder is damaged.
-            OSError: A file cannot be written.
         """
         check_type("benchmark.minutes", minutes, float | None)
         if minutes is not None and minutes < 0:
@@ -126,11 +122,7 @@ class Benchmark(ABC):
 
 
 def read_rows(file: Path, columns: Sequence[str]) -> list[Row]:
-    """The rows of a benchmark's file; an absent file has no rows.
-
-    Raises:
-        ValueError: The file is damaged, or belongs to something else.
-    """
+    """The rows of a benchmark's file, none of an absent one; raises a ValueError for a file with other columns."""
     if not file.is_file():
         return []
     with open(file, newline="", encoding="utf-8", errors="replace") as opened:
@@ -160,12 +152,7 @@ def grouped(rows: Sequence[Row], *keys: str) -> dict[tuple[str, ...], list[Row]]
 
 
 def table(rows: Sequence[Mapping], columns: Mapping[str, str]) -> str:
-    """Rows in Markdown, numbers with three digits.
-
-    Args:
-        rows: Rows of the file.
-        columns: Keys of the rows by the column's title.
-    """
+    """Rows in Markdown, numbers with three digits; columns are keys of the rows by title."""
     return markdown([[*columns], *([number(row[key]) for key in columns.values()] for row in rows)])
 
 
@@ -174,7 +161,7 @@ def number(value: str | float) -> str:
     try:
         found = float(value)
     except ValueError:
-        return value
+        return str(value)
     if found.is_integer() and "e" not in str(value):
         return f"{found:,.0f}"
     if not 1e-3 <= abs(found) < 1e5:

@@ -6,7 +6,7 @@ from gaigs.benchmark import Context, Row, grouped, number, table
 from gaigs.benchmark.trainings import Score, Trainings, sections, written
 from gaigs.registry import register, registry
 from gaigs.report.systems import read_published
-from gaigs.report.table import monitor_names
+from gaigs.report.table import monitor_names, task_class
 
 SYSTEMS, LOOK_UPS = "system", "look-up"
 """Axes of all systems, and of the task's baselines, which have no training."""
@@ -27,9 +27,6 @@ class Accuracy(Trainings):
         trainer, axes: See ``Trainings``.
         levels: Validation scores, by name of the score, to which the time is measured beside those of the look-ups.
         systems: Models; None: all installed ones with a published name, see ``conf/published.yaml``.
-
-    Raises:
-        TypeError, ValueError: An option has another form.
     """
 
     name = "accuracy"
@@ -44,7 +41,7 @@ class Accuracy(Trainings):
         for config in self.reference(context)["baselines"]:
             options = [f"++model.{key}={written(value)}" for key, value in config.items() if key != "name"]
             yield self.cell(context, options, axis=LOOK_UPS, key="model", value=config["name"])
-        known, published = registry("model").names(), read_published().names
+        known, published = registry("model").names(), read_published()["names"]
         for name in [name for name in published if name in known] if self.systems is None else self.systems:
             yield self.cell(context, (), axis=SYSTEMS, key="model", value=name)
         yield from self.cells_of_axes(context)
@@ -72,16 +69,16 @@ class Accuracy(Trainings):
 
 def _table(rows: Sequence[Row], levels: Mapping[str, float], score: Score) -> str:
     """Scores, seconds to each level, and costs; in bold the rows that no other one beats in error and time."""
-    ahead = []
+    ahead: list[Row] = []
     for row in sorted(rows, key=lambda row: (float(row["inference_ms"]), score.loss(row["test"]))):
         if not ahead or score.loss(row["test"]) < score.loss(ahead[-1]["test"]):
             ahead.append(row)
-    compared = registry("task").get(rows[0]["task"]).metrics()[score.first].title
+    compared = task_class(rows[0]["task"]).metrics()[score.first].title
     columns = {"": "name", score.title: "test"} | ({compared: "compared"} if compared != score.title else {})
     columns |= {"validation": "validation", "inference [ms]": "inference_ms", "rendering [ms]": "render_ms"}
     columns |= {"training [s]": "train_seconds", **{f"s to {level}": level for level in levels}}
     columns |= {"steps": "steps", "parameters": "num_parameters", "checkpoint [bytes]": "checkpoint_bytes"}
-    lines, published = [], read_published().names
+    lines, published = [], read_published()["names"]
     for row in rows:
         name = published.get(row["value"], row["value"]) if row["key"] == "model" else row["value"]
         name = f"`{row['value']}`" if row["axis"] == LOOK_UPS else name

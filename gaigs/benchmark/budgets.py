@@ -27,9 +27,6 @@ class Budgets(Trainings):
         trainer, factors: See ``Trainings``.
         axes: See ``Trainings``. One with the key ``seed`` shows how much scores scatter.
         tolerance: Largest loss against the best validation score, by unit: ``dB``, or ``ratio`` for none.
-
-    Raises:
-        TypeError, ValueError: An option has another form.
     """
 
     name = "budgets"

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gaigs.benchmark import now
 from gaigs.projection import Plane, Splats
-from gaigs.rasterizer import ALPHA_MIN, Rasterizer
+from gaigs.rasterizer import ALPHA_MIN
 from gaigs.testing.rasterizer import (
     cast_scene,
     distance_to_jumps,
@@ -75,9 +75,7 @@ def _splats(means: Tensor, deviations: Tensor, uniform) -> Splats:
     return Splats(means, factors, depths, depths > 0)
 
 
-def passes(
-    rasterizer: Rasterizer, scene: DrawnScene, device: str, dtype: torch.dtype, clock=now
-) -> Callable[[], tuple]:
+def passes(rasterizer: Callable, scene: DrawnScene, device: str, dtype: torch.dtype, clock=now) -> Callable[[], tuple]:
     """A function that draws and differentiates a scene, and returns the seconds of both."""
     splats, *others, plane = cast_scene(scene, device, dtype)
     leaf = lambda tensor: None if tensor is None else tensor.detach().clone().requires_grad_()
@@ -98,7 +96,7 @@ class Truth:
     """The dense float64 sum over all pairs of a splat and a pixel of a scene, with its gradients.
 
     A scene of many pairs is drawn on a coarser grid. Pixels are left out where an opacity of a splat is within 1e-4 of
-    one of its bounds: there rounding may decide whether a splat acts.
+    one of its bounds: there rounding may decide if a splat acts.
 
     Attributes:
         pairs: Number of pairs that act, of all transmitters; in proportion on the scene's own grid.
@@ -112,7 +110,7 @@ class Truth:
         acting = int((self.scene.opacities[:, order, None, None] * footprints >= ALPHA_MIN).sum())
         self.pairs = round(acting * math.prod(scene.plane.shape) / math.prod(self.scene.plane.shape))
 
-    def errors(self, rasterizer: Rasterizer, device: str, dtype: torch.dtype) -> dict[str, float]:
+    def errors(self, rasterizer: Callable, device: str, dtype: torch.dtype) -> dict[str, float]:
         """Largest deviations of the map and of the gradients, each relative to its largest true value."""
         found = render_with_gradients(rasterizer, cast_scene(self.scene, device, dtype), self.pixels.to(device))
         errors = {name: (found[name].cpu() - true).abs().max() / true.abs().max() for name, true in self.values.items()}

@@ -38,9 +38,6 @@ class StepBenchmark(Benchmark):
 
     Args:
         repeats: Divided steps, and as many undivided ones.
-
-    Raises:
-        ValueError: ``repeats`` is below 1.
     """
 
     name = "step"
@@ -68,11 +65,9 @@ class StepBenchmark(Benchmark):
         parts = [INTRODUCTION]
         for (overrides, device), own in grouped(rows, "overrides", "device").items():
             command = f"python -m gaigs command=benchmark benchmark=step {overrides}".rstrip()
-            about = "{rasterizer}, {gaussians} Gaussians, {places} places a step, medians of {repeats} steps".format(
-                **own[0]
-            )
+            about = "{rasterizer}, {gaussians} Gaussians, {places} places a step, medians of {repeats} steps"
             columns = {"part": "part", "ms": "ms", "spread": "spread_ms", "share": "share"}
-            parts.append(f"```\n{command}\n```\n\n{device}; {about}:\n\n{table(own, columns)}")
+            parts.append(f"```\n{command}\n```\n\n{device}; {about.format(**own[0])}:\n\n{table(own, columns)}")
         return "\n".join(parts)
 
 
@@ -83,8 +78,10 @@ class Watch(Callback):
     its inputs are there.
     """
 
-    def __init__(self):
-        self.times, self.divided = defaultdict(list), False
+    def __init__(self) -> None:
+        self.times: dict[str, list[float]] = defaultdict(list)
+        self.step: dict[str, float] = Counter()
+        self.divided, self.last = False, 0.0
 
     def lap(self, part: str) -> None:
         """Adds the time since the last lap to a part of the step."""
@@ -147,14 +144,7 @@ class Watch(Callback):
 
 
 def train(config: dict, repeats: int, device: str) -> tuple[dict[str, list[float]], dict]:
-    """Trains under watch.
-
-    Returns:
-        Seconds of each step by part; and the rasterizer, the number of Gaussians and that of places a step.
-
-    Raises:
-        ValueError: The model has no rasterizer or no deformation.
-    """
+    """Seconds of each step by part; and the rasterizer, the number of Gaussians and that of places a step."""
     if not config["model"].get("rasterizer") or "deformation" not in config["model"]:
         raise ValueError(
             f"benchmark=step needs a model with a deformation and a rasterizer, got model={config['model']['name']}; "

@@ -17,14 +17,13 @@ from gaigs.benchmark import UNAVAILABLE, Benchmark, Context, Row, grouped
 from gaigs.configuration import run_folder
 from gaigs.data import load
 from gaigs.processes import lacks_memory
-from gaigs.registry import check_type, registry
+from gaigs.registry import check_type
 from gaigs.report.curves import read_validations
 from gaigs.report.runs import train_seconds
-from gaigs.report.table import monitor_names
+from gaigs.report.systems import COSTS
+from gaigs.report.table import monitor_names, task_class
 
 log = logging.getLogger(__name__)
-
-COSTS = ("train_seconds", "inference_ms", "render_ms", "num_parameters", "num_gaussians", "checkpoint_bytes")
 
 
 class Trainings(Benchmark):
@@ -34,9 +33,6 @@ class Trainings(Benchmark):
         trainer: Options of ``trainer`` for each run; the command line has precedence.
         axes: By name: ``key``, its ``values``, and the reference ``of``, a list of overrides.
         factors: Values of an axis without ``values``, in multiples of a default of whole numbers.
-
-    Raises:
-        TypeError, ValueError: An axis has another form.
     """
 
     keys = ("device", "scene", "trainer", "of", "key", "default", "axis", "value")
@@ -45,17 +41,11 @@ class Trainings(Benchmark):
     def __init__(self, trainer: dict, axes: dict[str, dict], factors: Sequence[float] = ()):
         self.trainer, self.axes, self.factors = trainer, axes, factors
         for name, axis in axes.items():
-            if axis.keys() | {"values"} != {"key", "of", "values"}:
-                raise ValueError(f"benchmark.axes.{name} must have key, of and values, got {', '.join(axis)}")
             for part, kind in (("key", str), ("of", list[str]), ("values", list | None)):
                 check_type(f"benchmark.axes.{name}.{part}", axis.get(part), kind)
 
     def reference(self, context: Context) -> dict:
-        """The configuration of the command line.
-
-        Raises:
-            ValueError, OSError: Its data cannot be read, or its split has no validation links.
-        """
+        """The configuration of the command line; raises an error for one without validation links."""
         config = context.compose()
         split = load(config["data"], config["split"], config["task"]["name"]).split
         if not len(split.validation):
@@ -80,11 +70,7 @@ class Trainings(Benchmark):
         return [common | {"of": shlex.join(of), "default": ""} | keys]
 
     def cells_of_axes(self, context: Context) -> Iterator[list[Row]]:
-        """Cells of each axis whose key the reference has.
-
-        Raises:
-            ValueError: A reference cannot be composed, or an axis has neither values nor a default to multiply.
-        """
+        """Cells of each axis whose key the reference has."""
         for name, axis in self.axes.items():
             try:
                 default = OmegaConf.select(OmegaConf.create(self.compose(context, axis["of"])), axis["key"])
@@ -103,11 +89,7 @@ class Trainings(Benchmark):
                 yield self.cell(context, axis["of"], **keys)
 
     def measure(self, cell: Sequence[Row], context: Context) -> Iterable[dict]:
-        """Trains and tests, or reads the run that has ended in its folder.
-
-        Raises:
-            OSError: A file cannot be written.
-        """
+        """Trains and tests, or reads the run that has ended in its folder."""
         (row,) = cell
         words = overrides_of(row)
         places = row["device"], f"{row['scene']} {row['trainer']}".strip(), ",".join(words)
@@ -127,8 +109,7 @@ class Trainings(Benchmark):
 
 
 class Score(NamedTuple):
-    """The scores of a task: names of its first metric and of the mean validation score, and the latter's title, unit
-    (empty for a ratio) and direction."""
+    """Names of a task's first metric and mean validation score; title, unit (or "") and direction of the latter."""
 
     first: str
     mean: str
@@ -138,8 +119,7 @@ class Score(NamedTuple):
 
     @classmethod
     def of(cls, task: str) -> "Score":
-        """The scores of a task by name."""
-        known = registry("task").get(task).metrics()
+        known = task_class(task).metrics()
         first = next(iter(known))
         mean = monitor_names(task)[1] or first
         title, is_better, _ = known[mean]
@@ -175,12 +155,12 @@ def results(metrics: Mapping, folder: Path) -> dict:
     score, test = Score.of(task), metrics["models"][own]
     validation = (metrics["validation"] or {}).get(own, {}).get(score.mean)
     points = read_validations(folder, monitor_names(task)[0])
-    curve = [(point.seconds, point.score) for point in points if math.isfinite(point.seconds)]
+    curve = [(seconds, value) for _, seconds, value in points if math.isfinite(seconds)]
     if metrics.get("kriging") and curve and validation is not None:
-        curve.append((train_seconds(metrics), validation))
+        curve.append((train_seconds(metrics) or 0.0, validation))
     found = {key: metrics[key] for key in ("task", "split", "seed", *COSTS)} | {"train_seconds": train_seconds(metrics)}
     found |= {"validation": validation, "test": test[score.mean], "compared": test[score.first]}
-    found["steps"] = points[-1].step + 1 if points else None
+    found["steps"] = points[-1][0] + 1 if points else None
     return found | {"curve": " ".join(f"{time:.1f}:{value:.5g}" for time, value in curve)}
 
 

@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
-from gaigs.io.files import atomic_write, write_text
-from gaigs.report.style import COLUMN, DPI, LINES, STYLE
+from gaigs.io.files import write_text
+from gaigs.report.style import COLUMN, LINES, STYLE, save
 from gaigs.report.table import markdown
+from gaigs.task import Task
 
 
 class Cell(NamedTuple):
@@ -31,28 +34,10 @@ class Cell(NamedTuple):
 
 
 def write(
-    folder: Path,
-    score: str,
-    titles: Mapping[str, str],
-    cells: Sequence[Cell],
-    rows: Mapping[str, Mapping[str, float]],
-    split: str,
-    remarks: Sequence[str],
+    folder: Path, task: Task, cells: Sequence[Cell], rows: Mapping[str, Mapping], split: str, remarks: Sequence[str]
 ) -> str:
-    """Writes ``agreement.md`` and ``agreement.png``, and returns the page.
-
-    Args:
-        folder: Folder of the files.
-        score: Name of the agreement of two labels, with its unit.
-        titles: Titles of the metrics, by name.
-        cells: Cells by rows.
-        rows: Metrics on the split's test links, by predictor; may be empty.
-        split: Name of the split.
-        remarks: Further remarks for readers.
-
-    Raises:
-        OSError: A file cannot be written.
-    """
+    """Writes ``agreement.md`` and ``agreement.png``, and returns the page; ``rows`` are metrics by predictor."""
+    score, titles = task.pair_score, {name: metric.title for name, metric in task.metrics().items()}
     at = {(cell.distance, cell.separation): cell for cell in cells}
     distances, columns = dict.fromkeys(cell.distance for cell in cells), sorted({cell.separation for cell in cells})
 
@@ -76,21 +61,12 @@ def write(
     parts.append("".join(f"- {remark}\n" for remark in [*remarks, *drawn]))
     page = "\n".join(parts)
     write_text(folder / "agreement.md", page)
-    with atomic_write(folder / "agreement.png") as part:
-        figure(score, cells).savefig(part, dpi=DPI)
+    save(figure(score, cells), folder / "agreement.png")
     return page
 
 
-def figure(score: str, cells: Sequence[Cell]):
-    """Median and 10th to 90th percentile against distance, one line for each separation.
-
-    Args:
-        score: Name of the agreement of two labels, with its unit.
-        cells: Cells by rows.
-    """
-    from matplotlib import rc_context  # slow to import
-    from matplotlib.figure import Figure
-
+def figure(score: str, cells: Sequence[Cell]) -> Figure:
+    """Median and 10th to 90th percentile against distance, one line for each separation."""
     distances = list(dict.fromkeys(cell.distance for cell in cells))
     columns = sorted({cell.separation for cell in cells})
     with rc_context(STYLE):
@@ -112,12 +88,10 @@ def figure(score: str, cells: Sequence[Cell]):
 
 
 def _number(value: float, title: str) -> str:
-    """A score as text: hundredths of a unit, thousandths of a ratio."""
     return f"{value:z.{2 if title.endswith(']') else 3}f}"
 
 
 def _distance(bounds: tuple[float, float]) -> str:
-    """Head of a row."""
     low, high = bounds
     if not high:
         return "same place"
@@ -125,7 +99,6 @@ def _distance(bounds: tuple[float, float]) -> str:
 
 
 def _separation(bounds: tuple[int, float]) -> str:
-    """Head of a column."""
     low, high = bounds
     if math.isinf(high):
         return f"over {low - 1:,}" if low else "any"

@@ -13,9 +13,8 @@ from scipy.stats import t
 
 from gaigs.configuration import HARMLESS, conf_dir
 from gaigs.io.files import write_text
-from gaigs.registry import check_type
 from gaigs.report.runs import Run
-from gaigs.report.table import latex, markdown, metrics_of, terminal, tex, write_csv, written
+from gaigs.report.table import markdown, task_class, terminal, write_csv, written
 
 CONFIDENCE = 0.95
 """Of the intervals."""
@@ -23,17 +22,16 @@ CONFIDENCE = 0.95
 NOTE = (
     "Positive gains are in favour of the claim, of errors where they fall. Ours: mean over seeds of the differences of "
     f"runs with the same seed, and its {CONFIDENCE:.0%} interval by Student's t. Confirmed: the interval lies above 0; "
-    "contradicted: below; not seen: it has 0 in it."
+    "contradicted: below; not seen: it has 0 in it.\n"
 )
-"""Legend of the table."""
 
 
 class Claim(NamedTuple):
     """A claim of the paper.
 
     Attributes:
-        claim: In a few words.
-        better, than: Two variants, files of ``conf/variant``; by the claim the first is ahead.
+        claim: The claim in a few words.
+        better, than: Two variants, files of ``conf/variant``; the claim says that the first is better.
         source: Place in the paper.
         published: Published ``gain`` and its ``source``, by task.
     """
@@ -46,23 +44,12 @@ class Claim(NamedTuple):
 
 
 def read_claims(file: Path | None = None) -> list[Claim]:
-    """Contents of ``claims.yaml``, by default that of the configuration folder.
-
-    Raises:
-        ValueError: It does not have the form of gaigs's own.
-    """
+    """Contents of ``claims.yaml``, by default that of gaigs; a ValueError for a file of another form."""
     file = file or conf_dir() / "claims.yaml"
     try:
-        claims = [Claim(**({"published": {}} | parts)) for parts in yaml.safe_load(file.read_text())["claims"]]
-        for claim in claims:
-            for name, kind in zip(Claim._fields, (str, str, str, str, dict[str, dict]), strict=True):
-                check_type(f"{name!r} of a claim", getattr(claim, name), kind)
-            for task, part in claim.published.items():
-                check_type(f"'gain' of {claim.claim!r} for {task}", part["gain"], float)
-                check_type(f"'source' of {claim.claim!r} for {task}", part["source"], str)
+        return [Claim(**({"published": {}} | parts)) for parts in yaml.safe_load(file.read_text())["claims"]]
     except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
         raise ValueError(f"{file} must have the form of conf/claims.yaml: {error!r}") from error
-    return claims
 
 
 def interval(gains: Sequence[float]) -> tuple[float, float] | None:
@@ -75,36 +62,36 @@ def interval(gains: Sequence[float]) -> tuple[float, float] | None:
 
 
 def compare(runs: Sequence[Run], claims: Sequence[Claim]) -> list[dict]:
-    """Rows of ``claims.csv``, in the order of the claims; a claim of which a variant has no run is left out.
+    """Rows of ``claims.csv``, in the order of the claims; a claim is left out if one of its variants has no run.
 
-    Runs are of one setting if they differ only in variant, seed and what changes no result. A seed that was run twice
-    counts once.
+    Runs are of one setting if they differ only in variant, seed and options that change no result. A seed that was run
+    twice counts once.
     """
     keys = dict.fromkeys(key for run in runs for key in run.overrides if key not in ("variant", "seed", *HARMLESS))
     varied = [key for key in keys if len({run.overrides.get(key) for run in runs}) > 1]
-    settings: dict[str, dict[str, dict[int, Run]]] = {}
+    settings: dict[str, dict[str, dict[int, dict]]] = {}  # metrics by setting, variant and seed
     for run in runs:
         if run.metrics is not None and "variant" in run.overrides:
             setting = " ".join(f"{key}={run.overrides[key]}" for key in varied if key in run.overrides)
             seeds = settings.setdefault(setting, {}).setdefault(run.overrides["variant"], {})
-            seeds.setdefault(run.metrics["seed"], run)
+            seeds.setdefault(run.metrics["seed"], run.metrics)
     rows = []
     for claim in claims:
         for setting, variants in settings.items():
             better, than = (variants.get(name, {}) for name in (claim.better, claim.than))
             if seeds := sorted(better.keys() & than.keys()):
-                rows.append(_row(claim, setting, [(better[seed].metrics, than[seed].metrics) for seed in seeds]))
+                rows.append(_row(claim, setting, *([side[seed] for seed in seeds] for side in (better, than))))
     return rows
 
 
-def _row(claim: Claim, setting: str, pairs: Sequence[tuple[Mapping, Mapping]]) -> dict:
-    task = pairs[0][0]["task"]
-    name, metric = next(iter(metrics_of(pairs[0][0]).items()))
-    better, than = ([next(iter(one["models"].values()))[name] for one in side] for side in zip(*pairs, strict=True))
+def _row(claim: Claim, setting: str, *sides: Sequence[Mapping]) -> dict:
+    task = sides[0][0]["task"]
+    name, metric = next(iter(task_class(task).metrics().items()))
+    better, than = ([next(iter(metrics["models"].values()))[name] for metrics in side] for side in sides)
     sign = 1 if metric.higher_is_better else -1
     gains = [sign * (a - b) for a, b in zip(better, than, strict=True)]
     low, high = interval(gains) or (None, None)
-    if low is None:
+    if low is None or high is None:
         word = "one seed"
     else:
         word = "confirmed" if low > 0 else "contradicted" if high < 0 else "not seen"
@@ -128,40 +115,33 @@ def _row(claim: Claim, setting: str, pairs: Sequence[tuple[Mapping, Mapping]]) -
 
 
 def write_claims(folder: Path, runs: Sequence[Run]) -> Table | None:
-    """Writes ``claims.md``, ``claims.csv`` and ``claims.tex``.
-
-    Args:
-        folder: Gets the files.
-        runs: Of a multirun, or of several, of one task or several.
-
-    Returns:
-        A table for a terminal; None, and no files, where no claim has runs of both its variants.
-    """
+    """Writes ``claims.md`` and ``claims.csv``; None, and no files, if no claim has runs of both its variants."""
     claims = read_claims()
     rows = compare(runs, claims)
     if not rows:
         return None
-    shown = [_shown(row) for row in rows]
+    lines = [_line(row) for row in rows]
     if len({row["setting"] for row in rows}) == 1:
-        shown = [{title: text for title, text in line.items() if title != "setting"} for line in shown]
-    lines = [[*shown[0]], *([*line.values()] for line in shown)]
+        for line in lines:
+            del line["setting"]
     published = {claim.claim: claim.published for claim in claims}
-    sources = {}  # each once
+    notes: dict[str, None] = {}  # each once
     for row in rows:
-        sources[f"{row['claim']}: {row['source']}"] = None
+        notes[f"- {row['claim']}: {row['source']}\n"] = None
         if (gain := row["published gain"]) is not None:
-            sources[f"published gain {_signed(gain)}: {published[row['claim']][row['task']]['source']}"] = None
-    failed = [f"{run.name}: {run.failure or 'unfinished'}" for run in runs if run.metrics is None]
-    notes = [NOTE, "", *(f"- {text}" for text in sources), *(f"- without a result: {text}" for text in failed)]
-    write_text(folder / "claims.md", f"{markdown(lines)}\n" + "".join(f"{note}\n" for note in notes))
-    write_text(folder / "claims.tex", latex([[tex(cell) for cell in line] for line in lines]))
+            notes[f"- published gain {_signed(gain)}: {published[row['claim']][row['task']]['source']}\n"] = None
+    failed = [f"{run.name}: {run.failure or 'unfinished'}\n" for run in runs if run.metrics is None]
+    table = markdown([[*lines[0]], *([*line.values()] for line in lines)])
+    remarks = "".join([*notes, *(f"- without a result: {failure}" for failure in failed)])
+    write_text(folder / "claims.md", f"{table}\n{NOTE}\n{remarks}")
     write_csv(folder / "claims.csv", rows)
-    heads = dict.fromkeys((head for head in ("claim", "setting", "ours", "seeds", "says") if head in shown[0]), False)
-    caption = "".join(f"{failure}\n" for failure in failed) + "all columns in claims.md"
-    return terminal("Claims of the paper", heads, [[escape(line[head]) for head in heads] for line in shown], caption)
+    heads = [head for head in ("claim", "setting", "ours", "seeds", "says") if head in lines[0]]
+    cells = [[escape(line[head]) for head in heads] for line in lines]
+    caption = "".join(failed) + "all columns in claims.md"
+    return terminal("Claims of the paper", dict.fromkeys(heads, False), cells, caption)
 
 
-def _shown(row: Mapping) -> dict[str, str]:
+def _line(row: Mapping) -> dict[str, str]:
     """A row of the tables for readers."""
     ends = "" if row["low"] is None else f" ({_signed(row['low'])}, {_signed(row['high'])})"
     return {

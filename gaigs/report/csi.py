@@ -1,7 +1,7 @@
 """Figures of complex channels: over frequency, as impulse responses over delay, and their errors by power."""
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from gaigs.data import Links
 from gaigs.report.curves import LABEL, cdf
-from gaigs.report.figures import TaskFigures, examples, own_scores, scores_of_systems
+from gaigs.report.figures import Examples, TaskFigures, own_scores, read_examples, scores_of_systems
 from gaigs.report.style import COLUMN, MARKERS, PAGE, SKY, STYLE
 from gaigs.task.csi import Csi
 
@@ -31,38 +31,20 @@ class CsiFigures(TaskFigures):
     def of_run(self, task: Csi, folder: Path, links: Links) -> dict[str, Figure]:
         file, split = folder / "predictions.npz", links.split.name
         scores, errors, powers = (own_scores(file, kind) for kind in ("snr_db", "error_power", "label_power"))
-        name, own = next(iter(scores.items()))
-        names = examples(own)
-        shown = list(names)
-        with np.load(file) as run:
-            labels, predictions = run["labels"][shown], run["prediction"][shown]
-        drawn = labels, predictions, own[shown], list(names.values()), task.frequencies.numpy()
-        figures = {"channels": magnitudes_and_phases(*drawn)}
-        if len(task.frequencies) > 1:
-            figures["impulse_response"] = impulse_responses(*drawn)
-        figures["error_power"] = error_against_power(powers[name], errors, split)
+        shown, frequencies = read_examples(file, "snr_db"), task.frequencies.numpy()
+        figures = {"channels": magnitudes_and_phases(shown, frequencies)}
+        if len(frequencies) > 1:
+            figures["impulse_response"] = impulse_responses(shown, frequencies)
+        figures["error_power"] = error_against_power(next(iter(powers.values())), errors, split)
         return figures | {"snr_cdf": cdf(scores, "SNR [dB]", "channels", split, (None, None))}
 
     def of_systems(self, task: type[Csi], files: Mapping[str, Path], split: str) -> dict[str, Figure]:
         return {"cdf": cdf(scores_of_systems(files, "snr_db"), "SNR [dB]", "channels", split, (None, None))}
 
 
-def magnitudes_and_phases(
-    labels: Complex[ndarray, "k e s"],
-    predictions: Complex[ndarray, "k e s"],
-    snr: Float[ndarray, " k"],
-    names: Sequence[str],
-    frequencies: Float[ndarray, " s"],
-) -> Figure:
-    """Magnitude and phase over frequency, one link a row, at the element where the label is strongest.
-
-    Args:
-        labels: Measured channels.
-        predictions: Predicted ones, in the same unit.
-        snr: Score of each prediction [dB].
-        names: Names of the rows.
-        frequencies: Of the subcarriers, in any order [Hz].
-    """
+def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) -> Figure:
+    """Magnitude and phase over frequency [Hz], one link a row, at the element where the label is strongest."""
+    labels, predictions = shown.labels, shown.predictions
     order = np.argsort(frequencies)
     frequencies = frequencies[order]
     scale, unit = (1e9, "GHz") if frequencies[-1] >= 1e9 else (1e6, "MHz")
@@ -70,7 +52,7 @@ def magnitudes_and_phases(
     with rc_context(STYLE):
         figure = Figure(figsize=(PAGE, 1.35 * len(labels) + 0.7), layout="constrained")
         axes = figure.subplots(len(labels), 2, sharex=True, squeeze=False)
-        rows = zip(axes, labels[..., order], predictions[..., order], _titles(labels, snr, names), strict=True)
+        rows = zip(axes, labels[..., order], predictions[..., order], _titles(shown), strict=True)
         for (magnitude, phase), label, prediction, (title, element) in rows:
             pair = np.stack((prediction[element], label[element]))
             levels, angles = _decibels(pair), np.rad2deg(np.angle(pair))
@@ -91,13 +73,7 @@ def magnitudes_and_phases(
     return figure
 
 
-def impulse_responses(
-    labels: Complex[ndarray, "k e s"],
-    predictions: Complex[ndarray, "k e s"],
-    snr: Float[ndarray, " k"],
-    names: Sequence[str],
-    frequencies: Float[ndarray, " s"],
-) -> Figure:
+def impulse_responses(shown: Examples, frequencies: Float[ndarray, " s"]) -> Figure:
     """Magnitude over delay, relative to the label's peak, at the element where the label is strongest.
 
     The impulse response is the Fourier sum over the subcarriers, weighted by a Hann window over the band. Its period is
@@ -105,17 +81,17 @@ def impulse_responses(
     main lobe, at most a quarter of the period. A panel ends where all that follows is 25 dB below the label's peak.
 
     Args:
-        labels, predictions, snr, names: As for ``magnitudes_and_phases``.
+        shown: Channels (k, elements, subcarriers) and their SNR [dB].
         frequencies: Of the subcarriers, in any order, evenly spaced or not, at least two [Hz].
     """
-    titles = _titles(labels, snr, names)
-    pairs = np.stack([(guess[e], label[e]) for label, guess, (_, e) in zip(labels, predictions, titles, strict=True)])
+    titles, links = _titles(shown), zip(shown.labels, shown.predictions, strict=True)
+    pairs = np.stack([(guess[e], label[e]) for (label, guess), (_, e) in zip(links, titles, strict=True)])
     delays, responses = _impulse_response(pairs, frequencies)
     levels = _decibels(responses)  # (k, 2, delays)
     levels -= levels[:, 1:].max(-1, keepdims=True)
     with rc_context(STYLE):
         figure = Figure(figsize=(PAGE, 2.7), layout="constrained")
-        axes = figure.subplots(1, len(labels), sharey=True, squeeze=False)[0]
+        axes = figure.subplots(1, len(titles), sharey=True, squeeze=False)[0]
         for ax, pair, (title, _) in zip(axes, levels, titles, strict=True):
             for name, level in zip(LOOKS, pair, strict=True):
                 ax.plot(1e9 * delays, level, **LOOKS[name], label=name)
@@ -129,15 +105,13 @@ def impulse_responses(
     return figure
 
 
-def _titles(
-    labels: Complex[ndarray, "k e s"], snr: Float[ndarray, " k"], names: Sequence[str]
-) -> list[tuple[str, int]]:
+def _titles(shown: Examples) -> list[tuple[str, int]]:
     """The title of each link, and its element with the most power."""
-    count = labels.shape[1]
-    elements = (np.abs(labels) ** 2).sum(-1).argmax(-1)
+    count = shown.labels.shape[1]
+    elements = (np.abs(shown.labels) ** 2).sum(-1).argmax(-1)
     return [
         (f"{name}, SNR {score:.1f} dB" + (f", element {element + 1} of {count}" if count > 1 else ""), int(element))
-        for name, score, element in zip(names, snr, elements, strict=True)
+        for name, score, element in zip(shown.names, shown.scores, elements, strict=True)
     ]
 
 
@@ -152,7 +126,7 @@ def _limits(levels: Float[ndarray, "... 2 n"]) -> tuple[float, float]:
     lowest, highest = levels[np.isfinite(levels)].min(), levels.max()
     lowest = max(lowest, levels[..., 1, :].max() - 60)
     rim = max(1.0, 0.05 * (highest - lowest))
-    return lowest - rim, highest + rim
+    return float(lowest - rim), float(highest + rim)
 
 
 def _draw_phase(ax: Axes, frequencies: Float[ndarray, " s"], angles: Float[ndarray, " s"], **look) -> None:
@@ -178,15 +152,7 @@ def _impulse_response(
 
 
 def error_against_power(powers: Float[ndarray, " k"], errors: Mapping[str, Float[ndarray, " k"]], split: str) -> Figure:
-    """Power of each test link's error over the power of its channel, of two models; NMSE of all links in the key.
-
-    Links above the line have an error larger than their channel. Links to the right dominate the NMSE.
-
-    Args:
-        powers: Of the labels, linear, all above 0.
-        errors: Powers of the errors by model, the run's own first; that and the baseline of the least NMSE are drawn.
-        split: Name of the split.
-    """
+    """Power of each test link's error over that of its channel, of the own model (first) and the best baseline."""
     own, *others = errors
     baselines = sorted((name for name in others if name != f"{own}_trend"), key=lambda name: errors[name].sum())
     with rc_context(STYLE):

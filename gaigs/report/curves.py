@@ -6,7 +6,6 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy import ndarray
 
-from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE
+from gaigs.report.style import COLUMN, LINES, PAGE, STYLE
+from gaigs.task import Metric
 
 LABEL = 48
 """Most characters of a line of an axis label, in a figure of one column."""
@@ -32,9 +32,9 @@ def cdf(
     """Share of test samples with at most a given value, one step curve a model, medians marked.
 
     Args:
-        values: Of every test sample by model, the run's own model first.
+        values: Values of every test sample by model, the run's own model first.
         quantity: Name of the values, with their unit.
-        samples: Name of the samples.
+        samples: Name of the samples, e.g. "links".
         split: Name of the split.
         limits: Ends of the axis of values; None for those of the data.
     """
@@ -63,10 +63,6 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
 
     Args:
         paths: One file for each start of the run; a later file replaces earlier ones from its first step on.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: A file has no column ``step``.
     """
     curves: dict[str, dict[float, float]] = {}
     for path in paths:
@@ -74,8 +70,6 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
             reader = csv.DictReader(line for line in file if line.endswith("\n"))
             if reader.fieldnames is None:
                 continue
-            if "step" not in reader.fieldnames:
-                raise ValueError(f"{path} must have a column 'step', got {reader.fieldnames}; is it of a CSVLogger?")
             rows = list(reader)
             begin = min((float(row["step"]) for row in rows), default=math.inf)
             for points in curves.values():
@@ -88,40 +82,26 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
     return {name: tuple(np.array(sorted(points.items())).T) for name, points in curves.items() if points}
 
 
-class Validated(NamedTuple):
-    """A validation of a training: its step, its time since the start [s], NaN if unknown, and the mean score."""
-
-    step: int
-    seconds: float
-    score: float
+def read_log(folder: Path) -> dict[str, tuple[ndarray, ndarray]]:
+    """The curves in the log of a run's folder, of all its starts; empty for a run without a training."""
+    return read_curves(sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime))
 
 
-def read_validations(folder: Path, score: str) -> list[Validated]:
-    """The validations in the log of a run's folder, by the name of a score; empty for a run without a training."""
-    logs = sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime)
-    curves = read_curves(logs)
+def read_validations(folder: Path, score: str) -> list[tuple[int, float, float]]:
+    """Step, time since the start [s], NaN if unknown, and mean score of each validation in a run's log."""
+    curves = read_log(folder)
     seconds = dict(zip(*curves.get("seconds", ((), ())), strict=True))
     found = zip(*curves.get(f"validation/{score}", ((), ())), strict=True)
-    return [Validated(int(step), float(seconds.get(step, math.nan)), float(value)) for step, value in found]
+    return [(int(step), float(seconds.get(step, math.nan)), float(value)) for step, value in found]
 
 
 def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:
-    """Training loss with its terms, and the validation scores, against the optimiser's steps.
-
-    Args:
-        curves: Steps and values by name, as ``read_curves`` gives them: ``train/...`` are the loss and its terms,
-            ``validation/...`` the scores; other names are left out.
-
-    Raises:
-        ValueError: There is neither ``train/...`` nor ``validation/...``.
-    """
+    """Training loss with its terms (``train/...``) and validation scores (``validation/...``) against steps."""
     panels = {
         group: {name.removeprefix(f"{group}/"): curve for name, curve in curves.items() if name.startswith(f"{group}/")}
         for group in ("train", "validation")
     }
     panels = {group: names for group, names in panels.items() if names}
-    if not panels:
-        raise ValueError(f"loss curves need a quantity named train/... or validation/..., got {list(curves)}")
     with rc_context(STYLE):
         figure = Figure(figsize=(COLUMN * len(panels), 2.6), layout="constrained")
         for ax, (group, names) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
@@ -135,58 +115,10 @@ def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:
     return figure
 
 
-def speed_against_error(
-    names: Sequence[str],
-    scores: Float[ndarray, " runs"],
-    times: Mapping[str, Float[ndarray, " runs"]],
-    score_label: str,
-    baselines: Mapping[str, float],
-) -> Figure:
-    """Score of each run against what it costs, one panel a kind of time.
+def learning_curves(curves: Mapping[str, Sequence], baselines: Mapping[str, float], score: Metric) -> Figure:
+    """Validation scores over the time of training [s], both by system; baselines are horizontal lines.
 
-    Args:
-        names: Of the runs, for the key below the panels.
-        scores: Score of each run.
-        times: Times of each run by axis label; NaN where unknown.
-        score_label: Name of the score, with its unit.
-        baselines: Scores of the baselines, drawn as horizontal lines.
-    """
-    with rc_context(STYLE):
-        key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page
-        key_rows = (len(names) + len(baselines) + 1) // key_columns
-        figure = Figure(figsize=(PAGE, 2.4 + 0.15 * key_rows), layout="constrained")
-        axes = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]
-        for ax, (label, values) in zip(axes, times.items(), strict=True):
-            for run, (name, look) in enumerate(zip(names, cycle(MARKERS), strict=False)):
-                ax.plot(values[run], scores[run], linestyle="", markersize=5, label=name, **look)
-            for (name, score), (colour, dash) in zip(baselines.items(), cycle(LINES[1:]), strict=False):
-                ax.axhline(score, color=colour, linestyle=dash, linewidth=0.9, zorder=0, label=name)
-            ax.set_xlabel(label)
-            ax.grid()
-            known = values[np.isfinite(values)]
-            if len(known) and 0 < 10 * known.min() < known.max():
-                ax.set_xscale("log")
-                ticks = LogLocator(subs=(1, 2, 5))
-                ax.xaxis.set(major_locator=ticks, major_formatter="{x:g}", minor_locator=NullLocator())
-        axes[0].set_ylabel(score_label)
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=key_columns)
-    return figure
-
-
-def learning_curves(
-    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-    score_label: str,
-    baselines: Mapping[str, float],
-    higher_is_better: bool,
-) -> Figure:
-    """Validation scores over the time of training, one line a system.
-
-    Args:
-        curves: Times [s] and scores by name.
-        score_label: Name of the score.
-        baselines: Scores of the baselines, drawn as horizontal lines.
-        higher_is_better: True for a similarity. Errors have a logarithmic axis, so that large ones at the start leave
-            space for small ones.
+    Errors have a logarithmic axis, so that large ones at the start leave space for small ones.
     """
     with rc_context(STYLE):
         key_rows = (len(curves) + len(baselines) + 3) // 4
@@ -194,10 +126,10 @@ def learning_curves(
         ax = figure.subplots()
         for (name, (times, scores)), (colour, dash) in zip(curves.items(), cycle(LINES), strict=False):
             ax.plot(times, scores, marker=".", markersize=4, color=colour, linestyle=dash, label=name)
-        for (name, score), shade in zip(baselines.items(), cycle(("0.2", "0.45", "0.65", "0.8")), strict=False):
-            ax.axhline(score, color=shade, linewidth=0.9, zorder=0, label=name)
-        ax.set(xlabel="training [s]", ylabel=score_label)
-        if not higher_is_better and all(score > 0 for line in ax.lines for score in line.get_ydata()):
+        for (name, value), shade in zip(baselines.items(), cycle(("0.2", "0.45", "0.65", "0.8")), strict=False):
+            ax.axhline(value, color=shade, linewidth=0.9, zorder=0, label=name)
+        ax.set(xlabel="training [s]", ylabel=f"{score.title}, validation")
+        if not score.higher_is_better and all(value > 0 for line in ax.lines for value in line.get_ydata()):
             ax.set_yscale("log")
             ticks = LogLocator(subs=(1, 2, 3, 4, 5, 6, 8))
             ax.yaxis.set(major_locator=ticks, major_formatter="{x:g}", minor_locator=NullLocator())

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,11 +19,11 @@ registered: dict[type[Task], type["TaskFigures"]] = {}
 class TaskFigures:
     """Figures of a task. A subclass overrides the methods for which it has figures."""
 
-    def of_run(self, task: Task, folder: Path, links: Links) -> dict:
+    def of_run(self, task: Any, folder: Path, links: Links) -> dict[str, Any]:
         """Figures of one run by file name, drawn from the files in its folder."""
         return {}
 
-    def of_systems(self, task: type[Task], files: Mapping[str, Path], split: str) -> dict:
+    def of_systems(self, task: type[Any], files: Mapping[str, Path], split: str) -> dict[str, Any]:
         """Figures that compare several systems, by file name.
 
         Args:
@@ -53,20 +54,33 @@ def own_scores(file: Path, kind: str) -> dict[str, ndarray]:
 
 
 def scores_of_systems(files: Mapping[str, Path], kind: str) -> dict[str, ndarray]:
-    """The arrays ``<kind>_<model>`` of several ``predictions.npz``: each system's own, then the baselines of the first.
-
-    A baseline with the name of a system and other scores is marked as a baseline.
-    """
-    own, baselines = {}, {}
+    """The arrays ``<kind>_<model>`` of each system's own model, then those of the first system's baselines."""
+    own: dict[str, ndarray] = {}
+    baselines: dict[str, ndarray] = {}
     for name, file in files.items():
         (model, own[name]), *others = own_scores(file, kind).items()
         baselines = baselines or {other: scores for other, scores in others if other != f"{model}_trend"}
-    others = {name: scores for name, scores in baselines.items() if not np.array_equal(own.get(name), scores)}
-    return own | {as_baseline(name) if name in own else name: scores for name, scores in others.items()}
+    marked = {as_baseline(name) if name in own else name: name for name in baselines}
+    return own | {
+        title: baselines[name] for title, name in marked.items() if not np.array_equal(own.get(name), baselines[name])
+    }
 
 
-def examples(scores: Float[ndarray, " t"]) -> dict[int, str]:
-    """Indices of the samples that are shown, with their rank in a score as the name."""
+class Examples(NamedTuple):
+    """Test samples for a figure: labels and predictions (k, *shape), scores, and names of their ranks."""
+
+    labels: ndarray
+    predictions: ndarray
+    scores: Float[ndarray, " k"]
+    names: list[str]
+
+
+def read_examples(file: Path, kind: str) -> Examples:
+    """The samples of ``predictions.npz`` at three ranks of the own model's score ``<kind>_<model>``."""
+    scores = next(iter(own_scores(file, kind).values()))
     order = np.argsort(scores)
     ranks = {"10th percentile": 0.1, "median": 0.5, "90th percentile": 0.9}
-    return {int(order[round(rank * (len(order) - 1))]): name for name, rank in ranks.items()}
+    chosen = {int(order[round(rank * (len(order) - 1))]): name for name, rank in ranks.items()}
+    shown = [*chosen]
+    with np.load(file) as run:
+        return Examples(run["labels"][shown], run["prediction"][shown], scores[shown], [*chosen.values()])

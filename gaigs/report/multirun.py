@@ -1,23 +1,17 @@
-"""The runs of a Hydra multirun, or of several: one table, their spread over seeds, their speed against their error."""
+"""The runs of a Hydra multirun, or of several: one table, and their spread over seeds."""
 
-import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-from matplotlib.figure import Figure
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
 from gaigs.io.files import write_text
-from gaigs.registry import check_type
 from gaigs.report.claims import write_claims
-from gaigs.report.curves import speed_against_error
 from gaigs.report.runs import Run, by_seed, read_runs, train_seconds
-from gaigs.report.style import save
 from gaigs.report.systems import write_systems
-from gaigs.report.table import Spread, columns_of, markdown, metrics_of, terminal, write_csv, written
+from gaigs.report.table import Spread, columns_of, markdown, task_class, terminal, write_csv, written
 
 COSTS = {
     "train_seconds": "training [s]",
@@ -28,30 +22,20 @@ COSTS = {
 """Titles of the costs in ``metrics.json``."""
 
 SEEDS = "Runs that differ in the seed alone: mean ± standard deviation (n - 1), and the least"
-"""Title of the second table."""
 
 
 def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
-    """Rows of the table, each a dictionary by column, and the settings that all runs share.
+    """Rows of the table: runs, then their baselines, once for each split; and the settings that all runs share."""
+    shared: dict[str, object] = {}
 
-    Varied overrides come first, then scores and costs. An unfinished run has a row without scores. The baselines of
-    the runs follow, once for each split.
-    """
-    shared, varied = {}, []
-    for key in columns_of([run.overrides for run in runs]):
-        values = {run.overrides.get(key, "") for run in runs}
-        if len(values) == 1:
-            shared[key] = values.pop()
-        else:
-            varied.append(key)
-    done = [run.metrics for run in runs if run.metrics is not None]
-    facts = []
-    for key in ("split", "seed", "device"):
-        values = {metrics[key] for metrics in done}
-        if len(values) == 1:
-            shared[key] = values.pop()
-        else:
-            facts.append(key)
+    def differing(keys: Sequence[str], sources: Sequence[Mapping]) -> list[str]:
+        values = {key: {source.get(key, "") for source in sources} for key in keys}
+        shared.update({key: next(iter(found)) for key, found in values.items() if len(found) == 1})
+        return [key for key, found in values.items() if len(found) != 1]
+
+    typed = [run.overrides for run in runs]
+    varied = differing(columns_of(typed), typed)
+    facts = differing(("split", "seed", "device"), [run.metrics for run in runs if run.metrics is not None])
 
     rows, baselines = [], {}
     for name, overrides, metrics, *_ in runs:
@@ -73,15 +57,7 @@ def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
 
 
 def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
-    """A row for each group of runs that differ in ``seed`` alone, where two seeds or more have ended.
-
-    Args:
-        runs: All runs of the table.
-        shared: Settings that they share, as ``ablation`` gives them; they are left out.
-
-    Returns:
-        Rows with the group's model, its overrides, its split, its number of ``runs``, and a ``Spread`` of each metric.
-    """
+    """Rows of groups of runs that differ in ``seed`` alone, where two seeds or more have ended."""
     done = [run for run in runs if run.metrics is not None]
     varied = [key for key in columns_of([run.overrides for run in done]) if key != "seed" and key not in shared]
     rows = []
@@ -102,25 +78,21 @@ def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
 
 
 def report(folder: str | Path) -> Group:
-    """Writes ``ablation.csv``, ``ablation.md`` and, if a run has ended, ``speed_against_error.png`` into a folder.
+    """Writes ``ablation.csv`` and ``ablation.md`` into a folder.
 
-    Runs of several models also get the files of ``gaigs.report.systems.write_systems``, and runs of variants those of
-    ``gaigs.report.claims.write_claims``. Runs of several tasks get the latter only.
+    Runs of several models also get the files of ``gaigs.report.systems``, and runs of variants those of
+    ``gaigs.report.claims``. Runs of several tasks get the latter only.
 
     Args:
-        folder: Of a Hydra multirun, or one above several.
+        folder: Folder of a Hydra multirun, or one above several.
 
     Returns:
-        The tables, for a terminal of 80 columns: the runs; groups of runs that differ in the seed alone; the systems;
-        the claims. Metrics that are not brief are in the files only.
+        The tables, for a terminal of 80 columns. Metrics that are not brief are in the files only.
 
     Raises:
-        TypeError: The folder is not a path.
         FileNotFoundError: The folder holds no run.
-        ValueError: The runs make no table.
+        ValueError: A file is damaged, or the runs are of several tasks.
     """
-    if not isinstance(folder, os.PathLike):
-        check_type("folder", folder, Path)
     folder = Path(folder)
     runs = read_runs(folder)
     claims = write_claims(folder, runs)
@@ -130,7 +102,7 @@ def report(folder: str | Path) -> Group:
             return Group(claims)
         listed = ", ".join(f"{task} in {name}" for task, name in tasks.items())
         raise ValueError(f"the runs of a table must be of one task, got {listed}; pass a folder with runs of one")
-    known = next((metrics_of(run.metrics) for run in runs if run.metrics is not None), {})
+    known = task_class(next(iter(tasks))).metrics() if tasks else {}
     titles = {name: metric.title for name, metric in known.items()} | COSTS
     rows, shared = ablation(runs)
     groups = over_seeds(runs, shared)
@@ -142,8 +114,6 @@ def report(folder: str | Path) -> Group:
     if groups:
         page += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
     write_text(folder / "ablation.md", page)
-    if known:
-        save(_speed(runs, rows, shared, titles), folder / "speed_against_error.png")
 
     hidden = {name for name, metric in known.items() if not metric.is_brief} | {"num_gaussians"}
     if not any(row["status"] == "unfinished" for row in rows):
@@ -177,18 +147,3 @@ def _terminal(title: str, rows: list[dict], titles: Mapping[str, str], hidden: s
     lines = [[escape(_text(row.get(column), "\n")) for column in columns] for row in rows]
     styles = [{"unfinished": "red", "baseline": "dim"}.get(row["status"]) for row in rows]
     return terminal(title, heads, lines, caption, styles)
-
-
-def _speed(runs: list[Run], rows: list[dict], shared: Mapping, titles: Mapping[str, str]) -> Figure:
-    done = [(run, row) for run, row in zip(runs, rows, strict=False) if run.metrics is not None]
-    metric = next(iter(titles))
-    names = [
-        " ".join(f"{key}={value}" for key, value in run.overrides.items() if key not in shared) or row["model"]
-        for run, row in done
-    ]
-    if len(set(names)) < len(names):
-        names = [run.name for run, _ in done]
-    numbers = lambda key: np.array([np.nan if row.get(key) is None else row[key] for _, row in done], float)
-    times = {"inference [ms a transmitter]": numbers("inference_ms"), "training [s]": numbers("train_seconds")}
-    baselines = {f"{row['model']} {row.get('split', '')}".strip(): row[metric] for row in rows[len(runs) :]}
-    return speed_against_error(names, numbers(metric), times, titles[metric], baselines)

@@ -17,11 +17,8 @@ from gaigs.gaussians import SH_DC, Gaussians
 from gaigs.placement.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
 from gaigs.report.style import BLUE, GREEN, ORANGE, STYLE
 
-DRAWN = 600
-"""Most Gaussians that are drawn; more would hide each other."""
-
 SHOWN = 0.001
-"""Least share of the power of a plane that is drawn."""
+"""Smallest share of the power of a plane that is drawn."""
 
 VIEWS = ((1, 2), (2, 1))
 """Upward axis and line of sight of plan and side view."""
@@ -31,15 +28,9 @@ VIEWS = ((1, 2), (2, 1))
 def room(links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | None = None) -> Figure:
     """Plan (x, y) and side view (x, z) of the room, to one scale.
 
-    Of the Gaussians the strongest by |signal| times opacity are drawn, each as its ellipse of one standard deviation,
-    the strongest on top. The box shown holds transmitters, receivers and walls, and the middle 80 % of these Gaussians
-    along each axis. Line widths of learnt planes grow with their share of the power. A plane seen nearly from the front
-    is left to the other view. Colour shows the loss by obstacles along the line of sight.
-
-    Args:
-        links: Transmitters, receivers and walls. Axes of the receivers are drawn where directions matter.
-        gaussians: None for a model without.
-        learnt: Planes and obstacles; None for a model that learns none.
+    The 600 strongest Gaussians by |signal| times opacity are drawn, as ellipses of one standard deviation. The box
+    holds transmitters, receivers, walls and the middle 80 % of these Gaussians along each axis. Line widths of learnt
+    planes grow with their share of the power. Colour shows the loss by obstacles along the line of sight.
     """
     train, test = (links.query.transmitters[part].numpy() for part in (links.split.train, links.split.test))
     receivers, edges = _receivers(links), links.edges.numpy()
@@ -47,7 +38,7 @@ def room(links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | 
     corners = [train, test, receivers, edges.reshape(-1, 3)]
     if gaussians is not None:
         strengths = (gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)).cpu().numpy()
-        strongest = np.argsort(strengths)[-DRAWN:]
+        strongest = np.argsort(strengths)[-600:]  # more would hide each other
         parts = gaussians.means.cpu().numpy(), gaussians.covariances.cpu().numpy(), strengths
         means, covariances, strengths = (part[strongest] for part in parts)
         corners.append(np.quantile(means, (0.1, 0.9), axis=0))
@@ -86,12 +77,7 @@ def room(links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | 
 
 
 def paths(links: Links, learnt: LearntRoom) -> Figure:
-    """The learnt paths of a transmitter, folded through the room, in plan (x, y) and side view (x, z).
-
-    Args:
-        links: Receivers and walls.
-        learnt: At least one path, all of one transmitter; and the planes, drawn faintly.
-    """
+    """The learnt paths of a transmitter, at least one, folded through the room, in plan (x, y) and side view (x, z)."""
     receivers, edges = _receivers(links), links.edges.numpy()
     points = [path.points for path in learnt.paths]
     corners = [receivers, edges.reshape(-1, 3), *points]
@@ -121,7 +107,7 @@ def _draw_receivers(ax: Axes, places: Float[ndarray, "receivers 2"], label: str)
     ax.plot(*places.T, "s", color=GREEN, markersize=5, markeredgecolor="white", label=label)
 
 
-def _views(corners: Float[ndarray, "k 3"]) -> tuple[Figure, tuple[Axes, Axes], float]:
+def _views(corners: Float[ndarray, "k 3"]) -> tuple[Figure, tuple[Axes, Axes], np.floating]:
     """Empty plan and side view that contain some points [m], and the length of arrows in them [m]."""
     lower, upper = corners.min(0), corners.max(0)
     arrow = 0.1 * (upper - lower).max()
@@ -161,7 +147,8 @@ def _draw_gaussians(
         edgecolors="white",
         linewidths=0.3,
     )
-    return ax.add_collection(ellipses)
+    ax.add_collection(ellipses)
+    return ellipses
 
 
 def _draw_planes(ax: Axes, planes: list[LearntPlane], view: list[int], along: int) -> None:
@@ -180,7 +167,7 @@ def _draw_planes(ax: Axes, planes: list[LearntPlane], view: list[int], along: in
     ax.add_collection(polygons)
     width, height = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
     needed = np.array((0.14 * width, 0.04 * max(width, height)))  # of a label
-    taken = []
+    taken: list[ndarray] = []
     for plane in shown:
         outward = plane.normal[view] / np.linalg.norm(plane.normal[view])
         flat = plane.corners[:, view] - plane.corners[:, view].mean(0)
@@ -231,7 +218,8 @@ def _draw_paths(ax: Axes, paths: list[LearntPath], view: list[int]) -> LineColle
         clim=(lowest, 0),
         linewidths=0.8 + 1.4 * (1 - powers / lowest),
     )
-    return ax.add_collection(lines)
+    ax.add_collection(lines)
+    return lines
 
 
 def _draw_axes(ax: Axes, position: Float[ndarray, "2"], axes: Float[ndarray, "2 3"]) -> None:

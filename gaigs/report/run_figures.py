@@ -6,7 +6,7 @@ from gaigs.data import Links
 from gaigs.model import Model
 from gaigs.report import figures, style
 from gaigs.report.csi import CsiFigures
-from gaigs.report.curves import loss_curves, read_curves
+from gaigs.report.curves import loss_curves, read_log
 from gaigs.report.room import paths, room
 from gaigs.report.scalar import ScalarFigures
 from gaigs.report.spectrum import SpectrumFigures
@@ -25,27 +25,17 @@ def figures_of(task: type[Task]) -> figures.TaskFigures:
 
 
 def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
-    """Draws a run: its room, its losses and the figures of its task.
+    """Draws the room, the losses and the figures of the task from the files of a run into ``figures/*.png``.
 
-    Args:
-        folder: Of the run. ``predictions.npz``, the files of the task and, of a trained model, ``log/*/metrics.csv``
-            are read from it. The figures go to ``figures/``.
-        links: Data of the run.
-        model: Trained or fitted. Its ``primitives`` and ``learnt_room`` are drawn where it has them.
-
-    Returns:
-        The files, as PNG.
-
-    Raises:
-        FileNotFoundError: The folder lacks a file that a figure needs.
+    The model's ``primitives`` and ``learnt_room`` are drawn if it has them.
     """
     learnt_room = getattr(model, "learnt_room", None)
     learnt = learnt_room(links) if learnt_room else None
     drawn = {"room": room(links, getattr(model, "primitives", None), learnt)}
     if learnt is not None and learnt.paths:
         drawn["paths"] = paths(links, learnt)
-    if losses := sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime):
-        drawn["loss"] = loss_curves(read_curves(losses))
+    if losses := read_log(folder):
+        drawn["loss"] = loss_curves(losses)
     drawn |= figures_of(type(links.task)).of_run(links.task, folder, links)
     (folder / "figures").mkdir(exist_ok=True)
     files = {folder / "figures" / f"{name}.png": figure for name, figure in drawn.items()}

@@ -4,7 +4,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 from omegaconf import OmegaConf
@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gaigs.configuration import differences
 from gaigs.registry import check_type
-from gaigs.report.table import metrics_of
+from gaigs.report.table import task_class
 
 
 class Run(NamedTuple):
@@ -54,44 +54,21 @@ def by_seed(runs: Sequence[Run]) -> list[list[Run]]:
 
 
 def read_metrics(file: Path) -> dict:
-    """Contents of a run's ``metrics.json``, checked for what tables need.
-
-    Raises:
-        ValueError: It is damaged, lacks a key, or is of a task that is not installed here.
-    """
-    costs = "train_seconds", "inference_ms", "render_ms", "num_gaussians", "num_parameters", "checkpoint_bytes"
-    needed = {"task": str, "split": str, "seed": int, "device": str} | dict.fromkeys(costs, float | None)
+    """Contents of a run's ``metrics.json``; a ValueError for a damaged file or a task that is not installed."""
     try:
         metrics = json.loads(file.read_text())
-        if not isinstance(metrics, dict):
-            raise TypeError(f"it must be a mapping, got {metrics!r:.60}")
-        first, *_ = metrics_of(metrics)
-        for key, kind in needed.items():
-            check_type(repr(key), metrics.get(key), kind)
-        _check_scores("models", metrics.get("models"), first)
-        if metrics.get("validation"):
-            _check_scores("validation", metrics["validation"], first)
-        for receiver, models in (metrics.get("receivers") or {}).items():
-            _check_scores(f"receiver {receiver}", models, first)
-    except (AttributeError, TypeError, ValueError, RecursionError) as error:  # JSON and encodings raise a ValueError
+        first, *_ = task_class(metrics["task"]).metrics()
+        for scores in metrics["models"].values():
+            check_type(repr(first), scores[first], float)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:  # JSON and encodings raise a ValueError
         raise ValueError(
-            f"cannot read {file}: {error}; move the file elsewhere, and the run's command writes it anew without "
-            "another training"
+            f"cannot read {file} ({type(error).__name__}: {error})\n"
+            "move it elsewhere, and start the run again, which does not train a second time"
         ) from error
     return metrics
 
 
-def _check_scores(place: str, models: object, first: str) -> None:
-    """Checks that models have scores, among them the one by which runs are compared."""
-    if not isinstance(models, dict) or not models:
-        raise TypeError(f"{place!r} must be the scores of models, got {models!r:.60}")
-    for model, scores in models.items():
-        for name in {first: None, **scores}:
-            check_type(f"{name!r} of {model!r} in {place!r}", scores.get(name), float)
-
-
-def _read_yaml(file: Path, kind: type) -> object:
-    """Contents of one of a job's configuration files."""
+def _read_yaml(file: Path, kind: type) -> Any:
     try:
         content = OmegaConf.to_container(OmegaConf.load(file), resolve=kind is dict)
         check_type("its content", content, kind)
@@ -110,25 +87,19 @@ def read_runs(folder: Path) -> list[Run]:
     runs = []
     for path in folder.glob("**/.hydra/overrides.yaml"):
         own, started = path.parents[1], path.parent / "config.yaml"
-        metrics, stored = own / "metrics.json", own / "config.yaml"
+        stored, file = own / "config.yaml", own / "metrics.json"
         if stored.is_file() and started.is_file() and differences(_read_yaml(stored, dict), _read_yaml(started, dict)):
             raise ValueError(
-                f"{own} holds a run of another configuration than the one last started there, which was refused, and "
-                "Hydra has rewritten its overrides; start the multirun once more as it was at first"
+                f"{own} holds a run of another configuration than the one last started there, and Hydra has rewritten "
+                "its overrides\nstart the first multirun again"
             )
-        overrides = (override.partition("=") for override in _read_yaml(path, list))
-        runs.append(
-            Run(
-                own.relative_to(folder).as_posix(),
-                {key.lstrip("+"): re.sub(r"\\(.)", r"\1", value) for key, _, value in overrides},  # as it was typed
-                read_metrics(metrics) if metrics.is_file() else None,
-                None if metrics.is_file() else _failure(own),
-                own,
-            )
-        )
+        typed = (override.partition("=") for override in _read_yaml(path, list))
+        overrides = {key.lstrip("+"): re.sub(r"\\(.)", r"\1", value) for key, _, value in typed}  # without escapes
+        metrics, failure = (read_metrics(file), None) if file.is_file() else (None, _failure(own))
+        runs.append(Run(own.relative_to(folder).as_posix(), overrides, metrics, failure, own))
     if not runs:
         raise FileNotFoundError(
-            f"{folder} must hold runs, each with its .hydra/overrides.yaml, found none; "
+            f"{folder} must hold runs, each with its .hydra/overrides.yaml\n"
             "pass the folder that Hydra made for 'python -m gaigs --multirun ...'"
         )
     # Text and numbers alternate, so that equal types are compared.

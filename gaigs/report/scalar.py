@@ -23,7 +23,7 @@ from gaigs.report.style import GREY, ORANGE, PAGE, STYLE, round_step
 from gaigs.task.scalar import Scalar, with_unit
 
 PANELS = 6
-"""Most panels of one figure, a panel a receiver."""
+"""Largest number of panels of a figure, a panel a receiver."""
 
 
 class ScalarFigures(TaskFigures):
@@ -35,18 +35,13 @@ class ScalarFigures(TaskFigures):
             transmitters, receiver, labels, predictions = (
                 run[name] for name in ("transmitters", "receiver", "labels", "prediction")
             )
-        names = [one.name for one in links.receivers]
+        gateways = {one.name: one.pose.position.numpy() for one in links.receivers}
         readings = np.column_stack((transmitters[:, :2], labels))
-        maps = radio_maps(
-            RadioMap.load(folder / "radio_map.npz"),
-            {one.name: one.pose.position.numpy() for one in links.receivers},
-            {name: readings[receiver == index] for index, name in enumerate(names)},
-            links.edges.numpy(),
-            task,
-        )
+        measured = {name: readings[receiver == index] for index, name in enumerate(gateways)}
+        radio_map, edges = RadioMap.load(folder / "radio_map.npz"), links.edges.numpy()
         paged = {
-            "predicted_against_measured": predicted_against_measured(labels, predictions, receiver, names, task),
-            "radio_map": maps,
+            "predicted_against_measured": predicted_against_measured(labels, predictions, receiver, [*gateways], task),
+            "radio_map": radio_maps(radio_map, gateways, measured, edges, task),
         }
         # The last hundredth would squeeze all others.
         furthest = max(np.quantile(error, 0.99) for error in errors.values()) or None
@@ -70,17 +65,10 @@ def predicted_against_measured(
     names: Sequence[str],
     task: Scalar,
 ) -> list[Figure]:
-    """Histogram of test readings over label and prediction, one panel a receiver, all on the same axes.
+    """Histogram of test readings over label and prediction [task.unit], one panel a receiver, all on the same axes.
 
-    Args:
-        labels: Measured [task.unit].
-        predictions: Of the run's own model [task.unit]. One more than 20 cells outside the labels is drawn there.
-        receiver: Of each reading, an index into the names.
-        names: Of the receivers; one without readings has no panel.
-        task: Gives the quantity and its units.
-
-    Returns:
-        A figure for every ``PANELS`` receivers.
+    A prediction more than 20 cells outside the labels is drawn there. A receiver without readings has no panel.
+    ``receiver`` is an index into the names of each reading.
     """
     errors, unit = np.abs(predictions - labels), task.error_unit
     # Equal labels have no range: the cell's width then suits their size, or is 1.
@@ -126,21 +114,12 @@ def radio_maps(
     radio_map: RadioMap,
     gateways: Mapping[str, Float[ndarray, "3"]],
     readings: Mapping[str, Float[ndarray, "k 3"]],
-    edges: Float[ndarray, "k 2 3"],
+    edges: Float[ndarray, "s 2 3"],
     task: Scalar,
 ) -> list[Figure]:
-    """The map of each receiver in a panel, all with the same axes and colours.
+    """The map of each receiver in a panel, all with the same axes and colours, and the walls on the floor [m].
 
-    Args:
-        radio_map: Predictions.
-        gateways: Positions of the receivers by name [m].
-        readings: x, y [m] and label [task.unit] of each receiver's measurements, by name; at most 100 of each are
-            drawn, evenly chosen in the order given.
-        edges: Line segments of the room [m]; those on its floor are drawn.
-        task: Gives the quantity and its units.
-
-    Returns:
-        A figure for every ``PANELS`` receivers.
+    ``readings`` are x, y [m] and label [task.unit] by receiver; at most 100 of each, evenly chosen, are drawn.
     """
     dots = {name: readings[name][:: -(-len(readings[name]) // 100) or 1] for name in radio_map.receivers}
     limits, step = _scale(radio_map.values, np.concatenate([dot[:, 2] for dot in dots.values()]), task.error_unit)
@@ -161,7 +140,7 @@ def radio_maps(
     with rc_context(STYLE):
         for first in range(0, len(radio_map.receivers), PANELS):
             names = radio_map.receivers[first : first + PANELS]
-            figure, axes = _panels(len(names), *(upper - lower), "x [m]", "y [m]")
+            figure, axes = _panels(len(names), upper[0] - lower[0], upper[1] - lower[1], "x [m]", "y [m]")
             for ax, name, values in zip(axes, names, radio_map.values[first:], strict=False):
                 image = ax.imshow(values, **place, **colours)
                 levels = _levels(values, limits, step)
@@ -205,13 +184,7 @@ def _levels(values: Float[ndarray, "rows columns"], limits: Mapping[str, float],
 
 
 def _panels(count: int, width: float, height: float, xlabel: str, ylabel: str) -> tuple[Figure, list[Axes]]:
-    """Panels with common axes, as large as a page allows, and room for a colour bar, titles and a legend.
-
-    Args:
-        count: Panels of the figure.
-        width, height: Extent of a panel's axes, in one unit.
-        xlabel, ylabel: Of the outer panels.
-    """
+    """Panels with common axes of an extent in one unit, as large as a page with colour bar and legend allows."""
     bar, title, foot = 1.5, 0.25, 0.65  # inches beside all, above each and below all
     scale = lambda columns: min((PAGE - bar) / (columns * width), 5.6 / (ceil(count / columns) * height), 3 / height)
     columns = max(range(1, count + 1), key=scale)

@@ -1,6 +1,6 @@
 """Figures of spatial spectra, over azimuth and elevation or as the sky above the array."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from math import ceil
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from gaigs.data import Links
 from gaigs.report.curves import cdf
-from gaigs.report.figures import TaskFigures, examples, own_scores, scores_of_systems
+from gaigs.report.figures import Examples, TaskFigures, own_scores, read_examples, scores_of_systems
 from gaigs.report.style import PAGE, STYLE
 from gaigs.task.spectrum import Spectrum
 
@@ -25,18 +25,14 @@ class SpectrumFigures(TaskFigures):
     """Example spectra and the distribution of SSIM."""
 
     def of_run(self, task: Spectrum, folder: Path, links: Links) -> dict[str, Figure]:
-        scores = own_scores(folder / "predictions.npz", "ssim")
-        own = next(iter(scores.values()))
-        names = examples(own)
-        shown = list(names)
-        with np.load(folder / "predictions.npz") as run:
-            labels, predictions = run["labels"][shown], run["prediction"][shown]
-        grid = (np.rad2deg(angles.numpy()) for angles in (task.directions.elevations, task.directions.azimuths))
-        drawn = labels, predictions, own[shown], list(names.values()), *grid
+        file = folder / "predictions.npz"
+        shown = read_examples(file, "ssim")
+        grid = task.directions
+        elevations, azimuths = (np.rad2deg(angles.numpy()) for angles in (grid.elevations, grid.azimuths))
         return {
-            "spectra": spectra(*drawn),
-            "spectra_polar": spectra(*drawn, polar=True),
-            "ssim_cdf": cdf(scores, "SSIM", "spectra", links.split.name, (None, 1)),
+            "spectra": spectra(shown, elevations, azimuths),
+            "spectra_polar": spectra(shown, elevations, azimuths, polar=True),
+            "ssim_cdf": cdf(own_scores(file, "ssim"), "SSIM", "spectra", links.split.name, (None, 1)),
         }
 
     def of_systems(self, task: type[Spectrum], files: Mapping[str, Path], split: str) -> dict[str, Figure]:
@@ -56,36 +52,20 @@ class SpectrumFigures(TaskFigures):
 
 
 def spectra(
-    labels: Float[ndarray, "k rows columns"],
-    predictions: Float[ndarray, "k rows columns"],
-    ssim: Float[ndarray, " k"],
-    names: Sequence[str],
-    elevations: Float[ndarray, " rows"],
-    azimuths: Float[ndarray, " columns"],
-    polar: bool = False,
+    shown: Examples, elevations: Float[ndarray, " rows"], azimuths: Float[ndarray, " columns"], polar: bool = False
 ) -> Figure:
-    """Label, prediction and signed error, one transmitter a row.
+    """Label, prediction and signed error over azimuth and elevation [deg], one transmitter a row.
 
-    Args:
-        labels: Measured spectra, amplitudes in [0, 1].
-        predictions: Predicted spectra; values outside [0, 1] take the colour of the nearer end.
-        ssim: Score of each prediction.
-        names: Names of the rows.
-        elevations: Of the pixels' rows [deg].
-        azimuths: Of the pixels' columns [deg].
-        polar: The zenith in the middle and azimuth around it, instead of azimuth across and elevation upwards.
+    A polar figure has the zenith in the middle. Amplitudes outside [0, 1] take the colour of the nearer end.
     """
-    labels, predictions = labels.astype(np.float32), predictions.astype(np.float32)
+    labels, predictions = shown.labels.astype(np.float32), shown.predictions.astype(np.float32)
     errors = predictions - labels
     limit = float(np.abs(errors).max()) or 1.0  # a perfect prediction still needs a colour scale
+    difference = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     columns = (
-        (labels, AMPLITUDE, [f"Label, {name}" for name in names]),
-        (predictions, AMPLITUDE, [f"Prediction, SSIM {score:.3f}" for score in ssim]),
-        (
-            errors,
-            {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit},
-            [f"Error, MAE {np.abs(error).mean():.3f}" for error in errors],
-        ),
+        (labels, AMPLITUDE, [f"Label, {name}" for name in shown.names]),
+        (predictions, AMPLITUDE, [f"Prediction, SSIM {score:.3f}" for score in shown.scores]),
+        (errors, difference, [f"Error, MAE {np.abs(error).mean():.3f}" for error in errors]),
     )
     draw = _draw_sky if polar else _draw_plane
     edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
@@ -110,13 +90,7 @@ def side_by_side(
     elevations: Float[ndarray, " rows"],
     azimuths: Float[ndarray, " columns"],
 ) -> Figure:
-    """Several spectra, e.g. a measured one and its predictions by several systems.
-
-    Args:
-        panels: Spectra by title; values outside [0, 1] take the colour of the nearer end.
-        elevations: Of the rows [deg].
-        azimuths: Of the columns [deg].
-    """
+    """Spectra by title on one grid [deg], e.g. a measured one and its predictions by several systems."""
     columns = min(4, len(panels))
     rows = ceil(len(panels) / columns)
     edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)

@@ -55,7 +55,7 @@ def save(figure: Figure, file: Path) -> None:
 
 
 def round_step(span: float, most: int) -> float:
-    """The smallest step, 1, 2 or 5 times a power of ten, of which at most ``most`` cover a span above 0."""
+    """The smallest step, 1, 2 or 5 times a power of ten, that covers a span above 0 by at most ``most`` steps."""
     least = span / most
     power = 10.0 ** math.floor(math.log10(least))
     return next((step * power for step in (1, 2, 5) if step * power >= least), 10 * power)

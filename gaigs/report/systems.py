@@ -1,8 +1,7 @@
-"""Runs of several models as one table in the form of the paper's: published figures beside ours, times and sizes."""
+"""Runs of several models as one table: published figures beside ours, times and sizes."""
 
 import math
-import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,12 +13,11 @@ from rich.table import Table
 
 from gaigs.configuration import conf_dir, plugin_conf_dirs
 from gaigs.io.files import write_text
-from gaigs.registry import registry
 from gaigs.report.curves import learning_curves, read_validations
 from gaigs.report.run_figures import figures_of
 from gaigs.report.runs import Run, as_baseline, by_seed, train_seconds
 from gaigs.report.style import save
-from gaigs.report.table import Spread, latex, markdown, monitor_names, terminal, tex, write_csv, written
+from gaigs.report.table import Spread, markdown, monitor_names, task_class, terminal, write_csv, written
 
 COSTS = {
     "train_seconds": "training [s]",
@@ -31,22 +29,6 @@ COSTS = {
 }
 """Titles of the costs in ``metrics.json``, in the order of the table."""
 
-BRIEF = ("train_seconds", "inference_ms", "num_parameters")
-"""Costs of the terminal's table."""
-
-
-class Published(NamedTuple):
-    """Figures of publications.
-
-    Attributes:
-        names: Names of models for a reader, by registered name; in the order of the rows.
-        scores, costs: For each task columns with ``title``, ``source``, and ``figures`` by model.
-    """
-
-    names: dict[str, str]
-    scores: dict[str, list[dict]]
-    costs: dict[str, list[dict]]
-
 
 class System(NamedTuple):
     """A row of the table.
@@ -55,8 +37,8 @@ class System(NamedTuple):
         model: Registered name.
         name: Name for a reader.
         runs: Runs that ended, one a seed; empty for a baseline.
-        values: Of each metric and cost, one a run; a baseline has one of each metric.
-        failures: Of each run that has not ended, its seed where several vary, and the cause.
+        values: Values of each metric and cost, one a run.
+        failures: Seed and cause of each run that has not ended.
         varied: True if its runs differ from others in more than model and seed.
     """
 
@@ -68,37 +50,30 @@ class System(NamedTuple):
     varied: bool = False
 
 
-def read_published() -> Published:
-    """Contents of ``published.yaml`` in the configuration folder of gaigs and in those of plug-ins.
+def read_published() -> dict[str, dict]:
+    """Contents of ``published.yaml`` of gaigs and of plug-ins; a ValueError for a file of another form.
 
-    Raises:
-        ValueError: A file does not have the form of gaigs's own.
+    ``names`` of models are in the order of the rows. ``scores`` and ``costs`` have for each task columns with
+    ``title``, ``source``, and ``figures`` by model.
     """
-    found = Published({}, {}, {})
+    found: dict[str, dict] = {"names": {}, "scores": {}, "costs": {}}
     for file in (folder / "published.yaml" for folder in (conf_dir(), *plugin_conf_dirs())):
         if not file.is_file():
             continue
         try:
             content = yaml.safe_load(file.read_text())
-            found.names.update(content.get("names", {}))
-            for there, here in ((found.scores, content.get("scores", {})), (found.costs, content.get("costs", {}))):
-                for task, columns in here.items():
-                    parts = ({key: column[key] for key in ("title", "source", "figures")} for column in columns)
-                    there[task] = [*there.get(task, []), *parts]
+            found["names"].update(content.get("names", {}))
+            for part in ("scores", "costs"):
+                for task, columns in content.get(part, {}).items():
+                    columns = [{key: column[key] for key in ("title", "source", "figures")} for column in columns]
+                    found[part].setdefault(task, []).extend(columns)
         except (AttributeError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
             raise ValueError(f"{file} must have the form of conf/published.yaml: {error!r}") from error
     return found
 
 
 def find_systems(runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapping, names: Mapping) -> list[System]:
-    """Rows of the table. Runs that differ in the seed alone are one row. Baselines that are no system come last.
-
-    Args:
-        runs: Of the multirun.
-        baselines: Rows of ``gaigs.report.multirun.ablation``.
-        shared: Settings that the runs share.
-        names: Names of models for a reader.
-    """
+    """Rows of the table. Runs that differ in the seed alone are one row. Baselines that are not systems come last."""
     rows = []
     for group in by_seed(runs):
         overrides = group[0].overrides
@@ -141,12 +116,8 @@ def _costs(metrics: Mapping) -> dict[str, float | None]:
     return costs
 
 
-def _mean(value: float | Spread) -> float:
-    return value.mean if isinstance(value, Spread) else value
-
-
 def _cells(systems: Sequence[System], published: Sequence[Mapping], titles: Mapping[str, str]) -> list[dict]:
-    """Rows by title: published figures, of systems that are not varied, then ours; empty columns are left out."""
+    """Rows by title: published figures of systems in their usual setting, then ours; empty columns are left out."""
     rows = []
     for system in systems:
         figures = {f"published {column['title']}": column["figures"].get(system.model) for column in published}
@@ -160,109 +131,65 @@ def _cells(systems: Sequence[System], published: Sequence[Mapping], titles: Mapp
     ]
 
 
-def _texts(
-    systems: Sequence[System],
-    rows: Sequence[Mapping],
-    better: Mapping[str, bool],
-    bold: str,
-    quoted: Callable[[str], str] = str,
-    missing: str = "",
-) -> list[list[str]]:
-    """Lines of a table as text: name and numbers of each system, the best of a column in bold.
-
-    Args:
-        systems: One a line.
-        rows: Their numbers by title.
-        better: By title, True if a higher number is better; columns that are not there have no best.
-        bold: Format of bold text.
-        quoted: Gives a text in the table's language.
-        missing: Text of a number that is not there.
-    """
+def _texts(rows: Sequence[Mapping], better: Mapping[str, bool], bold: str) -> list[list[str]]:
+    """Lines of a table as text, the best of each column with an entry in ``better`` in the format ``bold``."""
+    mean = lambda value: value.mean if isinstance(value, Spread) else value
     best = {}
     for title in better.keys() & rows[0].keys():
-        means = [_mean(row[title]) for row in rows if row[title] is not None]
+        means = [mean(row[title]) for row in rows if row[title] is not None]
         best[title] = (max if better[title] else min)(means) if len(means) > 1 else None
-    lines = []
-    for system, row in zip(systems, rows, strict=True):
-        line = [quoted(system.name)]
-        for title, value in row.items():
-            text = missing if value is None else quoted(written(value))
-            is_best = value is not None and _mean(value) == best.get(title)
-            line.append(bold.format(text) if is_best else text)
-        lines.append(line)
-    return lines
+    return [
+        [
+            bold.format(written(value)) if value is not None and mean(value) == best.get(title) else written(value)
+            for title, value in row.items()
+        ]
+        for row in rows
+    ]
 
 
 def write_systems(
     folder: Path, runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapping, known: Mapping
 ) -> Table | None:
-    """Writes ``systems.md``, ``systems.csv``, ``systems.tex`` and the figures that compare the systems.
+    """Writes ``systems.md``, ``systems.csv`` and the figures that compare the systems.
 
-    Args:
-        folder: Gets the files.
-        runs: Of the multirun.
-        baselines: Rows of ``gaigs.report.multirun.ablation``.
-        shared: Settings that the runs share.
-        known: Metrics of the task.
-
-    Returns:
-        A table for a terminal; None, and no files, where the runs that ended are not of several models.
+    ``baselines`` and ``shared`` are results of ``gaigs.report.multirun.ablation``, ``known`` the metrics of the task.
+    The result is None, and there are no files, unless runs of several models have ended.
     """
     published = read_published()
-    systems = find_systems(runs, baselines, shared, published.names)
+    systems = find_systems(runs, baselines, shared, published["names"])
     done = [system for system in systems if system.runs]
     if len({system.model for system in done}) < 2:
         return None
     task = done[0].runs[0].metrics["task"]
     failed = [f"{system.name}: {failure}" for system in systems for failure in system.failures]
     systems = [system for system in systems if system.values]
-    columns = [*published.scores.get(task, ()), *published.costs.get(task, ())]
+    columns = [published[part].get(task, []) for part in ("scores", "costs")]
     better = {metric.title: metric.higher_is_better for metric in known.values()}
-    scores = _cells(systems, published.scores.get(task, ()), {name: metric.title for name, metric in known.items()})
-    costs = _cells(systems, published.costs.get(task, ()), COSTS)
+    titles = {name: metric.title for name, metric in known.items()}
+    scores, costs = (_cells(systems, *parts) for parts in zip(columns, (titles, COSTS), strict=True))
 
-    lines = zip(systems, scores, costs, strict=True)
-    whole = [{"system": system.name, "model": system.model} | a | b for system, a, b in lines]
-    write_csv(folder / "systems.csv", whole, (", sd",))
+    lines = [*zip(systems, scores, costs, strict=True)]
+    rows = [{"system": system.name, "model": system.model} | a | b for system, a, b in lines]
+    write_csv(folder / "systems.csv", rows, (", sd",))
     notes = [", ".join(f"{key}={value}" for key, value in shared.items())]
-    notes += [f"- published {column['title']}: {column['source']}" for column in columns]
+    notes += [f"- published {column['title']}: {column['source']}" for part in columns for column in part]
     notes += [f"- without a result: {failure}" for failure in failed]
-    pages = [markdown([["system", *rows[0]], *_texts(systems, rows, better, "**{}**")]) for rows in (scores, costs)]
+    pages = []
+    for part in (scores, costs):
+        rows = [{"system": system.name} | row for system, row in zip(systems, part, strict=True)]
+        pages.append(markdown([[*rows[0]], *_texts(rows, better, "**{}**")]))
     write_text(folder / "systems.md", "\n".join([*pages, *notes]) + "\n")
-    pages = [
-        latex([["Method", *map(tex, rows[0])], *_texts(systems, rows, better, r"\textbf{{{}}}", tex, "--")])
-        for rows in (scores, costs)
-    ]
-    write_text(folder / "systems.tex", "\n".join(pages))
     for name, figure in _figures(done, task, known).items():
         save(figure, folder / f"systems_{name}.png")
 
     brief = [title for title in scores[0] if title.startswith("published ")][-1:]
     brief += [metric.title for metric in known.values() if metric.is_brief and metric.title in scores[0]]
-    brief += [COSTS[key] for key in BRIEF if COSTS[key] in costs[0]]
-    rows = [{title: (a | b)[title] for title in brief} for a, b in zip(scores, costs, strict=True)]
-    return terminal(
-        "Systems",
-        {"system": False} | dict.fromkeys(brief, True),
-        _texts(systems, rows, better, "[bold]{}[/bold]", escape),
-        "".join(f"{failure}\n" for failure in failed) + "all columns in systems.md",
-        [None if system.runs else "dim" for system in systems],
-    )
-
-
-def _have_same_labels(files: Iterable[Path]) -> bool:
-    """True if all files are predictions of the same test links, to judge by their labels, and can be read."""
-    first = None
-    for file in files:
-        try:
-            with file.open("rb") as stream, np.load(stream) as run:  # numpy would not close a damaged file
-                labels = run["labels"]
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-            return False
-        first = labels if first is None else first
-        if not np.array_equal(first, labels):
-            return False
-    return first is not None
+    brief += [COSTS[key] for key in ("train_seconds", "inference_ms", "num_parameters") if COSTS[key] in costs[0]]
+    rows = [{"system": escape(system.name)} | {title: (a | b)[title] for title in brief} for system, a, b in lines]
+    caption = "".join(f"{failure}\n" for failure in failed) + "all columns in systems.md"
+    styles = [None if system.runs else "dim" for system in systems]
+    heads = {"system": False} | dict.fromkeys(brief, True)
+    return terminal("Systems", heads, _texts(rows, better, "[bold]{}[/bold]"), caption, styles)
 
 
 def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict[str, Figure]:
@@ -275,21 +202,26 @@ def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict[str, Fig
     splits = {run.metrics["split"] for run in firsts.values()}
     if len(splits) > 1:
         return {}
-    figures, kind = {}, registry("task").get(task)
+    figures: dict[str, Figure] = {}
+    kind = task_class(task)
     files = {name: run.folder / "predictions.npz" for name, run in firsts.items()}
     files = {name: file for name, file in files.items() if file.is_file()}
-    if _have_same_labels(files.values()):
+    labels = set()  # the same labels: the same test links
+    for file in files.values():
+        with np.load(file) as run:
+            labels.add(hash(run["labels"].tobytes()))
+    if len(labels) == 1:
         figures |= figures_of(kind).of_systems(kind, files, *splits)
     monitor, mean = monitor_names(task)
     curves = {}
     for name, run in firsts.items():
-        if points := [(p.seconds, p.score) for p in read_validations(run.folder, monitor) if math.isfinite(p.seconds)]:
+        if points := [point for _, *point in read_validations(run.folder, monitor) if math.isfinite(point[0])]:
             curves[name] = tuple(zip(*points, strict=True))
     if curves and mean is not None:
         own = {next(iter(firsts[name].metrics["models"])) for name in curves}
         own |= {f"{name}_trend" for name in own}  # a run's own model without its kriging
-        validation = next((run.metrics["validation"] for run in firsts.values() if run.metrics.get("validation")), {})
+        validations = (run.metrics.get("validation") for run in firsts.values())
+        validation: dict[str, dict] = next(filter(None, validations), {})
         lines = {name: scores[mean] for name, scores in validation.items() if name not in own}
-        score = known[mean]
-        figures["curves"] = learning_curves(curves, f"{score.title}, validation", lines, score.higher_is_better)
+        figures["curves"] = learning_curves(curves, lines, known[mean])
     return figures

@@ -1,4 +1,4 @@
-"""Tables for terminals, Markdown, LaTeX and CSV; the scores of a run beside those of its baselines."""
+"""Tables for terminals, Markdown and CSV; the scores of a run beside those of its baselines."""
 
 import csv
 import statistics
@@ -13,16 +13,11 @@ from rich.table import Table
 
 from gaigs.io.files import atomic_write
 from gaigs.registry import registry
-
-TEX = str.maketrans(
-    {sign: f"\\{sign}" for sign in "&%_#${}"}
-    | {"±": r"$\pm$", "–": "--", "²": r"\textsuperscript{2}"}
-    | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
-)
+from gaigs.task import Metric, Task
 
 
 class Spread(NamedTuple):
-    """A number of several runs: mean, standard deviation of the sample, least value."""
+    """A number of two runs or more: mean, standard deviation of the sample, least value."""
 
     mean: float
     deviation: float
@@ -30,30 +25,18 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Spread":
-        """The spread of two values or more."""
         return cls(statistics.mean(values), statistics.stdev(values), min(values))
 
 
-def metrics_of(metrics: Mapping) -> dict:
-    """``Metric`` of each number of a run's table by name, in the order of its task.
-
-    Args:
-        metrics: Contents of ``metrics.json``.
-
-    Raises:
-        ValueError: The key ``task`` is missing, or that task is not installed here.
-    """
-    if "task" not in metrics:
-        raise ValueError(
-            f"metrics.json must have the key 'task', got {', '.join(metrics)}; one without is of an earlier version of "
-            "gaigs: do the run anew, in another folder"
-        )
-    return registry("task").get(metrics["task"]).metrics()
+def task_class(name: str) -> type[Task]:
+    """The class of a task; a ValueError if the task is not installed."""
+    kind: type[Task] = registry("task").get(name)
+    return kind
 
 
 def monitor_names(task: str) -> tuple[str, str | None]:
     """The score that picks a task's best checkpoints, and the metric that is its mean, if there is one."""
-    kind = registry("task").get(task)
+    kind = task_class(task)
     known = kind.metrics()
     monitor = kind.monitor if isinstance(kind.monitor, str) else next(iter(known))  # a property of the instance
     return monitor, next((name for name in (f"{monitor}_mean", monitor) if name in known), None)
@@ -78,10 +61,7 @@ def columns_of(rows: Iterable[Mapping]) -> list[str]:
 def write_csv(file: Path, rows: Sequence[Mapping], spread: Sequence[str] = ()) -> None:
     """Writes a line for each row; a column is there if a row has it.
 
-    Args:
-        file: To be written.
-        rows: Cells by column. A ``Spread`` takes several columns: the mean, and behind it deviation and least value.
-        spread: Ends of the names of deviation and, if it is wanted, least value.
+    A ``Spread`` takes several columns: mean, deviation and least value, named with the ends ``spread``.
     """
     wide = {column for row in rows for column, value in row.items() if isinstance(value, Spread)}
     ends = lambda column: ["", *spread] if column in wide else [""]
@@ -98,29 +78,17 @@ def write_csv(file: Path, rows: Sequence[Mapping], spread: Sequence[str] = ()) -
 def terminal(
     title: str, heads: Mapping[str, bool], lines: Sequence[Sequence[str]], caption: str, styles: Sequence = ()
 ) -> Table:
-    """A table for a terminal.
+    """A table of cells in Rich's markup for a terminal.
 
-    Args:
-        title: Above the table.
-        heads: Of the columns, and True for columns of numbers; these are not broken into lines.
-        lines: Cells in Rich's markup.
-        caption: Below the table.
-        styles: Of the lines; empty for plain ones.
+    A head with True is of a column of numbers, which are not broken into lines.
     """
     table = Table(title=escape(title), caption=escape(caption), box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for head, is_number in heads.items():
-        justify = "right" if is_number else "left"
-        table.add_column(
-            stacked(head) if is_number else escape(head), justify=justify, no_wrap=is_number, overflow="fold"
-        )
+        head, justify = (stacked(head), "right") if is_number else (escape(head), "left")
+        table.add_column(head, justify=justify, no_wrap=is_number, overflow="fold")
     for line, style in zip(lines, styles or [None] * len(lines), strict=True):
         table.add_row(*line, style=style)
     return table
-
-
-def tex(text: str) -> str:
-    """A text with LaTeX's special characters escaped."""
-    return text.translate(TEX)
 
 
 def markdown(lines: Sequence[Sequence[str]]) -> str:
@@ -130,27 +98,15 @@ def markdown(lines: Sequence[Sequence[str]]) -> str:
     return "".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |\n" for line in ruled)
 
 
-def latex(lines: Sequence[Sequence[str]]) -> str:
-    """A ``tabular`` with the rules of the package booktabs, of cells in LaTeX; the first line is the head."""
-    head, *rows = (" & ".join(line) + r" \\" for line in lines)
-    start = rf"\begin{{tabular}}{{l{'c' * (len(lines[0]) - 1)}}}"
-    return "\n".join([start, r"\toprule", head, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}"]) + "\n"
-
-
 def stacked(title: str) -> str:
     """The head of a narrow column, a word a line."""
     return escape(title.replace(" ", "\n"))
 
 
 def metrics_table(metrics: Mapping) -> Group:
-    """Models down, metrics across, the best of each metric in bold; below it the same models at each receiver.
-
-    Args:
-        metrics: Contents of ``metrics.json``: ``task``, ``split``, ``device``, of a run ``seed``, and ``models`` with
-            the test scores of each. ``validation`` has scores on the validation links, if there are any; the first
-            metric is shown. ``receivers`` has ``models`` for each of several receivers.
-    """
-    known, models, validation = metrics_of(metrics), metrics["models"], metrics.get("validation") or {}
+    """Models down, metrics across, the best of each metric in bold; below it the same models at each receiver."""
+    known, models = task_class(metrics["task"]).metrics(), metrics["models"]
+    validation = metrics.get("validation") or {}
     has = lambda name: all(name in scores for scores in models.values())
     # A terminal has room for five metrics; of more, only the brief ones are shown.
     names = [name for name, metric in known.items() if has(name) and (metric.is_brief or len(known) <= 5)]
@@ -172,7 +128,7 @@ def metrics_table(metrics: Mapping) -> Group:
     return Group(table, *([_receivers_table(metrics["receivers"], known)] if metrics.get("receivers") else []))
 
 
-def _receivers_table(receivers: Mapping, known: dict) -> Table:
+def _receivers_table(receivers: Mapping, known: Mapping[str, Metric]) -> Table:
     """Receivers down, models across: the first metric."""
     name, metric = next(iter(known.items()))
     table = Table("receiver", title=f"{escape(metric.title)} at each receiver")
@@ -191,13 +147,9 @@ def _cells(models: Mapping, name: str, higher_is_better: bool) -> dict[str, str]
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence that compares the run's own model, the first of ``models``, with the baselines by the first metric.
-
-    Args:
-        metrics: As for ``metrics_table``.
-    """
+    """A sentence that compares the run's own model, the first of ``models``, with the baselines by the first metric."""
     (model, own), *others = metrics["models"].items()
-    name, metric = next(iter(metrics_of(metrics).items()))
+    name, metric = next(iter(task_class(metrics["task"]).metrics().items()))
     quantity, _, unit = metric.title.removesuffix("]").partition(" [")
     digits, unit = (2, f" {unit}") if unit else (3, "")
     stands = []

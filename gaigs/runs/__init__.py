@@ -4,12 +4,16 @@ import json
 import logging
 from pathlib import Path
 
+from rich.console import Console
+
 from gaigs.data import load
 from gaigs.io.files import write_text
 from gaigs.model import call_optional
 from gaigs.processes import is_first, limited_threads, only_run
 from gaigs.radio_maps import has_radio_map, radio_map
 from gaigs.registry import registry
+from gaigs.report.runs import read_metrics
+from gaigs.report.table import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store
 
 log = logging.getLogger(__name__)
@@ -20,30 +24,31 @@ def run(config: dict, folder: Path) -> dict | None:
 
     Args:
         config: The resolved configuration.
-        folder: Gets ``config.yaml``, ``best.ckpt``, ``last.ckpt``, ``log/``, ``predictions.npz``, the model's exports,
-            ``radio_map.npz`` where a label is one real number, ``figures/`` and at last ``metrics.json``. A finished
-            run is not repeated. One run holds the folder at a time.
+        folder: The run folder of docs/start.md. A finished run is not repeated. One run holds the folder at a time.
 
     Returns:
         The contents of ``metrics.json``; None in all but the first of several processes.
 
     Raises:
-        TypeError: A value of the configuration has the wrong type.
-        ValueError: The configuration does not fit the data, the folder holds another run, or a file in it is damaged.
-        FileNotFoundError: The data do not exist.
-        OSError: A file cannot be written, e.g. because the disk is full; no partial file is left.
-        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it and SIGTERM within the training.
+        TypeError, ValueError, OSError, KeyboardInterrupt: As for ``gaigs.run``.
     """
     with limited_threads(config["threads"]):
         if not is_first():
             logging.getLogger("gaigs").setLevel(logging.WARNING)  # the first process logs for all
             train_and_test(config, folder)
             return None
-        metrics = _in_folder(config, folder)
-    from rich.console import Console
-
-    from gaigs.report.table import metrics_table, verdict
-
+        folder.mkdir(parents=True, exist_ok=True)
+        with only_run(folder):
+            claim(folder, config)
+            finished = folder / "metrics.json"
+            if finished.is_file():
+                log.info("finished already: %s", finished)
+                metrics = read_metrics(finished)
+            else:
+                metrics = train_and_test(config, folder)
+                if not is_configuration(folder / "config.yaml"):  # loggers make a removed folder again
+                    store(config, folder)
+                write_text(finished, json.dumps(metrics, indent=2) + "\n")
     console = Console()
     console.print(metrics_table(metrics))
     console.print(verdict(metrics))
@@ -51,30 +56,8 @@ def run(config: dict, folder: Path) -> dict | None:
     return metrics
 
 
-def _in_folder(config: dict, folder: Path) -> dict:
-    """The contents of ``metrics.json``, of a finished run or of this one."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with only_run(folder):
-        claim(folder, config)
-        finished = folder / "metrics.json"
-        if finished.is_file():
-            from gaigs.report.runs import read_metrics
-
-            log.info("finished already: %s", finished)
-            return read_metrics(finished)
-        metrics = train_and_test(config, folder)
-        if not is_configuration(folder / "config.yaml"):  # the folder was removed, and loggers have made it again
-            store(config, folder)
-        write_text(finished, json.dumps(metrics, indent=2) + "\n")
-    return metrics
-
-
 def train_and_test(config: dict, folder: Path) -> dict | None:
-    """A run without its folder's claim and the terminal's tables.
-
-    Returns:
-        The contents of ``metrics.json``; None in all but the first process.
-    """
+    """Contents of ``metrics.json`` of a run in a claimed folder; None in all but the first process."""
     import lightning
 
     lightning.seed_everything(config["seed"], verbose=False)

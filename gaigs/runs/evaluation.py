@@ -35,12 +35,7 @@ Scores = dict[str, dict[str, Tensor]]
 
 
 def build_baselines(configurations: Sequence[str | Mapping], own: str, scene: Scene) -> dict[str, Model]:
-    """The baselines of a run by name, not fitted; the one with the run's own model name is left out.
-
-    Args:
-        configurations: Names or configurations of models without a training.
-        own: Name of the run's model.
-        scene: Receivers and task.
+    """The baselines of a run by name, not fitted; the one with the name ``own`` of the run's model is left out.
 
     Raises:
         ValueError: A baseline has no name, an unknown one or options that do not fit, has to be trained, or two have
@@ -103,9 +98,9 @@ class Evaluation(JupyterMixin):
         return Group(metrics_table(facts), verdict(facts))
 
     def __str__(self) -> str:
-        console = Console(file=io.StringIO(), width=120)
-        console.print(self)
-        return console.file.getvalue().rstrip()
+        text = io.StringIO()
+        Console(file=text, width=120).print(self)
+        return text.getvalue().rstrip()
 
 
 def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | None = None) -> Evaluation:
@@ -149,14 +144,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | No
 def score(
     models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links, folder: Path | None = None
 ) -> Scores:
-    """Scores of every test link.
-
-    Args:
-        models: Fitted models by name; predictions of the first are written.
-        look_ups: Models without a training by name, not fitted.
-        links: The whole data set.
-        folder: Gets ``predictions.npz``; None: no file.
-    """
+    """Scores of every test link by fitted models and by look-ups; a folder gets predictions of the first."""
     task, index = links.task, links.split.test
     labels = torch.cat([links.labels[part] for part in index.split(BATCH)])
     query = links.query[index]
@@ -183,23 +171,13 @@ def score(
 
 
 def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
-    """Scores of every validation link; empty without such links.
-
-    Args:
-        models: Models by name that have not been fitted to the validation links.
-        look_ups: Models without a training by name, not fitted.
-        links: The whole data set.
-    """
+    """Scores of every validation link, by models that have not been fitted to these links; empty without such links."""
     split = links.split
     if not len(split.validation):
         return {}
-    unseen = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
-    labels = torch.cat([links.labels[part] for part in split.validation.split(BATCH)])
-    scores = {}
-    for name in [*models, *look_ups]:
-        model = models[name] if name in models else fitted(look_ups[name], unseen)
-        scores[name] = links.task.scores(labels, predict(model, unseen, split.validation))
-    return scores
+    return score(
+        models, look_ups, replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
+    )
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:

@@ -65,11 +65,7 @@ def _names(part: object) -> Iterator[str]:
 
 
 def check_software(folder: Path, config: dict) -> None:
-    """Checks that a run is resumed by the software that began it; patch versions change no number.
-
-    Raises:
-        ValueError: Another version began the run, or the source of a plug-in has changed.
-    """
+    """Checks that a run is resumed by the software that began it; patch versions change no number."""
     try:
         there = json.loads((folder / "software.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -98,11 +94,7 @@ def is_configuration(file: Path) -> bool:
 
 
 def check_same_links(there: dict, here: dict, path: Path) -> None:
-    """Checks that a training is resumed with its own links, so that no test link has been trained on.
-
-    Raises:
-        ValueError: The split or the links have changed.
-    """
+    """Checks that a training is resumed with its own links, so that no test link has been trained on."""
     parts = ("train", "validation", "test")
     same = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
     same = same and are_alike(there.get("scene"), here.get("scene"))

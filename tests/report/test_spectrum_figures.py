@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gaigs.report.figures import Examples
 from gaigs.report.spectrum import spectra
 
 ELEVATIONS, AZIMUTHS = np.arange(10.0, 91, 10), np.arange(0.0, 360, 15)
@@ -25,7 +26,8 @@ def corners_of_pixel(mesh, row, column):
 @pytest.mark.parametrize("polar", [False, True])
 def test_spectra_show_label_prediction_and_error(rng, polar):
     labels, predictions = rng.random((2, 2, 9, 24)).astype(np.float16)
-    figure = spectra(labels, predictions, np.array([0.25, 0.875]), ["worst", "best"], ELEVATIONS, AZIMUTHS, polar)
+    shown = Examples(labels, predictions, np.array([0.25, 0.875]), ["worst", "best"])
+    figure = spectra(shown, ELEVATIONS, AZIMUTHS, polar)
     figure.draw_without_rendering()
     panels = [mesh.get_array().reshape(9, 24) for mesh in meshes(figure)]
     for row in range(2):
@@ -42,18 +44,16 @@ def test_spectra_show_label_prediction_and_error(rng, polar):
 def test_colours_of_errors_are_the_same_both_ways_and_in_all_rows():
     labels, predictions = np.full((2, 9, 24), 0.5), np.full((2, 9, 24), 0.6)
     predictions[1, 4, 4] = 0.1
-    figure = spectra(labels, predictions, np.zeros(2), ["a", "b"], ELEVATIONS, AZIMUTHS)
+    figure = spectra(Examples(labels, predictions, np.zeros(2), ["a", "b"]), ELEVATIONS, AZIMUTHS)
     assert [mesh.get_clim() for mesh in meshes(figure)[2::3]] == [pytest.approx((-0.4, 0.4))] * 2
-    perfect = spectra(labels, labels, np.ones(2), ["a", "b"], ELEVATIONS, AZIMUTHS)
+    perfect = spectra(Examples(labels, labels, np.ones(2), ["a", "b"]), ELEVATIONS, AZIMUTHS)
     perfect.draw_without_rendering()
     assert meshes(perfect)[2].norm(0.0) == 0.5
 
 
 def test_pixels_lie_where_their_directions_are():
-    values = np.zeros((1, 9, 24))
-    plane, sky = (
-        meshes(spectra(values, values, np.ones(1), ["a"], ELEVATIONS, AZIMUTHS, polar))[0] for polar in (False, True)
-    )
+    shown = Examples(*np.zeros((2, 1, 9, 24)), np.ones(1), ["a"])
+    plane, sky = (meshes(spectra(shown, ELEVATIONS, AZIMUTHS, polar))[0] for polar in (False, True))
     np.testing.assert_allclose(corners_of_pixel(plane, 2, 6).mean(0), (90, 30))
     np.testing.assert_allclose(corners_of_pixel(sky, 2, 6).mean(0), (np.pi / 2, 60))
     radii = corners_of_pixel(sky, 8, 0)[:, 1]

@@ -90,11 +90,6 @@ def test_all_models_and_the_validation_score_fit_eighty_columns(task, scores, sh
     assert heads(metrics) == ["model", *titles, f"{titles[0]}, validation"]
 
 
-def test_a_run_without_validation_has_no_column_for_it():
-    for validation in ({}, None):
-        assert "validation" not in printed(metrics_table(RSSI | {"validation": validation}))
-
-
 def test_receivers_stand_below_with_the_first_metric_of_each_model():
     at = lambda gaigs, mean: {"gaigs": rssi(gaigs, 77.0), "mean": rssi(mean, 66.0)}
     metrics = RSSI | {"receivers": {"[attic]": at(2.125, 7.5), "cellar": at(4.5, 3.875)}}
@@ -109,11 +104,6 @@ def test_receivers_stand_below_with_the_first_metric_of_each_model():
     assert ["cellar", "4.500", "3.875"] in words
     assert not any("77" in line for line in lines)
     assert any("6.250" in line for line in lines[:title])  # all receivers together come first
-
-
-def test_one_receiver_has_no_table_of_its_own():
-    assert "receiver" not in printed(metrics_table(RSSI | {"receivers": {}}))
-    assert "receiver" not in printed(metrics_table(RSSI))
 
 
 @pytest.mark.parametrize(
@@ -140,15 +130,6 @@ def test_one_receiver_has_no_table_of_its_own():
 )
 def test_verdict(metrics, sentence):
     assert verdict(metrics) == sentence
-
-
-def test_a_run_of_an_earlier_version_is_told():
-    with pytest.raises(
-        ValueError, match="must have the key 'task', got split, seed, device, models; one without is of"
-    ):
-        metrics_table(run(None, gaigs=rssi(3.0)))
-    with pytest.raises(ValueError, match=r"unknown task 'rsi' \(did you mean 'rssi'"):
-        verdict(run("rsi", gaigs=rssi(3.0)))
 
 
 @pytest.mark.parametrize(
