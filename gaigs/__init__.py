@@ -107,7 +107,6 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
     configurations.check(config)
     match config["command"]:
         case "train":
-            processes.check_ranks()  # before Lightning is imported, which reads them
             from gaigs import runs
 
             return runs.run(config, folder)

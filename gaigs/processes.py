@@ -15,37 +15,18 @@ from gaigs.io.files import file_message
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 """Signals at which a run saves and stops: Ctrl-C, and the one that schedulers send before they kill."""
 
-POCL_THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
-"""Environment variables that limit the processor threads of PoCL's OpenCL, up to version 3 and later."""
-
-OUT_OF_MEMORY = (
-    "allocate memory", "unable to allocate", "not enough memory", "out of memory", "bad_alloc", "bad allocation",
-    "failed to map segment", "can't start new thread", "mem_object_allocation_failure", "could not create a primitive",
-    "error return without exception set",
-)  # fmt: skip
-"""Messages for a lack of memory of torch, C++, the linker, Python, OpenCL and oneDNN, in lower case; the last one is
-Python's if there is no memory for the error itself."""
+THREADS = ("OMP_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
+"""Environment variables that limit threads of OpenMP and of PoCL's OpenCL, up to version 3 and later."""
 
 AGAIN = 0.05
 """Delay before an ignored signal is sent again [s]."""
-
-RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "NODE_RANK", "GROUP_RANK")
-"""Environment variables that number processes and machines."""
-
-COUNTS = ("SLURM_NTASKS", "SLURM_NTASKS_PER_NODE", "SLURM_NNODES")
-"""Environment variables that count processes and machines."""
 
 received: list[int] = []
 """Signals that have stopped runs of this process: a launcher's worker starts no further run."""
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal has stopped a run.
-
-    Args:
-        message: The step at which it stopped.
-        number: The signal.
-    """
+    """A signal has stopped a run; the message names the step."""
 
     def __init__(self, message: str, number: int):
         super().__init__(message)
@@ -59,9 +40,6 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
     Args:
         count: Number of threads; None: no limit for one job, an equal share of the processors for several.
         jobs: Number of jobs that run at a time on this machine; -1: one for each processor.
-
-    Raises:
-        ValueError: The count is less than 1.
     """
     if count is None and jobs in (0, 1):
         yield
@@ -73,9 +51,8 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
         raise ValueError(f"threads must be at least 1, or null for all, got {count}")
     import torch  # slow to import
 
-    names = ("OMP_NUM_THREADS", *POCL_THREADS)
-    before, environment = torch.get_num_threads(), {name: os.environ.get(name) for name in names}
-    os.environ |= dict.fromkeys(names, str(count))
+    before, environment = torch.get_num_threads(), {name: os.environ.get(name) for name in THREADS}
+    os.environ |= dict.fromkeys(THREADS, str(count))
     torch.set_num_threads(count)
     try:
         yield
@@ -89,20 +66,23 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
 
 def lacks_memory(error: BaseException | None) -> bool:
     """True if an error, or its cause, is a lack of memory of the processor or of a GPU."""
+    messages = (
+        "allocate memory", "unable to allocate", "not enough memory", "out of memory", "bad_alloc", "bad allocation",
+        "failed to map segment", "can't start new thread", "mem_object_allocation_failure",
+        "could not create a primitive",
+        "error return without exception set",  # of Python without memory for the error itself
+    )  # fmt: skip
     while error is not None:
-        if isinstance(error, MemoryError) or any(words in str(error).lower() for words in OUT_OF_MEMORY):
+        if isinstance(error, MemoryError) or any(words in str(error).lower() for words in messages):
             return True
         error = error.__cause__
     return False
 
 
 def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
-    """The message of an error that a user can mend; None for a fault of the program.
+    """The message of an error of a run in a folder that a user can mend; None for a fault of the program.
 
-    Args:
-        error: Raised by a run.
-        folder: Run folder.
-        goes_on: How to resume the run.
+    ``goes_on`` says how to resume the run.
     """
     if lacks_memory(error):
         cause = " ".join(str(error).split()) or type(error).__name__
@@ -118,26 +98,6 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
     return str(error) if is_known or type(error).__name__ == "MisconfigurationException" else None  # Lightning's
 
 
-def check_ranks() -> None:
-    """Checks the environment variables of several processes, before Lightning is imported, which reads them.
-
-    Raises:
-        ValueError: A variable is not a number, or SLURM gives no number of processes per machine.
-    """
-    for name in (*RANKS, *COUNTS):
-        value = os.environ.get(name, "0")
-        if not value.isdecimal():
-            raise ValueError(f"{name} must be a whole number in the environment, got {value!r}; unset it")
-    count = int(os.environ.get("SLURM_NTASKS", 1))
-    is_shell = os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive")  # one process alone
-    is_slurm = not is_shell and "TORCHELASTIC_RUN_ID" not in os.environ  # torchrun's numbers take precedence
-    if count > 1 and is_slurm and "SLURM_NTASKS_PER_NODE" not in os.environ:
-        raise ValueError(
-            f"SLURM_NTASKS={count} needs SLURM_NTASKS_PER_NODE in the environment\n"
-            "use srun --ntasks-per-node instead of --ntasks, or unset SLURM_NTASKS for one process"
-        )
-
-
 def is_first() -> bool:
     """True in the first of the processes that train together; only this one writes files."""
     from lightning.pytorch.utilities import rank_zero_only  # slow to import
@@ -145,16 +105,12 @@ def is_first() -> bool:
     # Without torchrun and SLURM, Lightning's rank is that within a machine.
     is_global = any(name in os.environ for name in ("RANK", "SLURM_PROCID"))
     machine = 0 if is_global else int(os.environ.get("NODE_RANK", os.environ.get("GROUP_RANK", 0)))
-    return rank_zero_only.rank == 0 and machine == 0
+    return rank_zero_only.rank == 0 and machine == 0  # type: ignore[attr-defined]
 
 
 @contextlib.contextmanager
 def only_run(folder: Path) -> Iterator[None]:
-    """Locks a run folder, at most until this process ends; writes nothing there.
-
-    Raises:
-        ValueError: Another run holds the folder.
-    """
+    """Locks a run folder, at most until this process ends; writes nothing there."""
     try:
         import fcntl
     except ImportError:  # Windows has no such locks
@@ -165,9 +121,7 @@ def only_run(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(
-                f"another run is at work in {folder}\nwait for it, or choose another hydra.run.dir"
-            ) from None
+            raise ValueError(f"another run is at work in {folder}\nwait, or choose another hydra.run.dir") from None
         yield
     finally:
         os.close(handle)
@@ -177,11 +131,8 @@ def only_run(folder: Path) -> Iterator[None]:
 def stopping(waits: bool = False) -> Iterator[None]:
     """Lets SIGTERM stop a run as Ctrl-C does, and restores the handlers.
 
-    Python ignores errors that are raised while it destroys an object; such a signal is sent again.
-
-    Args:
-        waits: True if the process waits for another run afterwards. SIGTERM does not end it then: its launcher would
-            wait for it forever.
+    Python ignores errors that are raised while it destroys an object; such a signal is sent again. A process that
+    ``waits`` for another run afterwards ignores SIGTERM then, as its launcher would wait for it forever.
     """
     if threading.current_thread() is not threading.main_thread():  # other threads may not set handlers
         yield

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gaigs.geometry import FAR, WITHIN, Directions, Grid, Rays
@@ -20,7 +20,7 @@ ROUNDING = 1e-6
 
 
 def unit_hint(number: float) -> str:
-    """A question about the unit in which a number would be a carrier; empty where there is none."""
+    """A question about the unit in which a number would be a carrier; empty if no unit makes it one."""
     units = {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}
     low, high = CARRIERS
     return next((f"; in {unit}?" for unit, size in units.items() if low / size <= number <= high / size), "")
@@ -36,11 +36,7 @@ def check_carrier(name: str, frequencies: float | Tensor) -> None:
 
 
 def as_numbers(name: str, values: object, expected: str) -> Tensor:
-    """Real numbers of any kind as a float32 tensor.
-
-    Raises:
-        ValueError: The values are not real numbers.
-    """
+    """Real numbers of any kind as a float32 tensor; raises a ``ValueError`` for anything else."""
     try:
         native = values
         if isinstance(values, np.ndarray):  # torch takes no negative strides and no other byte order
@@ -54,11 +50,7 @@ def as_numbers(name: str, values: object, expected: str) -> Tensor:
 
 
 def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
-    """Positions of any kind as a float32 tensor (..., 3) [m].
-
-    Raises:
-        ValueError: The values are not (..., 3) real numbers, or one is not finite or too far away.
-    """
+    """Positions of any kind as a float32 tensor [m]; raises a ``ValueError`` unless all are finite and in range."""
     positions = as_numbers(name, values, "(..., 3) positions [m]")
     if not positions.ndim or positions.shape[-1] != 3:
         raise ValueError(f"{name} must be (..., 3) positions [m], got shape {tuple(positions.shape)}")
@@ -71,11 +63,7 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
 
 
 def as_receivers(values: object, names: Sequence[str]) -> Int[Tensor, "*points"]:
-    """The index of a receiver, given by name or index, or the indices of several.
-
-    Raises:
-        ValueError: There is no such receiver.
-    """
+    """Indices of receivers, given by name or index; raises a ``ValueError`` for an unknown receiver."""
     expected = f"receiver must be one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
     try:
         indices = torch.as_tensor(names.index(values) if isinstance(values, str) else values)
@@ -92,17 +80,15 @@ def as_receivers(values: object, names: Sequence[str]) -> Int[Tensor, "*points"]
 
 
 def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, "*points"] | None:
-    """Carriers that a user asks for, or for None the only known one; None where none is known [Hz].
+    """Carriers that a user asks for [Hz]; for None the only known one, or None if no carrier is known.
 
     Raises:
         ValueError: A carrier is out of range, differs from the only known one, or is missing beside several.
     """
     if values is None:
         if len(known) > 1:
-            raise ValueError(
-                f"the training links have {len(known)} carriers, {known[0]:.7g} to {known[-1]:.7g} Hz; choose one with "
-                "frequency=..."
-            )
+            span = f"{known[0]:.7g} to {known[-1]:.7g} Hz"
+            raise ValueError(f"the training links have {len(known)} carriers, {span}; choose one with frequency=...")
         return known[0] if len(known) else None
     frequencies = as_numbers("a frequency", values, "a carrier in Hz")
     check_carrier("a frequency", frequencies)
@@ -116,17 +102,11 @@ def as_directions(directions: Directions | None, own: Grid | None, task: str) ->
     """Directions that a user asks for, in float32, or for None the label's own of a task.
 
     Raises:
-        TypeError: The directions are neither a ``Grid`` nor ``Rays``.
-        ValueError: The label has no directions; an angle is no number, or too large for radians; or rays have
+        ValueError: The label has no directions; an angle is not a number, or too large for radians; or rays have
             different numbers of elevations and azimuths.
     """
     if directions is None:
         return own
-    if not isinstance(directions, Directions):
-        raise TypeError(
-            "directions must be a gaigs.geometry.Grid or gaigs.geometry.Rays, or None for the label's own, got "
-            f"{type(directions).__name__}"
-        )
     if own is None:
         raise ValueError(f"labels of task {task!r} have no directions; leave directions out")
     angles = {}
@@ -134,8 +114,6 @@ def as_directions(directions: Directions | None, own: Grid | None, task: str) ->
     for name, most in (("elevations", math.pi / 2), ("azimuths", 20 * math.pi)):
         expected = f"a list of angles from {-most:.4f} to {most:.4f} rad"
         angles[name] = values = as_numbers(name, getattr(directions, name), expected)
-        if values.ndim != 1:
-            raise ValueError(f"{name} must be {expected}, got shape {tuple(values.shape)}")
         if len(wrong := values[~(values.abs() <= most + 1e-4)]):
             raise ValueError(f"{name} must be {expected}, got {wrong[0]:g}; Grid.degrees takes degrees")
     if isinstance(directions, Grid):
@@ -153,7 +131,7 @@ class Query:
     Attributes:
         transmitters: Positions, world frame (b, 3) [m].
         receivers: Indices into the scene's receivers (b,).
-        frequencies: Carriers (b,) [Hz], from 10 kHz to 300 GHz; None where they are unknown.
+        frequencies: Carriers (b,) [Hz], from 10 kHz to 300 GHz; None if unknown.
 
     Example:
         >>> query = gaigs.Query(torch.tensor([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]), torch.tensor([0, 0]))
@@ -176,21 +154,17 @@ class Query:
             receiver: Name or index of the receiver, or an index for each position.
             frequency: Carrier, one for all or one for each position [Hz]; None is the known one.
             names: Names of the scene's receivers.
-            known: Different carriers of the training links, ascending [Hz]; empty where they are unknown.
+            known: Different carriers of the training links, ascending [Hz]; empty if unknown.
 
         Returns:
             The links in the order of ``positions.reshape(-1, 3)``, and the leading axes of the positions.
-
-        Raises:
-            ValueError: As of ``as_positions``, ``as_receivers`` and ``as_frequencies``; the receivers or frequencies
-                are neither one nor one for each position; or a query comes with a receiver or a frequency.
         """
         if isinstance(positions, Query):
             if frequency is not None or not isinstance(receiver, int) or receiver:
                 raise ValueError("a query has its own receivers and frequencies; leave receiver and frequency out")
-            positions, receiver, frequency = positions.transmitters, positions.receivers, positions.frequencies
-        positions = as_positions("transmitters", positions)
-        shape = positions.shape[:-1]
+            receiver, frequency, positions = positions.receivers, positions.frequencies, positions.transmitters
+        points = as_positions("transmitters", positions)
+        shape = points.shape[:-1]
 
         def spread(name: str, values: Tensor) -> Tensor:
             if values.ndim and values.shape != shape:
@@ -198,7 +172,7 @@ class Query:
                 raise ValueError(f"{name} must be {expected}, got {tuple(values.shape)}")
             return values.expand(shape).reshape(-1)
 
-        points = positions.reshape(-1, 3)
+        points = points.reshape(-1, 3)
         receivers = spread("receivers", as_receivers(receiver, names)).to(points.device)
         frequencies = as_frequencies(frequency, known.cpu().float())
         return cls(points, receivers, None if frequencies is None else spread("frequencies", frequencies)), shape
@@ -206,13 +180,11 @@ class Query:
     def __len__(self) -> int:
         return len(self.transmitters)
 
-    def __getitem__(self, index: slice | Int[Tensor, " k"]) -> "Query":
-        """Some of the links."""
+    def __getitem__(self, index: slice | Int[Tensor, " k"] | Bool[Tensor, " b"]) -> "Query":
         frequencies = None if self.frequencies is None else self.frequencies[index]
         return Query(self.transmitters[index], self.receivers[index], frequencies)
 
     def to(self, device: torch.device | str) -> "Query":
-        """The same query on another device."""
         frequencies = None if self.frequencies is None else self.frequencies.to(device)
         return Query(self.transmitters.to(device), self.receivers.to(device), frequencies)
 
@@ -221,20 +193,14 @@ class Query:
         return (self[start : start + size] for start in range(0, max(len(self), 1), size))
 
     def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
-        """The different places and frequencies, or the different links.
+        """The different links, sorted by position, frequency and receiver; and the index of each link among them.
 
-        Args:
-            with_receivers: True if links to two receivers differ. If False, each place has any one of its receivers.
-
-        Returns:
-            The different links, sorted by position, frequency and receiver; and the index among them of each link.
+        Without receivers links to two of them are equal, and each place has any one of its receivers.
         """
-        columns = self.transmitters
         others = [self.frequencies] if self.frequencies is not None else []
         others += [self.receivers] if with_receivers else []
-        if others:
-            # Positions and frequencies are float32 or float64, which double holds exactly; so is an index.
-            columns = torch.cat((columns.double(), *(other.double()[:, None] for other in others)), 1)
+        # Double holds float32, float64 and indices exactly.
+        columns = torch.cat((self.transmitters.double(), *(other.double()[:, None] for other in others)), 1)
         _, which = columns.unique(dim=0, return_inverse=True)
         count = int(which.max()) + 1 if len(which) else 0
         numbers = torch.arange(len(which), device=which.device)
@@ -247,8 +213,7 @@ class Batch:
     """A query with directions and labels.
 
     Attributes:
-        query: The links.
-        directions: Directions to predict, the same for all links; None where the label has none.
+        directions: Directions to predict, the same for all links; None for a label without.
         labels: Measured values (b, ...), of the task's shape; None when predicting.
         shares: Weights of the mean over these links, and of the mean over their places, in the mean over all processes
             that train together; 1 for a single process.
@@ -263,7 +228,6 @@ class Batch:
         return len(self.query)
 
     def to(self, device: torch.device | str) -> "Batch":
-        """The same batch on another device."""
         directions = None if self.directions is None else self.directions.to(device)
         labels = None if self.labels is None else self.labels.to(device)
         return Batch(self.query.to(device), directions, labels, self.shares)

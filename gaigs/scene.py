@@ -13,6 +13,7 @@ from gaigs.propagation import free_space
 from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.task import Task
+from gaigs.task.csi import Csi
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,6 @@ class Scene:
         receivers: Antenna arrays or gateways.
         lower, upper: Corners of the box of the training transmitters, world frame (3,) [m].
         spacing: Median distance of a training transmitter to the nearest other one [m].
-        task: Task of the labels.
         frequencies: Distinct carriers of the training links, ascending (f,) [Hz]; empty if unknown.
         bandwidth: Band around each carrier over which a label's power is averaged, 0 for a carrier alone [Hz]; None if
             unknown.
@@ -58,16 +58,9 @@ class Scene:
         return len(self.frequencies) > 1
 
     def band_positions(self, query: Query) -> Float[Tensor, " b"]:
-        """Positions of carriers in the training links' band, by the logarithm: -1 at the lowest, 1 at the highest.
-
-        Raises:
-            ValueError: The query has no frequency.
-        """
+        """Positions of carriers in the training links' band, by the logarithm: -1 at the lowest, 1 at the highest."""
         if query.frequencies is None:
-            low, high = self.frequencies[0].item(), self.frequencies[-1].item()
-            raise ValueError(
-                f"a frequency must be given: the data have {len(self.frequencies)} carriers, {low:.6g} to {high:.6g} Hz"
-            )
+            raise ValueError(f"a frequency must be given, as the data have {len(self.frequencies)} carriers")
         low, high = self.frequencies.double().log()[[0, -1]].tolist()
         return ((2 * query.frequencies.double().log() - low - high) / (high - low)).to(query.transmitters.dtype)
 
@@ -84,66 +77,49 @@ class Scene:
                 }
                 for receiver in self.receivers
             ],
-            "lower": self.lower,
-            "upper": self.upper,
-            "spacing": self.spacing,
             "task": self.task.state(),
-            "frequencies": self.frequencies,
-            "bandwidth": self.bandwidth,
+            **{name: getattr(self, name) for name in ("lower", "upper", "spacing", "frequencies", "bandwidth")},
         }
 
     @classmethod
     def from_state(cls, state: dict) -> "Scene":
-        """The inverse of ``state``.
-
-        Raises:
-            ValueError: The task is not installed.
-        """
+        """The inverse of ``state``."""
         receivers = tuple(
             Receiver(r["name"], Pose(r["position"], r["rotation"]), Array(r["elements"], r["pattern"]))
             for r in state["receivers"]
         )
-        box = state["lower"], state["upper"], state["spacing"]
-        return cls(receivers, *box, registry("task").build(state["task"]), state["frequencies"], state["bandwidth"])
+        return cls(**state | {"receivers": receivers, "task": registry("task").build(state["task"])})
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
     """The frequency of each link [Hz]: the query's, else the data's only one; for channels the middle of their band.
 
     Raises:
-        ValueError: The query has no frequency, and the data have none or several.
+        ValueError: The query has no frequency, and the data do not have exactly one.
     """
-    if scene.task.dtype.is_complex:
+    if isinstance(scene.task, Csi):
         return scene.task.frequencies.mean().to(query.transmitters).expand(len(query))
     if query.frequencies is not None:
         return query.frequencies
     if len(scene.frequencies) != 1:
-        raise ValueError(
-            f"each link must have a frequency [Hz], as the data have {len(scene.frequencies)}; give the query its "
-            "frequencies, or the data theirs"
-        )
+        raise ValueError(f"each link must have a frequency [Hz], as the data have {len(scene.frequencies)} carriers")
     return scene.frequencies.to(query.transmitters).expand(len(query))
 
 
-def check_elements(what: str, scene: Scene) -> None:
-    """Checks that labels are channels, with as many elements as each receiver's array.
-
-    Args:
-        what: The component that takes nothing else, as errors name it.
-        scene: Task and receivers.
+def check_elements(owner: str, scene: Scene) -> Csi:
+    """The task of channels with as many elements as each receiver's array; ``owner`` names a component in errors.
 
     Raises:
         ValueError: Labels are not channels, or an array has another number of elements.
     """
     task = scene.task
-    if not task.dtype.is_complex or len(task.shape) != 2:
-        raise ValueError(f"{what} gives complex channels, and labels of task {task.name!r} are none; take another")
+    if not isinstance(task, Csi):
+        raise ValueError(f"{owner} gives complex channels, not labels of task {task.name!r}; take another")
     for receiver in scene.receivers:
         if len(receiver.array) != task.shape[0]:
-            raise ValueError(
-                f"the labels have {task.shape[0]} elements, and the array of {receiver.name} {len(receiver.array)}; "
-                "give the data's elements"
-            )
+            own = f"the array of {receiver.name} {len(receiver.array)}"
+            raise ValueError(f"the labels have {task.elements} elements, and {own}; give the data's elements")
+    return task
 
 
 def direct_waves(
@@ -151,12 +127,7 @@ def direct_waves(
 ) -> Complex[Tensor, "b e s"]:
     """Free space from each transmitter to the elements of its receiver, or to its middle alone (e = 1).
 
-    Args:
-        scene: Its receivers' arrays have the same number of elements.
-        query: The links.
-        frequencies: [Hz].
-        sign: Sign of the phases, as for ``free_space``.
-        at_elements: True for each element, False for the middle of the array.
+    Arrays have the same number of elements. The sign is that of the phases, as for ``free_space``.
     """
     # In float64: some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz 1e-4 rad.
     places = []
@@ -171,7 +142,7 @@ def direct_waves(
 def direct_gains(scene: Scene, query: Query) -> Float[Tensor, " b"]:
     """Field gain of each receiver's elements towards the transmitter, from the middle of the array; float64.
 
-    A transmitter in the very middle has no direction; its gain is that along the array's normal.
+    A transmitter in the middle itself gets the gain along the array's normal.
     """
     gains = torch.ones(len(query), dtype=torch.float64, device=query.transmitters.device)
     for receiver in query.receivers.unique().tolist():

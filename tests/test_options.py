@@ -20,9 +20,9 @@ from gaigs.testing import example_links
             ("loss", name, {}, "csi", "labels of task 'csi' are complex, .*; set loss=log_relative_error")
             for name in ("absolute", "squared", "huber")
         ),
-        ("loss", "l1_ssim", {}, "rssi", "'l1_ssim' compares spectra, labels of task 'rssi' are not"),
-        ("loss", "relative_error", {}, "rssi", "'rssi' are real, and loss 'relative_error' .*; set loss=squared"),
-        ("loss", "log_relative_error", {}, "spectrum", "'spectrum' are real, and loss 'log_relative_error'"),
+        ("loss", "l1_ssim", {}, "rssi", "'l1_ssim' compares spectra, not labels of task 'rssi'"),
+        ("loss", "relative_error", {}, "rssi", "'rssi' are real, not complex channels; set loss=squared"),
+        ("loss", "log_relative_error", {}, "spectrum", "'spectrum' are real, not complex"),
         ("tokenizer", "euclidean", {"transmitter_octaves": (3, 2)}, "rssi", r"within -30..30, got \[3, 2\]"),
         ("tokenizer", "euclidean", {"gaussian_octaves": (-31, 2)}, "rssi", r"within -30..30, got \[-31, 2\]"),
         ("tokenizer", "euclidean", {"hidden": 0}, "rssi", "hidden must be at least 1, got 0"),

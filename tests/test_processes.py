@@ -153,30 +153,6 @@ def test_an_ignored_signal_is_not_sent_again_while_a_run_stops():
     assert saved
 
 
-@pytest.mark.parametrize(
-    ("variables", "message"),
-    [
-        *(({name: "first"}, f"{name} must be a whole number in the environment, got 'first'")
-          for name in (*processes.RANKS, *processes.COUNTS)),
-        ({"SLURM_NTASKS": "4", "SLURM_JOB_NAME": "train"}, "SLURM_NTASKS=4 needs SLURM_NTASKS_PER_NODE in"),
-        ({"SLURM_NTASKS": "4", "SLURM_JOB_NAME": "train", "SLURM_NTASKS_PER_NODE": "4"}, None),
-        ({"SLURM_NTASKS": "4", "SLURM_JOB_NAME": "bash"}, None),
-        ({"SLURM_NTASKS": "4", "SLURM_JOB_NAME": "interactive"}, None),
-        ({"SLURM_NTASKS": "4", "TORCHELASTIC_RUN_ID": "x"}, None),
-    ],
-)  # fmt: skip
-def test_numbers_of_processes_are_checked(variables, message, monkeypatch):
-    for name in ("SLURM_NTASKS", "SLURM_NTASKS_PER_NODE", "SLURM_JOB_NAME", "TORCHELASTIC_RUN_ID"):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    if message is None:
-        processes.check_ranks()
-    else:
-        with pytest.raises(ValueError, match=message):
-            processes.check_ranks()
-
-
 @pytest.mark.parametrize("name", ["NODE_RANK", "GROUP_RANK"])
 def test_only_one_machine_has_the_first_process(name, monkeypatch):
     assert processes.is_first()
@@ -189,13 +165,13 @@ def test_only_one_machine_has_the_first_process(name, monkeypatch):
 def test_jobs_of_a_launcher_share_the_processors(monkeypatch):
     threads = torch.get_num_threads()
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
-    for name in ("OMP_NUM_THREADS", *processes.POCL_THREADS):
+    for name in processes.THREADS:
         monkeypatch.setenv(name, "")
     for count, jobs, expected in ((None, 4, 2), (None, -1, 1), (None, 16, 1), (3, 4, 3), (None, 1, threads)):
         with processes.limited_threads(count, jobs):
             assert torch.get_num_threads() == expected
             if expected != threads:
-                assert {os.environ[name] for name in ("OMP_NUM_THREADS", *processes.POCL_THREADS)} == {str(expected)}
+                assert {os.environ[name] for name in processes.THREADS} == {str(expected)}
         assert torch.get_num_threads() == threads, "undone"
         assert os.environ["OMP_NUM_THREADS"] == ""
     with pytest.raises(ValueError, match="threads must be at least 1, or null for all, got 0"):

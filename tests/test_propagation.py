@@ -144,7 +144,7 @@ def test_the_carrier_of_a_link_is_its_own_or_the_datas_only_one():
     assert middle.dtype == torch.float32
     for known in (band, band[:0]):
         with pytest.raises(
-            ValueError, match=rf"each link must have a frequency \[Hz\], as the data have {len(known)}; give"
+            ValueError, match=rf"each link must have a frequency \[Hz\], as the data have {len(known)} carriers"
         ):
             carriers(replace(spectra, frequencies=known), silent)
 
@@ -195,5 +195,5 @@ def test_arrays_must_fit_the_labels():
     check_elements("model 'm'", links.scene)
     with pytest.raises(ValueError, match="labels have 4 elements, and the array of gateway0 9; give the data's"):
         check_elements("model 'm'", scene(Array.planar(3, 3, 0.06)))
-    with pytest.raises(ValueError, match="model 'm' gives complex channels, and labels of task 'rssi' are none"):
+    with pytest.raises(ValueError, match="model 'm' gives complex channels, not labels of task 'rssi'"):
         check_elements("model 'm'", example_links("rssi").scene)

@@ -1,4 +1,4 @@
-"""Queries: checks of what a user asks for, equal links, and batches."""
+"""Queries: checks of positions, receivers, carriers and directions; equal links; batches."""
 
 import math
 from dataclasses import replace
@@ -23,15 +23,12 @@ def ask(positions=PLACE, receiver=0, frequency=None, known=NONE):
     ("positions", "message"),
     [
         ([1.0, 2], r"\(..., 3\) positions \[m\], got shape \(2,\)"),
-        ([[1.0, 2]], r"got shape \(1, 2\)"),
         (3.0, r"got shape \(\)"),
         ([[1.0, 2, 3], [0, math.nan, 1]], r"must be finite, got \[0.0, nan, 1.0\] in row 1"),
-        ([[1.0, math.inf, 3]], "must be finite"),
         ([[1.0, 2, 3], [0, -1e5, 0]], r"within 1e5 m of the origin .*, got \[0.0, -100000.0, 0.0\] in row 1"),
         (torch.ones(1, 3, dtype=torch.complex64), r"must be \(..., 3\) positions \[m\] in real numbers"),
         ([[1.0, 2, 3], [1.0, 2]], r"in real numbers, got \[\[1.0, 2, 3\], \[1.0, 2\]\]"),
         ("west", "in real numbers, got 'west'"),
-        (None, "in real numbers, got None"),
         (np.ones((1, 3), dtype=bool), "in real numbers"),
         (np.ma.array([[1.0, 2, 3]], mask=[[True, False, False]]), "in real numbers, got masked_array"),
         (replace(QUERY, transmitters=torch.full((2, 3), math.nan)), "transmitters must be finite"),
@@ -50,11 +47,9 @@ def test_impossible_positions_are_refused(positions, message):
     [
         (2, "must be one of 0 = west, 1 = east, got 2"),
         (-1, "got -1"),
-        ("north", "got 'north'"),
         (True, "got True"),
         (1.0, "got 1.0"),
         (["west"], r"got \['west'\]"),
-        (10**30, "got 1000"),
         (torch.tensor([0.0]), r"got \(1,\) of torch.float32"),
         (np.array([0, 7, 1]), "got 7"),
         (torch.tensor([0, 1]), r"one for each of the \(1,\) positions, got \(2,\)"),
@@ -73,7 +68,6 @@ def test_impossible_receivers_are_refused(receiver, message):
     [
         (0.0, r"^a frequency must be a carrier in Hz, from 10000 to 3e\+11, got 0$"),
         (math.nan, "got nan$"),
-        (math.inf, "got inf$"),
         (9e11, r"got 9e\+11$"),
         (0.95, r"got 0\.95; in GHz\?$"),
         (950, r"got 950; in MHz\?$"),
@@ -126,20 +120,23 @@ OWN = Grid.degrees(range(10, 90, 10), range(0, 360, 10))
 
 
 @pytest.mark.parametrize(
-    ("directions", "error", "message"),
+    ("directions", "message"),
     [
-        (30, TypeError, r"must be a gaigs\.geometry\.Grid or gaigs\.geometry\.Rays, .* got int"),
-        (Rays([0.5], [90.0]), ValueError, "azimuths must be .* rad, got 90; Grid.degrees takes degrees"),
-        (Rays([-2.0], [0.0]), ValueError, "elevations must be .* -1.5708 to 1.5708 rad, got -2; Grid"),
-        (Grid([math.nan], [0.0]), ValueError, "elevations must be .* rad, got nan"),
-        (Rays(["up"], [0.0]), ValueError, r"elevations must be .* in real numbers, got \['up'\]"),
-        (Rays(0.5, [0.0]), ValueError, r"elevations must be .* rad, got shape \(\)"),
-        (Rays([0.5, 0.6], [0.0]), ValueError, "as many elevations as azimuths, got 2 and 1"),
+        (Rays(torch.zeros(1), torch.tensor([90.0])), "azimuths must be .* rad, got 90; Grid.degrees takes degrees"),
+        (Rays(torch.tensor([-2.0]), torch.zeros(1)), "elevations must be .* -1.5708 to 1.5708 rad, got -2; Grid"),
+        (Grid(torch.tensor([math.nan]), torch.zeros(1)), "elevations must be .* rad, got nan"),
     ],
 )
-def test_impossible_directions_are_refused(directions, error, message):
-    with pytest.raises(error, match=message):
+def test_impossible_directions_are_refused(directions, message):
+    with pytest.raises(ValueError, match=message):
         as_directions(directions, OWN, "spectrum")
+
+
+def test_rays_of_unlike_lengths_are_refused():
+    rays = Rays(torch.zeros(2), torch.zeros(2))
+    object.__setattr__(rays, "azimuths", torch.zeros(1))
+    with pytest.raises(ValueError, match="as many elevations as azimuths, got 2 and 1"):
+        as_directions(rays, OWN, "spectrum")
 
 
 @pytest.mark.parametrize("view", [lambda x: x[::-1], lambda x: x.astype(">f8"), lambda x: np.asfortranarray(x)])
@@ -150,18 +147,14 @@ def test_arrays_of_any_layout_are_positions(view):
     assert shape == (4,)
 
 
-def test_directions_become_lists_in_float32():
+def test_directions_become_float32():
     assert as_directions(None, OWN, "spectrum") is OWN
     assert as_directions(None, None, "rssi") is None
     with pytest.raises(ValueError, match="labels of task 'rssi' have no directions; leave directions out"):
         as_directions(OWN, None, "rssi")
 
-    class Ring(Rays):
-        pass
-
-    ring = as_directions(Ring([math.pi / 2 + 1e-5] * 3, np.arange(3)), OWN, "spectrum")
-    assert type(ring) is Rays
-    assert ring.azimuths.dtype == ring.elevations.dtype == torch.float32
+    rays = as_directions(Rays(torch.full((3,), math.pi / 2 + 1e-5).double(), torch.arange(3.0)), OWN, "spectrum")
+    assert rays.azimuths.dtype == rays.elevations.dtype == torch.float32
 
 
 both = pytest.mark.parametrize("with_receivers", [False, True])
@@ -207,7 +200,7 @@ def test_a_place_at_minus_zero_is_the_place_at_zero(with_receivers):
 
 @both
 @pytest.mark.parametrize("frequencies", [None, torch.zeros(0)])
-def test_no_links_are_no_different_links(with_receivers, frequencies):
+def test_an_empty_query_has_no_different_links(with_receivers, frequencies):
     query = Query(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long), frequencies)
     different, which = query.unique(with_receivers)
     assert len(different) == len(which) == 0

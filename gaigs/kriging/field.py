@@ -1,7 +1,7 @@
 """Kriged residuals of one receiver in a compact form: places, weights, and principal components."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Inexact
 from torch import Tensor, nn
 
 from gaigs.kriging.fit import Hyperparameters
@@ -12,15 +12,19 @@ from gaigs.scene import Scene
 
 
 class Field(nn.Module):
-    """The kriged residual at one receiver.
+    """The kriged residual at one receiver, from k known links and q principal components of their residuals.
 
-    With k known links and q principal components of their residuals it holds places (k, d) [m], see ``coordinates``;
-    weights (k, q), the components' scores over the covariances of the links; and components (q, *shape) in half
-    precision, complex ones as real and imaginary part in the last dimension. ``load_state_dict`` takes any k and q.
-
-    Args:
-        scene: Receivers and task.
+    Attributes:
+        places: Of the links (k, d) [m], see ``coordinates``.
+        weights: The components' scores over the covariances of the links (k, q).
+        components: In half precision (q, *shape), complex ones as real and imaginary part in the last dimension.
+        widened: The components in the task's precision, in which products are fast.
     """
+
+    places: Tensor
+    weights: Tensor
+    components: Tensor
+    widened: Tensor
 
     def __init__(self, scene: Scene):
         super().__init__()
@@ -59,29 +63,26 @@ class Field(nn.Module):
         return torch.tensordot(covariances.to(self.weights) @ self.weights, components, 1)
 
     def _widen(self) -> None:
-        """Converts the components to the task's precision, in which products are fast."""
         components = self.components.float()
         self.widened = torch.view_as_complex(components) if self.weights.is_complex() else components
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
         for name in ("places", "weights", "components"):
-            stored = state_dict.get(f"{prefix}{name}")
-            if stored is not None:
-                own = getattr(self, name)
-                setattr(self, name, own.new_empty(stored.shape))
+            if f"{prefix}{name}" in state_dict:  # of any k and q
+                setattr(self, name, getattr(self, name).new_empty(state_dict[f"{prefix}{name}"].shape))
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._widen()
 
 
 LEFT, MOST = 5e-4, 256
-"""Share of the residuals' energy that the components may leave out, and their largest number: SSIM hardly changes
-below this share, and visibly at ten times as much."""
+"""Largest share of the residuals' energy that the components leave out, and their largest number; SSIM changes visibly
+at ten times the share."""
 
 EXACT = 512
 """Links or numbers of a label up to which components are exact; beyond it random projections are faster."""
 
 
-def principal_components(residuals: Float[Tensor, "k m"]) -> Float[Tensor, "q m"]:
+def principal_components(residuals: Inexact[Tensor, "k m"]) -> Inexact[Tensor, "q m"]:
     """The fewest principal components that leave out at most ``LEFT`` of the energy, each scaled to a maximum of 1."""
     if min(residuals.shape) <= EXACT:
         _, values, components = torch.linalg.svd(residuals, full_matrices=False)

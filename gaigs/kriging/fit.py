@@ -18,17 +18,11 @@ from gaigs.scene import Scene
 
 
 class Hyperparameters(NamedTuple):
-    """Hyperparameters of a Gaussian process over links.
+    """Hyperparameters of a Gaussian process over links."""
 
-    Attributes:
-        length: Correlation length of the kernel [m].
-        nugget: Variance of the noise over that of the signal.
-        scale: Scale of frequencies, see ``coordinates`` [m]; NaN if positions alone count.
-    """
-
-    length: float = math.nan
-    nugget: float = math.nan
-    scale: float = math.nan
+    length: float = math.nan  # correlation length of the kernel [m]
+    nugget: float = math.nan  # variance of the noise over that of the signal
+    scale: float = math.nan  # of frequencies, see ``coordinates`` [m]; NaN without a band
 
     def facts(self) -> dict[str, float]:
         """Entries of ``metrics.json``."""
@@ -37,30 +31,22 @@ class Hyperparameters(NamedTuple):
 
 
 class HeldOut(NamedTuple):
-    """Held-out links of one receiver, and the links that predict them.
-
-    Attributes:
-        asked: The held-out links.
-        around: Links around each held-out link, one group after the other.
-        products: Products of the residuals of each held-out link and those around it, means over the label's numbers.
-    """
+    """Held-out links of one receiver, and the links that predict them."""
 
     asked: Query
-    around: Query
-    products: Float[Tensor, "b j+1 j+1"]
+    around: Query  # links around each held-out link, one group after the other
+    products: Float[Tensor, "b j+1 j+1"]  # of the residuals of each held-out link and those around it
 
 
-def label_numbers(scene: Scene) -> Int[Tensor, " m"]:
-    """Indices of the label's numbers that the hyperparameters are fitted to.
-
-    1,024 numbers of a label are far closer than an array resolves.
-    """
-    return evenly(torch.arange(math.prod(scene.task.shape)), 1024)
+def thin_labels(labels: Tensor) -> Tensor:
+    """At most 1,024 numbers of each label (k, m), to which hyperparameters are fitted: arrays resolve fewer."""
+    numbers = labels.reshape(len(labels), -1)
+    return numbers[:, evenly(torch.arange(numbers.shape[1]), 1024)]
 
 
 LOUDEST = 10.0
-"""Largest residual of a channel, in median channels: within decimetres of a receiver residuals are that large, and a
-reading that is far too loud would otherwise spoil the whole room."""
+"""Largest residual of a channel, in median channels. Residuals within decimetres of a receiver are that large; a
+reading that is far too loud must not spoil the whole room."""
 
 
 def damping(
@@ -80,43 +66,37 @@ def damping(
 
 
 NUGGETS = (1e-4, 1e2)
-"""Bounds of the nugget. The lower is well above float64's rounding errors, so that places measured twice do not make
-matrices singular."""
+"""Bounds of the nugget. The lower keeps matrices regular in float64 if places are measured twice."""
 
 EDGES = 8
-"""Longest correlation length, in longest edges of the box of places: beyond it the kernel is a straight line in the
-box, and only the ratio of its slope to the noise matters."""
+"""Longest correlation length, in longest edges of the box of places: beyond it the kernel is a line in the box."""
 
 
 def fit_hyperparameters(
     scene: Scene, links: Links, residuals: Callable[[Int[Tensor, " j"]], Float[Tensor, "j m"]], most: int = 300
 ) -> tuple[Hyperparameters, float]:
-    """Hyperparameters with the largest likelihood within their bounds.
+    """Hyperparameters with the largest likelihood, and ``negative_log_likelihood``; -inf if all residuals are 0.
 
     Args:
         scene: Receivers and task.
         links: Known links of each receiver, and the split that says which links are held out.
-        residuals: Function from indices of links to the residuals of their ``label_numbers``.
+        residuals: Function from indices of links to the residuals of their ``thin_labels``.
         most: Held-out links of all receivers together; 300 take seconds at most.
-
-    Returns:
-        The hyperparameters, and their ``negative_log_likelihood``; minus infinity if all residuals are 0.
     """
-    bounds = [(scene.spacing, EDGES * (scene.upper - scene.lower).max().item()), NUGGETS]
-    if scene.has_band:
-        bounds.append(scale_bounds(scene))
-    bounds = np.log(bounds)
+    lengths = scene.spacing, EDGES * (scene.upper - scene.lower).max().item()
+    bounds = np.log([lengths, NUGGETS, *([scale_bounds(scene)] if scene.has_band else [])])
     middle = bounds.mean(1)
     scale = math.exp(middle[2]) if scene.has_band else math.nan
     known = known_links(links)
     each = max(1, most // len(known))
-    held_out = [hold_out(scene, links, index, scale, residuals, each) for index in known]
-    held_out = [held for held in held_out if held is not None]
+    each_receiver = (hold_out(scene, links, index, scale, residuals, each) for index in known)
+    held_out = [held for held in each_receiver if held is not None]
 
     def cost(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         with torch.enable_grad():
             leaf = torch.tensor(logarithms, requires_grad=True)
-            total = sum(negative_log_likelihood(scene, held, *leaf.exp()) for held in held_out)
+            costs = (negative_log_likelihood(scene, held, *leaf.exp()) for held in held_out)
+            total = sum(costs, torch.zeros(()))
             (gradient,) = torch.autograd.grad(total, leaf)
         return total.item(), gradient.numpy()
 
@@ -148,8 +128,8 @@ def hold_out(
 ) -> HeldOut | None:
     """At most ``most`` held-out links of a receiver; None if their residuals are all 0 or no other place is known.
 
-    Validation links are held out from the training links. Where the split has fewer than ``FEWEST`` of them, training
-    links are held out one by one, each with all that share its place.
+    Validation links are held out from the training links. With fewer than ``FEWEST`` of them, training links are held
+    out one by one, each with all that share its place.
     """
     split, query = links.split, links.query
     validation = split.validation if len(split.validation) >= FEWEST else split.validation[:0]

@@ -16,13 +16,7 @@ def kernel(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"], length: float
 
 
 def cholesky_factor(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
-    """Lower Cholesky factor of the covariances of noisy labels at known places [m].
-
-    Args:
-        places: Known places, see ``coordinates`` [m].
-        length: Correlation length of the kernel [m].
-        nugget: Variance of the noise over that of the signal.
-    """
+    """Lower Cholesky factor of the covariances of noisy labels; arguments as for ``kriging_weights``."""
     covariances = kernel(places, places, length)
     covariances.diagonal().add_(nugget)
     return torch.linalg.cholesky(covariances)

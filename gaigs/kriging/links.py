@@ -17,18 +17,11 @@ PART = 256
 
 
 def known_links(links: Links) -> list[Int[Tensor, " k"]]:
-    """Training and validation links of each receiver.
-
-    Raises:
-        ValueError: A receiver has no such links.
-    """
+    """Training and validation links of each receiver; raises a ``ValueError`` for a receiver without."""
     known = [links.known(receiver) for receiver in range(len(links.receivers))]
     without = [receiver.name for receiver, index in zip(links.receivers, known, strict=True) if not len(index)]
     if without:
-        raise ValueError(
-            f"each receiver must have training or validation links; split {links.split.name!r} has none of "
-            f"{', '.join(without)}; choose another split, or leave the receiver out of the data"
-        )
+        raise ValueError(f"split {links.split.name!r} has no known links of {', '.join(without)}; choose another split")
     return known
 
 
@@ -42,25 +35,15 @@ def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
 def thinned(links: Links, most: int) -> Links:
     """The same links with at most ``most`` known links of each receiver, evenly spread."""
     chosen = torch.cat([evenly(index, most) for index in known_links(links)])
-    train, validation, test = links.split.parts().values()
-    parts = (part[torch.isin(part, chosen)] for part in (train, validation))
-    return replace(links, split=Split(links.split.name, *parts, test))
-
-
-# --- distances between links ---
+    split = links.split
+    train, validation = (part[torch.isin(part, chosen)] for part in (split.train, split.validation))
+    return replace(links, split=Split(split.name, train, validation, split.test))
 
 
 def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tensor, "b d"]:
     """Points whose Euclidean distance is the distance of links, d² = |dx|² + (scale d ln f)²; float64.
 
-    Args:
-        scene: Receivers and the training links' carriers.
-        query: The links.
-        scale: Distance of a step of 1 in the logarithm of the frequency [m]; without effect where the training links
-            have one carrier or none.
-
-    Raises:
-        ValueError: The frequency counts, and the query has none.
+    ``scale`` [m] has no effect unless the training links have several carriers.
     """
     positions = query.transmitters.double()
     if not scene.has_band:
@@ -80,8 +63,7 @@ def distances(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"]) -> Float[T
 def scale_bounds(scene: Scene) -> tuple[float, float]:
     """Least and largest ``scale`` of ``coordinates`` that the training links can distinguish [m].
 
-    With the least, the whole band is as far as the next place. With the largest, the next carrier is as far as the
-    box's longest edge.
+    The least puts the whole band as far as the next place, the largest the next carrier as far as the longest edge.
     """
     logarithms = scene.frequencies.double().log()
     edge = (scene.upper - scene.lower).max().item()
@@ -89,14 +71,8 @@ def scale_bounds(scene: Scene) -> tuple[float, float]:
     return scene.spacing / band, max(edge, scene.spacing) / step
 
 
-# --- labels in the directions of a batch ---
-
-
 def at_directions(values: Tensor, batch: Batch, scene: Scene) -> Tensor:
-    """Labels (b, rows, columns) in the directions of a batch, each from the nearest row and column.
-
-    Labels without directions are returned as they are, and so are labels in all their own directions.
-    """
+    """Labels (b, rows, columns) in the directions of a batch, each from the nearest row and column."""
     own, asked = scene.task.directions, batch.directions
     if own is None or asked is None or _is_same(asked, own):  # the usual case, found at once
         return values
@@ -106,7 +82,6 @@ def at_directions(values: Tensor, batch: Batch, scene: Scene) -> Tensor:
 
 
 def _is_same(asked: Directions, own: Grid) -> bool:
-    """True if the asked directions are all of the label's own."""
     if not isinstance(asked, Grid) or asked.shape != own.shape:
         return False
     pairs = (asked.elevations, own.elevations), (asked.azimuths, own.azimuths)

@@ -9,23 +9,14 @@ from gaigs.task import Task
 
 
 class MeanError(ABC):
-    """A mean over the errors of all links and directions, in the label's unit.
-
-    Args:
-        task: The labels' task.
-
-    Raises:
-        ValueError: The labels are complex.
-    """
+    """A mean over the errors of all links and directions, in the label's unit."""
 
     def __init__(self, task: Task):
         if task.dtype.is_complex:
-            raise ValueError(
-                f"labels of task {task.name!r} are complex, and this loss needs real ones; set loss=log_relative_error"
-            )
+            raise ValueError(f"labels of task {task.name!r} are complex, not real; set loss=log_relative_error")
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss, and the mean absolute error; see ``gaigs.loss.Loss``."""
+        """The loss, and the mean absolute error."""
         errors = values - batch.labels
         return self.mean(values, batch.labels), {"mae": errors.abs().mean()}
 

@@ -13,11 +13,7 @@ class Huber(MeanError):
     """Half the square of an error up to ``delta``, and linear beyond.
 
     Args:
-        task: The labels' task.
         delta: Error at which the square turns into a line, in the label's unit (dB for RSSI).
-
-    Raises:
-        ValueError: ``delta`` is not positive, or the labels are complex.
 
     Source: Huber, Robust estimation of a location parameter, 1964.
     """

@@ -3,9 +3,9 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from gaigs.geometry import Directions, Grid
-from gaigs.loss.windows import window_means
 from gaigs.query import Batch
 from gaigs.registry import register
 from gaigs.task import Task
@@ -20,11 +20,7 @@ class L1Ssim:
     and at most all pixels of the thinned grid.
 
     Args:
-        task: The labels' task, whose grid sets the window's angle.
         ssim: Weight of the SSIM term, the paper's 1 - beta.
-
-    Raises:
-        ValueError: The weight is out of range, or the labels have no grid.
 
     Source: GAI-GS, "Results": L_MAE and L_SSIM.
     """
@@ -33,11 +29,11 @@ class L1Ssim:
         if not 0 <= ssim <= 1:
             raise ValueError(f"loss.ssim must be in [0, 1], got {ssim}")
         if task.directions is None:
-            raise ValueError(f"loss 'l1_ssim' compares spectra, labels of task {task.name!r} are not; choose another")
+            raise ValueError(f"loss 'l1_ssim' compares spectra, not labels of task {task.name!r}; take another")
         self.ssim, self.pitch = ssim, task.directions.pitch
 
-    def __call__(self, values: Float[Tensor, "b rows columns"], batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss, and its terms ``l1`` and ``ssim``; see ``gaigs.loss.Loss``.
+    def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss, and its terms ``l1`` and ``ssim``.
 
         Raises:
             ValueError: The batch's directions are a list, which has no windows, or fewer than 3 x 3.
@@ -49,22 +45,12 @@ class L1Ssim:
 
 
 def find_window(loss: str, directions: Directions | None, pitch: float, pixels: int) -> int:
-    """Edge [pixels] of the window on a thinned grid that spans the same angle as on the label's own grid.
+    """Edge [pixels] of the window on a thinned grid that spans the angle of ``pixels`` (odd) on the label's own grid.
 
-    Args:
-        loss: Name of the loss for errors.
-        directions: The thinned grid.
-        pitch: Angle between neighbouring rows of the label's own grid [rad].
-        pixels: Edge on the label's own grid, odd.
-
-    Raises:
-        ValueError: The directions are no grid, or fewer than 3 x 3.
+    ``pitch`` is the angle between neighbouring rows of the label's own grid [rad], ``loss`` a name for errors.
     """
     if not isinstance(directions, Grid):
-        raise ValueError(
-            f"loss {loss!r} needs rows and columns, and training.thinning.rays draws single directions; set "
-            "loss=absolute or loss=squared"
-        )
+        raise ValueError(f"loss {loss!r} needs rows and columns; with training.thinning.rays set loss=absolute")
     smallest = min(directions.shape)
     if smallest < 3:
         raise ValueError(f"loss {loss!r} needs at least 3 x 3 directions, got {directions.shape}")
@@ -77,8 +63,7 @@ def structural_similarity(
 ) -> Float[Tensor, ""]:
     """Mean SSIM over all windows within the image: uniform weights, sample covariances, data range 1.
 
-    A window of 7 on the full grid gives the reported score, scikit-image's, with gradients. torchmetrics' convolutions
-    take a quarter of a training step here, and leave out five rows at each border.
+    A window of 7 on the full grid gives the reported score, scikit-image's, with gradients.
 
     Source: Wang et al., Image Quality Assessment, 2004, with the constants 0.01² and 0.03².
     """
@@ -90,3 +75,38 @@ def structural_similarity(
     covariance = unbiased * (xy - x * y)
     numerator = (2 * x * y + 0.01**2) * (2 * covariance + 0.03**2)
     return (numerator / ((x.square() + y.square() + 0.01**2) * (variances + 0.03**2))).mean()
+
+
+def window_means(images: Float[Tensor, "*batch rows columns"], window: int) -> Float[Tensor, "*batch r c"]:
+    """Means over every square window within an image, as of ``torch.nn.functional.avg_pool2d`` with stride 1.
+
+    On a CPU ``avg_pool2d`` adds window² pixels for each mean; here whole images are added along rows, then columns.
+    """
+    return _WindowMeans.apply(images, window)
+
+
+class _WindowMeans(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, images, window):
+        ctx.window = window
+        for axis in (-1, -2):
+            count = images.shape[axis] - window + 1
+            total = images.narrow(axis, 0, count).clone()
+            for first in range(1, window):
+                total += images.narrow(axis, first, count)
+            images = total
+        return images.div_(window**2)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, of_means):
+        gradient = of_means / ctx.window**2
+        for axis in (-2, -1):
+            count = gradient.shape[axis]
+            shape = list(gradient.shape)
+            shape[axis] += ctx.window - 1
+            total = gradient.new_zeros(shape)
+            for first in range(ctx.window):
+                total.narrow(axis, first, count).add_(gradient)
+            gradient = total
+        return gradient, None

@@ -13,11 +13,9 @@ class LogRelativeError(RelativeError):
     """The mean over the links of ln((1 + r / floor) / (1 + r floor)), r = |h - h'|² / |h|²: the SNR between two bounds.
 
     Between the bounds of -10 log10(floor) and 10 log10(floor) dB the loss is linear in the SNR in dB, so all links
-    have equal weight. Beyond the bounds a link pulls less and less: one of 30 dB needs no improvement, and one 30 dB
-    weaker than its prediction does not dim the room around it.
+    have equal weight. Beyond the bounds a link pulls less and less.
 
     Args:
-        task: The labels' task.
         floor: Relative error at the upper bound, its inverse is that at the lower one; 1e-3 is 30 dB.
 
     Raises:

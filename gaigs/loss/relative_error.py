@@ -13,14 +13,8 @@ from gaigs.task import Task
 class RelativeError:
     """The mean over the links of r = |h - h'|² / |h|².
 
-    A link in deep shadow, where any prediction is many times too strong, outweighs all others: predictions near zero
-    minimise this mean over a room. ``log_relative_error`` does not have that fault.
-
-    Args:
-        task: The labels' task.
-
-    Raises:
-        ValueError: The labels are real.
+    A link in deep shadow outweighs all others: predictions near zero minimise this mean over a room.
+    ``log_relative_error`` does not have that fault.
 
     Source: NeWRF, 2024, where it is called NMSE.
     """
@@ -29,13 +23,10 @@ class RelativeError:
 
     def __init__(self, task: Task):
         if not task.dtype.is_complex:
-            raise ValueError(
-                f"labels of task {task.name!r} are real, and loss {self.name!r} needs complex channels; set "
-                "loss=squared"
-            )
+            raise ValueError(f"labels of task {task.name!r} are real, not complex channels; set loss=squared")
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss, which is its only term; see ``gaigs.loss.Loss``."""
+        """The loss, which is its only term."""
         # Scaled by the strongest entry, so that squares of weak channels do not underflow; denormals have no inverse.
         labels = batch.labels.flatten(1)
         largest = labels.abs().amax(1, keepdim=True).clamp_min(FAINTEST)

@@ -4,10 +4,9 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs import checkpoint
@@ -15,7 +14,7 @@ from gaigs.data import Links
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Directions, ExtrapolationWarning
 from gaigs.query import ROUNDING, Batch, Query, as_directions
-from gaigs.registry import check_type, registry
+from gaigs.registry import registry
 from gaigs.scene import Scene
 
 
@@ -46,8 +45,6 @@ class Model(nn.Module):
         penalty_weights: Default weight of each penalty; ``training.penalties`` overrides it.
         chunk: Largest number of pairs of a link and a direction evaluated at a time; None: whole labels. Training sees
             as many as ``training.thinning`` leaves.
-        predicts_untrained: True if ``fit`` alone makes it a predictor, so that the training's start is a candidate.
-        primitives: Gaussians that density control changes and figures draw; None for a model without.
         revisions: Fractions of the training after which ``OptionalMethods.revise`` is called.
         configuration: Options that a registered model was made with; ``save`` stores them.
 
@@ -73,16 +70,28 @@ class Model(nn.Module):
     learning_rates: Mapping[str, float] = {"network": 1.6e-2}
     penalty_weights: Mapping[str, float] = {}
     chunk: int | None = None
-    predicts_untrained = False
-    primitives: Gaussians | None = None
     revisions: tuple[float, ...] = ()
 
     def __init__(self, scene: Scene):
         super().__init__()
         self.scene = scene
 
+    @property
+    def predicts_untrained(self) -> bool:
+        """True if ``fit`` alone makes it a predictor, so that the training's start is a candidate."""
+        return False
+
+    @property
+    def primitives(self) -> Gaussians | None:
+        """Gaussians that density control changes and figures draw; None for a model without."""
+        return None
+
     def fit(self, links: Links) -> None:
-        """Learns what follows from the training links without gradients; by default nothing."""
+        """Learns from the training links without gradients; by default nothing.
+
+        Raises:
+            ValueError: A receiver has no training or validation links.
+        """
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by the names in ``learning_rates``."""
@@ -105,11 +114,7 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
-        """Values of a batch in all its directions, at most ``chunk`` pairs of a link and a direction at a time.
-
-        Returns:
-            (b, *shape), on the batch's device.
-        """
+        """Values (b, *shape) of a batch in all its directions, ``chunk`` pairs of a link and a direction at a time."""
         if self.chunk is None or batch.directions is None:
             return self(batch).value
         rays = batch.directions.flatten()
@@ -124,22 +129,21 @@ class Model(nn.Module):
 
     def predict(
         self,
-        transmitters: Query | Float[Tensor, "*points 3"],
-        receiver: int | str | Int[Tensor, "*points"] = 0,
-        frequency: float | Float[Tensor, "*points"] | None = None,
+        transmitters: object,
+        receiver: object = 0,
+        frequency: object = None,
         batch_size: int = 16,
         directions: Directions | None = None,
     ) -> Tensor:
         """Values for transmitters anywhere: a query, or a point, a list of points, or a grid.
 
         Args:
-            transmitters: Positions, world frame [m], anything that becomes a float tensor, each coordinate below 1e5 m;
-                or a whole query.
+            transmitters: Positions, world frame [m], anything that becomes a float tensor; or a whole query.
             receiver: Name or index of the receiver; or an index for each position.
             frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the training links'
                 only carrier.
             batch_size: Links computed at a time.
-            directions: Directions to predict, where the label has directions; None: the label's own.
+            directions: Directions to predict; None: the label's own, if it has directions.
 
         Returns:
             A value of the task's shape for each position, scaled as the training labels
@@ -150,9 +154,7 @@ class Model(nn.Module):
                 box and the receivers, or a frequency is outside the training links' band. Not for a query.
 
         Raises:
-            TypeError: The batch size is no whole number, or the directions are of another type.
-            ValueError: The batch size is less than 1, or an argument is refused by ``Query.from_positions`` or
-                ``gaigs.query.as_directions``.
+            ValueError: The batch size is less than 1, or a position, receiver, frequency or direction is impossible.
 
         Example:
             >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
@@ -168,19 +170,16 @@ class Model(nn.Module):
 
     def predict_batches(
         self,
-        transmitters: Query | Float[Tensor, "*points 3"],
-        receiver: int | str | Int[Tensor, "*points"] = 0,
-        frequency: float | Float[Tensor, "*points"] | None = None,
+        transmitters: object,
+        receiver: object = 0,
+        frequency: object = None,
         batch_size: int = 16,
         directions: Directions | None = None,
     ) -> Iterator[Tensor]:
-        """The values of ``predict`` a batch at a time, for more positions than memory holds values of.
+        """The values of ``predict`` (b, *shape) a batch at a time, each computed when it is asked for.
 
-        Arguments, warnings and errors are those of ``predict``, and come at once.
-
-        Returns:
-            Values (b, *shape) of one batch of positions after the other, a grid's in the order of ``reshape(-1, 3)``;
-            the last batch may be smaller. Each is computed when it is asked for.
+        Arguments, warnings and errors are those of ``predict``, and come at once. The positions of a grid are in the
+        order of ``reshape(-1, 3)``; the last batch may be smaller.
         """
         batches, _ = self._batches(transmitters, receiver, frequency, batch_size, directions)
         return (self._answer(batch) for batch in batches)
@@ -189,7 +188,6 @@ class Model(nn.Module):
         self, transmitters, receiver, frequency, batch_size, directions
     ) -> tuple[Iterator[Batch], tuple[int, ...]]:
         """Checked batches for the arguments of ``predict``, on the model's device; and the positions' leading axes."""
-        check_type("batch_size", batch_size, int)
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
         scene = self.scene
@@ -220,7 +218,7 @@ class OptionalMethods(Protocol):
         """Entries of ``metrics.json`` beside the model's sizes; plain values by name."""
 
     def rendering(self, batch: Batch) -> Callable[[], object]:
-        """The rendering of a batch without all else, to be timed."""
+        """The rendering alone of a batch, to be timed."""
 
     def learnt_room(self, links: Links) -> object:
         """The room learnt from the links, a ``gaigs.placement.learnt_room.LearntRoom`` for figures."""
@@ -229,30 +227,23 @@ class OptionalMethods(Protocol):
         """Writes files for other programs into a run's folder."""
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
-        """Changes the model between two training steps in ways that gradients cannot, such as by a search.
+        """Changes the model between two training steps, such as by a search, and gives a sentence for the log.
 
-        Parameters keep their shapes, and the state dict has every decision.
-
-        Args:
-            number: Index into ``Model.revisions``.
-            train: Some training links, thinned as in the training's steps.
-            validation: Some validation links; None where none are held out.
-            loss: Loss of the model in its present state on a batch.
-
-        Returns:
-            A sentence for the log.
+        ``number`` is an index into ``Model.revisions``. The batches are some training links, thinned as in a step, and
+        some validation links. Parameters keep their shapes, and the state dict has every decision.
         """
 
 
-def call_optional(model: Model, method: str, *arguments: object) -> object:
-    """Result of a model's method of ``OptionalMethods``; None where the model has no such method."""
+def call_optional(model: Model, method: str, *arguments: object) -> Any:
+    """Result of a model's method of ``OptionalMethods``; None if the model has no such method."""
     return getattr(model, method)(*arguments) if hasattr(model, method) else None
 
 
 def warn_of_extrapolation(query: Query, scene: Scene) -> None:
-    """Warns of positions far from the training transmitters' box, and of carriers outside the training links' band.
+    """Warns of positions farther from the training transmitters' box than the scene's extent, and of carriers outside
+    the training links' band.
 
-    Far is more than the diagonal of the box and the receivers. The warning names the line that called ``predict``.
+    The warning names the line that called ``predict``.
     """
     messages, points = [], query.transmitters
     distances = (points - points.clamp(scene.lower.to(points), scene.upper.to(points))).norm(dim=-1)
@@ -275,12 +266,8 @@ def warn_of_extrapolation(query: Query, scene: Scene) -> None:
 
 
 def build_trend(trend: str | Mapping | Model, scene: Scene) -> Model:
-    """The model that is a trend, built where its name or configuration is given.
-
-    Raises:
-        ValueError: There is no such model, or it cannot be built.
-    """
-    is_known = trend in registry("model").names() if isinstance(trend, str) else True
-    if not is_known or (isinstance(trend, Mapping) and "name" not in trend):
-        raise ValueError(f"model.trend must have the name of a model, such as mean, got {trend!r}")
-    return registry("model").build(trend, scene=scene)
+    """The model that is a trend; errors name the option ``model.trend``."""
+    try:
+        return registry("model").build(trend, scene=scene)
+    except ValueError as error:
+        raise ValueError(f"model.trend: {error}") from error

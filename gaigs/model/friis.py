@@ -23,28 +23,24 @@ class Friis(Model):
     links a receiver the sign is -1. NaN before ``fit``.
 
     Raises:
-        ValueError: The labels are no channels, or their number of elements is not the array's.
+        ValueError: The labels are not channels, or their number of elements is not the array's.
 
     Source: Friis, A note on a simple transmission formula, 1946.
     """
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
-        check_elements("model 'friis'", scene)
+        self.frequencies = check_elements("model 'friis'", scene).frequencies
         self.register_buffer("gains", torch.full((len(scene.receivers),), torch.nan, dtype=torch.complex64))
         self.register_buffer("sign", torch.tensor(-1))
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits the sign and the gains.
-
-        Raises:
-            ValueError: A receiver has no training or validation links.
-        """
+        """Fits the sign and the gains."""
         known = known_links(links)
         index = torch.cat(known)
         labels, query = links.labels[index].to(torch.complex128), links.query[index]
-        waves = direct_waves(self.scene, query, self.scene.task.frequencies)
+        waves = direct_waves(self.scene, query, self.frequencies)
         sign = phase_sign(labels, waves, query.receivers)
         self.sign.fill_(sign or -1)
         self.gains.zero_()
@@ -58,5 +54,5 @@ class Friis(Model):
 
     def _waves(self, query: Query) -> Complex[Tensor, "b e s"]:
         """The direct wave at each element, with a gain of 1."""
-        waves = direct_waves(self.scene, query, self.scene.task.frequencies, int(self.sign))
+        waves = direct_waves(self.scene, query, self.frequencies, int(self.sign))
         return direct_gains(self.scene, query)[:, None, None] * waves

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -26,31 +26,25 @@ from gaigs.scene import Scene, carriers
 
 
 class Excited(NamedTuple):
-    """The Gaussians as places excite them.
-
-    Attributes:
-        placed: Before the deformation.
-        residuals: Changes by the deformation.
-        semi_axes: Changed semi-axes, a column for each axis (1 or places, n, 3, 3) [m].
-    """
+    """The Gaussians as places excite them: before the deformation, their changes, and their semi-axes after it."""
 
     placed: Placed
     residuals: Residuals
-    semi_axes: Float[Tensor, "places n 3 3"]
+    semi_axes: Float[Tensor, "places n 3 3"]  # a column for each axis [m]
 
 
 @register("model", "gaigs")
 class GaussianSplatting(Model):
     """Placement -> tokens -> residuals -> Gaussians as the query excites them -> splats -> map -> value.
 
-    Where the pooling takes paths, there are no splats and no map.
+    If the pooling takes paths, there are no splats and no map.
 
     Args:
         scene: Receivers and task.
         placement, tokenizer, deformation, projection, rasterizer, pooling: Registered components: each the name, the
             configuration (a mapping with ``name`` and options), or the object itself. Pooling None is the label's own.
-            Projection and rasterizer are None where the pooling takes paths.
-        gaussians: Options of ``gaigs.gaussians.Gaussians`` [m]; None for none, where the placement brings its own.
+            Projection and rasterizer are None if the pooling takes paths.
+        gaussians: Options of ``gaigs.gaussians.Gaussians`` [m]; None if the placement alone brings Gaussians.
         trend: Model whose value the pooled map is added to, likewise; None for none.
 
     Raises:
@@ -89,36 +83,30 @@ class GaussianSplatting(Model):
         if trend is not None:
             self.trend = build_trend(trend, scene)
             if not self.trend.state_dict() or [*self.trend.parameters()]:
-                kind = "needs its data" if not self.trend.state_dict() else "has to be trained itself"
-                raise ValueError(
-                    f"the trend must be fitted at once and stored in a checkpoint, and {name_of(self.trend)} {kind}; "
-                    "take path_loss, friis or mean with task.trend.name"
-                )
+                raise ValueError(f"task.trend.name cannot be {name_of(self.trend)}; take mean, path_loss or friis")
             self.register_buffer("level", torch.zeros(()))  # of the untrained map, in the label's unit
         self.pooling = registry("pooling").build(self.own_pooling(scene) if pooling is None else pooling, scene=scene)
-        self.projection = self.rasterizer = None
+        self.projection: Any = None
+        self.rasterizer: Any = None
         zone = self.pooling.zone
         if self.takes_paths:
             if projection is not None or rasterizer is not None:
                 raise ValueError(
-                    f"pooling {name_of(self.pooling)!r} takes paths, so there is nothing to project and rasterize\n"
-                    "leave out both (~projection ~rasterizer, None in Python), or take a pooling of maps, such as "
-                    "array_response, mean_power or element_sum"
+                    f"pooling {name_of(self.pooling)!r} takes paths, and no map is projected or rasterized\n"
+                    "leave out projection and rasterizer (~projection ~rasterizer, None in Python)"
                 )
-            self._check_gives(_no_paths(scene))
+            amplitudes = torch.zeros(1, 0, dtype=torch.complex64)
+            paths = torch.zeros(1, 0, 3), torch.zeros(1, 0, 3, 3), amplitudes, torch.zeros(1, 0), torch.zeros(0), None
+            self._check_gives(ReceivedPaths(*paths, scene.receivers[0], torch.tensor([1e9])))
         else:
             if projection is None or rasterizer is None:
                 raise ValueError(
                     f"pooling {name_of(self.pooling)!r} takes a map, which needs a projection and a rasterizer\n"
-                    "set projection=mercator rasterizer=fastest, or take a pooling of paths: path_spectrum, path_rssi "
-                    "or path_csi"
+                    "set projection=mercator rasterizer=fastest, or pooling=path_spectrum, path_rssi or path_csi"
                 )
             grid = self.pooling.grid or scene.task.directions
             if grid is None:
-                raise ValueError(
-                    f"labels of task {scene.task.name!r} have no directions, so the pooling must have a grid of its "
-                    f"own, and {name_of(self.pooling)} has none; take the task's own pooling"
-                )
+                raise ValueError(f"labels of task {scene.task.name!r} have no directions; take the task's own pooling")
             self._check_gives(torch.zeros(1, self.pooling.channels, *grid.shape))
             self.projection = registry("projection").build(projection, pixel=grid.pitch)
             self.rasterizer = registry("rasterizer").build(rasterizer)
@@ -129,33 +117,29 @@ class GaussianSplatting(Model):
         self.placement = registry("placement").build(placement, scene=scene, channels=channels)
         own = name_of(self.placement)
         if self.placement.model not in (None, self.name):
-            raise ValueError(
-                f"placement {own!r} makes another predictor, whose results go by its name; set "
-                f"model={self.placement.model}"
-            )
+            raise ValueError(f"placement {own!r} makes another predictor; set model={self.placement.model}")
         if self.own_placement not in (None, own):
-            raise ValueError(
-                f"model {self.name!r} takes placement={self.own_placement}, got {own}; take +experiment={self.name}, "
-                "which has all its parts"
-            )
+            needed = f"placement={self.own_placement}"
+            raise ValueError(f"model {self.name!r} takes {needed}, got {own}; take +experiment={self.name}")
         self.gaussians = None
         if gaussians is not None:
             self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels)
             if self.placement.has_own and self.gaussians.degree:
-                raise ValueError(
-                    f"Gaussians beside those of placement {own!r} must have gaussians.degree=0, got "
-                    f"{self.gaussians.degree}"
-                )
+                raise ValueError(f"placement {own!r} needs gaussians.degree=0, got {self.gaussians.degree}")
         elif not self.placement.has_own:
             raise ValueError(f"placement {own!r} places free Gaussians alone; set gaussians=lattice")
-        kind = deformation
+        component: Any = deformation
         if not is_built(deformation):
-            kind = registry("deformation").get(deformation if isinstance(deformation, str) else deformation["name"])
+            component = registry("deformation").get(
+                deformation if isinstance(deformation, str) else deformation["name"]
+            )
         self.tokenizer, context = None, {"scene": scene, "channels": channels}
-        if kind.reads_tokens:
+        if component.reads_tokens:
             parts = self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
             context["tokenizer_widths"] = parts.scene_width, parts.gaussian_width, parts.transmitter_width
         self.deformation = registry("deformation").build(deformation, **context)
+        self.learning_rates = {**Gaussians.learning_rates, **self.placement.learning_rates, **Model.learning_rates}
+        self.penalty_weights = {"opacity": 0.01, **self.placement.penalty_weights}  # the paper's alpha, as released
 
     @property
     def takes_paths(self) -> bool:
@@ -171,10 +155,7 @@ class GaussianSplatting(Model):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits placement, pooling and trend.
-
-        The training starts from the trend: the map's mean level is taken off.
-        """
+        """Fits placement, pooling and trend; takes off the map's mean level, so that training starts from the trend."""
         self.placement.fit(links)
         self.pooling.fit(links)
         if self.trend is None:
@@ -193,16 +174,9 @@ class GaussianSplatting(Model):
         return self.trend is not None
 
     def forward(self, batch: Batch) -> Prediction:
-        """As of every model.
-
-        Raises:
-            ValueError: In half precision.
-        """
         own = next(self.parameters())
         if torch.is_autocast_enabled(own.device.type) or torch.finfo(own.dtype).bits < 32:
-            raise ValueError(
-                "angles and phases of Gaussians need the digits of float32; set trainer.precision to 32-true or 64-true"
-            )
+            raise ValueError("angles and phases of Gaussians need float32; set trainer.precision to 32-true or 64-true")
         query = batch.query
         # Receivers share what a place excites, unless a part looks at the receiver.
         parts = self.placement, self.tokenizer, self.deformation
@@ -231,14 +205,6 @@ class GaussianSplatting(Model):
         """The pooled value on top of the trend."""
         return value if self.trend is None else self.trend(batch).value + value - self.level
 
-    @property
-    def learning_rates(self) -> dict[str, float]:
-        return {**Gaussians.learning_rates, **self.placement.learning_rates, **super().learning_rates}
-
-    @property
-    def penalty_weights(self) -> dict[str, float]:
-        return {"opacity": 0.01, **self.placement.penalty_weights}  # the paper's alpha, as released
-
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {}
         if self.gaussians is not None:
@@ -254,7 +220,7 @@ class GaussianSplatting(Model):
         return self.gaussians
 
     def facts(self) -> dict[str, object]:
-        """The rasterizer that drew the last map, where there is one."""
+        """The rasterizer that drew the last map, if any."""
         return {} if self.rasterizer is None else {"rasterizer": self.rasterizer.used}
 
     def rendering(self, batch: Batch) -> Callable[[], object]:
@@ -297,14 +263,7 @@ class GaussianSplatting(Model):
         return Excited(placed, residuals, semi_axes(quats, scales))
 
     def paths(self, excited: Excited, which: Int[Tensor, " b"], receiver: int, query: Query) -> ReceivedPaths:
-        """The paths of some queries to one receiver.
-
-        Args:
-            excited: The Gaussians of all places.
-            which: Place of each query.
-            receiver: Index of the receiver.
-            query: The queries.
-        """
+        """The paths of some queries, each with its place ``which``, to one receiver."""
         placed = excited.placed
         means, axes = (part if len(part) == 1 else part[which] for part in (placed.means, excited.semi_axes))
         signal, opacities, _ = self._strengths(excited, which)
@@ -331,10 +290,7 @@ class GaussianSplatting(Model):
     def _splats(
         self, excited: Excited, which: Int[Tensor, " b"], receiver: int, directions: Directions | None
     ) -> list[tuple]:
-        """The rasterizer's arguments: the Gaussians of some queries on the receiver's plane.
-
-        One call does for all where the Gaussians stand still, else there is one for each query.
-        """
+        """The rasterizer's arguments: Gaussians on the receiver's plane, for all queries at once unless they move."""
         placed, axes = excited.placed, excited.semi_axes
         if self.pooling.grid is not None or directions is None:
             directions = self.pooling.grid or self.scene.task.directions
@@ -373,32 +329,19 @@ class GaussianSplatting(Model):
         return signal.expand(len(which), -1, -1), opacities.expand(len(which), -1), attenuations
 
     def _check_gives(self, received: Tensor | ReceivedPaths) -> None:
-        """Raises a ``ValueError`` where the pooling gives no label of the task from a single map or set of paths."""
+        """Raises a ``ValueError`` unless the pooling gives labels of the task's shape."""
         query = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), torch.tensor([1e9]))  # any carrier
         gives, task = tuple(self.pooling(received, query).shape[1:]), self.scene.task
         if gives != task.shape:
-            raise ValueError(
-                f"the pooling must give labels of task {task.name!r}, {task.shape}, and {name_of(self.pooling)} gives "
-                f"{gives}; take the task's own pooling"
-            )
-
-
-def _no_paths(scene: Scene) -> ReceivedPaths:
-    """One set of zero paths."""
-    zeros = torch.zeros
-    amplitudes = zeros(1, 0, dtype=torch.complex64)
-    paths = zeros(1, 0, 3), zeros(1, 0, 3, 3), amplitudes, zeros(1, 0), zeros(0), None
-    return ReceivedPaths(*paths, scene.receivers[0], torch.tensor([1e9]))
+            own = f"labels of task {task.name!r}, {task.shape}"
+            raise ValueError(f"pooling {name_of(self.pooling)!r} gives {gives}, not {own}; take the task's own pooling")
 
 
 def _towards(bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]) -> Float[Tensor, "*b n c 1"]:
-    """Signal of Gaussians for transmitters so far away from them [m], before the factor of the constant harmonic.
-
-    Without harmonics it is the same for all transmitters.
-    """
+    """Signal of Gaussians towards transmitters at these offsets [m], before the factor of the constant harmonic."""
     if bands.shape[-1] == 1:
         return bands
-    # On a centre there is no direction. Nearer than 0.05 m the harmonics fade, so that gradients stay moderate.
+    # On a centre there is no direction. Nearer than 0.05 m the harmonics fade: gradients stay moderate.
     seen = -offsets / offsets.norm(dim=-1, keepdim=True).clamp(min=0.05)
     harmonics = spherical_harmonics(seen, math.isqrt(bands.shape[-1]) - 1)
     return (bands * harmonics[:, :, None]).sum(-1, keepdim=True) / SH_DC

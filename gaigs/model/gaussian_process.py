@@ -8,7 +8,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, label_numbers
+from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, thin_labels
 from gaigs.kriging.kernel import LIMIT, cholesky_factor, kernel, kriging_weights
 from gaigs.kriging.links import PART, at_directions, coordinates, distances, known_links
 from gaigs.model import Model, Prediction, build_trend
@@ -24,14 +24,13 @@ NEIGHBOURS = 300
 class GaussianProcess(Model):
     """label = trend + z + noise, z a Gaussian process over places with the Matern-1/2 kernel exp(-d / l).
 
-    d is the distance of transmitters. Where the training links have several carriers it is the distance in place and
-    frequency, d² = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are processes of their own with
-    one kernel.
+    d is the distance of transmitters. With several carriers it is the distance in place and frequency,
+    d² = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are processes of their own with one
+    kernel.
 
     Length l [m], nugget (variance of the noise over that of the signal) and s [m] maximise the likelihood of the
-    validation links given the training links around them. With fewer than ``kriging.fit.FEWEST`` of them, training
-    links are held out one by one, each with all that share its place. All receivers share the three. The signal's
-    variance is each receiver's most likely one.
+    validation links given the training links around them, see ``gaigs.kriging.fit``. All receivers share the three.
+    The signal's variance is each receiver's most likely one.
 
     A receiver with more than ``LIMIT`` known links is predicted from the ``NEIGHBOURS`` nearest to each query (local
     kriging). Residuals of channels are limited to ``kriging.fit.LOUDEST`` times the receiver's median channel.
@@ -39,8 +38,7 @@ class GaussianProcess(Model):
     It is a look-up: it keeps the links, and is not stored in a checkpoint.
 
     Args:
-        trend: Configuration of the model that is fitted first; the process describes its residuals. None: each
-            receiver's mean label.
+        trend: Configuration of the model whose residuals the process describes. None: each receiver's mean label.
 
     Raises:
         ValueError: The trend is a trained model.
@@ -51,37 +49,28 @@ class GaussianProcess(Model):
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
         built = build_trend({"name": "mean"} if trend is None else trend, scene)
-        if any(True for _ in built.parameters()):
-            raise ValueError(
-                f"model.trend must be a model without training, got {trend['name']}; choose mean, path_loss or friis"
-            )
+        if [*built.parameters()]:
+            raise ValueError(f"model.trend cannot be trained, got {trend['name']}; take mean, path_loss or friis")
         self.trends = (built,)  # in a tuple: its state is no state of this look-up
-        self.links, self.known, self.solved, self.factors = None, None, None, None
+        self.factors: Tensor | None = None
         self.process = Hyperparameters()
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits trend and hyperparameters, and factorises the covariances.
-
-        Raises:
-            ValueError: A receiver has no training or validation links.
-        """
+        """Fits trend and hyperparameters, and factorises the covariances."""
         self.links, self.known = links, known_links(links)
         self.trends[0].fit(links)
         self.factors = None
         if self.scene.task.dtype.is_complex:
             index = torch.cat(self.known)
-            residuals = torch.cat([part for _, part in self._residuals(index)])
+            residuals = torch.cat([*self._residuals(index)])
             factors = damping(residuals, links.labels[index], links.query.receivers[index])
             self.factors = torch.ones(len(links)).index_copy(0, index, factors)
-        numbers = label_numbers(self.scene)
-        residuals = lambda index: torch.cat(
-            [part.reshape(len(part), -1)[:, numbers] for _, part in self._residuals(index)]
-        )
+        residuals = lambda index: torch.cat([thin_labels(part) for part in self._residuals(index)])
         self.process, _ = fit_hyperparameters(self.scene, links, residuals)
         self.solved = [self._solve(index) for index in self.known]
 
-    def facts(self) -> dict[str, object]:
+    def facts(self) -> dict[str, float]:
         """``length_m``, ``nugget``, and with several carriers ``frequency_scale_m``."""
         return self.process.facts()
 
@@ -98,28 +87,27 @@ class GaussianProcess(Model):
         return coordinates(self.scene, query, self.process.scale)
 
     def _solve(self, index: Int[Tensor, " k"]) -> tuple[Tensor | None, Tensor | None]:
-        """The smaller of a receiver's residuals over their covariances, and the covariances' Cholesky factor.
+        """A receiver's residuals over their covariances or, if smaller, the covariances' Cholesky factor.
 
-        Both are None where local kriging predicts.
+        Both are None for local kriging.
         """
         if len(index) > LIMIT:
             return None, None
         factor = cholesky_factor(self._places(self.links.query[index]), self.process.length, self.process.nugget)
         if math.prod(self.scene.task.shape) >= len(index):
             return None, factor
-        residuals = torch.cat([part for _, part in self._residuals(index)]).reshape(len(index), -1)
+        residuals = torch.cat([*self._residuals(index)]).reshape(len(index), -1)
         wide = torch.promote_types(residuals.dtype, torch.float64)
         return torch.cholesky_solve(residuals.to(wide), factor.to(wide)), None
 
-    def _residuals(self, index: Int[Tensor, " k"]) -> Iterator[tuple[slice, Tensor]]:
-        """Labels of some links less their trend, ``PART`` links at a time, with their positions in the index."""
-        for start in range(0, len(index), PART):
-            some = index[start : start + PART]
+    def _residuals(self, index: Int[Tensor, " k"]) -> Iterator[Tensor]:
+        """Labels of some links less their trend, ``PART`` links at a time."""
+        for some in index.split(PART):
             trend = self.trends[0](Batch(self.links.query[some], self.scene.task.directions)).value
             residuals = self.links.labels[some] - trend
             if self.factors is not None:
                 residuals = residuals * self.factors[some, None, None]
-            yield slice(start, start + len(some)), residuals
+            yield residuals
 
     def _kriged(self, query: Query, receiver: int) -> Tensor:
         """Residuals (b, *shape) that the process predicts."""
@@ -137,7 +125,5 @@ class GaussianProcess(Model):
             used, column = near.unique(return_inverse=True)
             weights = own.new_zeros(len(query), len(used)).scatter(1, column, own)
             index = index[used]
-        values = 0
-        for part, residuals in self._residuals(index):
-            values = values + torch.tensordot(weights[:, part].to(residuals), residuals, 1)
-        return values
+        parts = zip(weights.split(PART, 1), self._residuals(index), strict=True)
+        return sum(torch.tensordot(part.to(residuals), residuals, 1) for part, residuals in parts)

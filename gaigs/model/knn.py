@@ -19,7 +19,7 @@ class KNearestNeighbours(Model):
     """The mean of the k known labels nearest to the transmitter, weighted by 1 / distance^power.
 
     Links as near as the k-th count too, so that the order of links does not matter. The look-up keeps all links, one
-    byte a pixel where the labels are images.
+    byte a pixel for images.
 
     Where the training links have several carriers, the distance is that in place and frequency,
     d² = |dx|² + (s d ln f)². ``fit`` takes the scale s [m] with the least squared error of known links that are
@@ -28,9 +28,6 @@ class KNearestNeighbours(Model):
     Args:
         k: Number of neighbours; with fewer known links, all of them.
         power: Exponent of the distance; 0 weights all neighbours equally.
-
-    Raises:
-        ValueError: ``k`` or ``power`` is out of range.
 
     Source: reference look-up of the data sets' own README; Shepard, 1968.
     """
@@ -42,22 +39,18 @@ class KNearestNeighbours(Model):
         if not 0 <= power < math.inf:
             raise ValueError(f"model.power must be 0 or more, and finite, got {power}")
         self.k, self.power = k, power
-        self.links, self.known, self.scale = None, None, math.nan
+        self.scale = math.nan
 
     def fit(self, links: Links) -> None:
-        """Keeps the links, and chooses the scale of frequencies.
-
-        Raises:
-            ValueError: A receiver has no training or validation links.
-        """
+        """Keeps the links, and chooses the scale of frequencies."""
         self.links, self.known, self.scale = links, known_links(links), math.nan
         if self.scene.has_band:
             low, high = scale_bounds(self.scene)
             scales = torch.logspace(math.log10(low), math.log10(high), 16, dtype=torch.float64).tolist()
             self.scale = min(scales, key=self._leave_one_out)
 
-    def facts(self) -> dict[str, object]:
-        """``frequency_scale_m``, where there are several carriers."""
+    def facts(self) -> dict[str, float]:
+        """``frequency_scale_m``, with several carriers."""
         return {} if math.isnan(self.scale) else {"frequency_scale_m": self.scale}
 
     def forward(self, batch: Batch) -> Prediction:
@@ -70,7 +63,6 @@ class KNearestNeighbours(Model):
         return Prediction(at_directions(labels, batch, self.scene), {})
 
     def _distances(self, query: Query, index: Int[Tensor, " k"], scale: float) -> Float[Tensor, "b k"]:
-        """Distances of links to some known ones [m]."""
         asked, known = (coordinates(self.scene, part, scale) for part in (query, self.links.query[index]))
         return distances(asked, known)
 

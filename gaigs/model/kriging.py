@@ -5,15 +5,16 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor, nn
 
 from gaigs.data import Links, Split
 from gaigs.gaussians import Gaussians
 from gaigs.kriging.field import Field
-from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, label_numbers
+from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, thin_labels
 from gaigs.kriging.kernel import LIMIT
 from gaigs.kriging.links import PART, coordinates, thinned
 from gaigs.model import Model, Prediction, call_optional
@@ -33,20 +34,18 @@ class Kriging(Model):
     """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend, z the kriged residual.
 
     The trend is a trained model. The fallback is a model that is fitted at once. z is the mean of a Gaussian process
-    over places, as in ``gaigs.model.gaussian_process``, residuals of channels limited as there. Far from all known
-    links z is 0. With a trend weight of 0 and a weight of 1 this is that process.
+    over places, as in ``gaigs.model.gaussian_process``, and 0 far from all known links. With a trend weight of 0 and a
+    weight of 1 this is that process.
 
     Trend weight, length and nugget maximise the likelihood of the validation links given the training links around
     them. The weight is the one with which the validation links, predicted from the training links, score best: the
     likelihood alone would trust kriging too far where cubes of space are held out.
 
-    A checkpoint holds it whole, the residuals as a few principal components. Of a receiver with more than ``LIMIT``
-    known links an even part is used.
-
-    A run makes it by ``kriging=true``.
+    A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal components. Of a receiver
+    with more than ``LIMIT`` known links an even part is used.
 
     Args:
-        trend: The trained model, or its configuration where a state is to be loaded.
+        trend: The trained model, or its configuration if a state is to be loaded.
         fallback: Configuration of the model that takes the rest of the trend weight; None: each receiver's mean label.
 
     Raises:
@@ -54,6 +53,10 @@ class Kriging(Model):
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7 and 5.4.2.
     """
+
+    trend_weight: Tensor
+    weight: Tensor
+    hyperparameters: Tensor
 
     def __init__(self, scene: Scene, trend: dict | Model, fallback: dict | None = None):
         super().__init__(scene)
@@ -63,30 +66,21 @@ class Kriging(Model):
         self.fallback_options = {"name": "mean"} if fallback is None else fallback
         self.fallback = registry("model").build(self.fallback_options, scene=scene)
         if not self.fallback.state_dict() or [*self.fallback.parameters()]:
-            raise ValueError(
-                "kriging_fallback must be a model without training that a checkpoint can hold, got "
-                f"{self.fallback_options['name']}; choose mean, path_loss or friis"
-            )
-        self.chunk, self.trained_by = self.trend.chunk, self.trend.trained_by
-        self.learning_rates, self.penalty_weights = self.trend.learning_rates, self.trend.penalty_weights
+            name = self.fallback_options["name"]
+            raise ValueError(f"kriging_fallback cannot be {name}; take mean, path_loss or friis")
+        self.chunk = self.trend.chunk
         self.register_buffer("trend_weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("hyperparameters", torch.full((3,), math.nan, dtype=torch.float64))
         self.fields = nn.ModuleList(Field(scene) for _ in scene.receivers)
 
-    # --- fitting ---
+    def fit(self, links: Links) -> None:
+        """Kriges the residuals of the trend, which must be trained."""
+        self.krige(links)
 
     @torch.no_grad()
-    def fit(self, links: Links) -> "Kriging":
-        """Kriges the residuals of the trend, which must be trained.
-
-        Returns:
-            The validation model: the same weights and hyperparameters on the training links alone, to be scored on the
-            validation links.
-
-        Raises:
-            ValueError: A receiver has no training or validation links.
-        """
+    def krige(self, links: Links) -> "Kriging":
+        """Fits, and gives the validation model: the same weights and hyperparameters on the training links alone."""
         links = thinned(links, LIMIT)
         split = links.split
         values = predicted(self.trend, links, known(links))
@@ -108,35 +102,24 @@ class Kriging(Model):
             best = max(WEIGHTS, key=lambda weight: sign * score(weight))
             self.weight.fill_(best)
             validation_model.weight.fill_(best)
-        log.info(
-            "kriging: weight %g, trend weight %g of %s, length %.3g m, nugget %.3g, %d components",
-            *(self.weight, self.trend_weight, name_of(self.trend), *self.hyperparameters[:2]),
-            max(len(field.components) for field in self.fields),
-        )
+        log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))
         return validation_model
 
-    def _fit_trend_weight(self, links: Links, values: Float[Tensor, " k *shape"]) -> None:
-        """Fits the trend weight and the hyperparameters.
-
-        Args:
-            links: At most ``LIMIT`` known ones of each receiver.
-            values: The trend's predictions of the ``known`` links, in their order.
-        """
-        numbers = label_numbers(self.scene)
-        thin = lambda labels: labels.reshape(len(labels), -1)[:, numbers]
+    def _fit_trend_weight(self, links: Links, values: Tensor) -> None:
+        """Fits the trend weight and the hyperparameters; ``values`` are the trend's predictions of known links."""
         index = known(links)
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
         over, apart = [], []  # labels and trend, less the fallback
         for part in torch.arange(len(index)).split(PART):
             fallback = predicted(self.fallback, links, index[part])
-            over.append(thin(links.labels[index[part]] - fallback))
-            apart.append(thin(values[part] - fallback))
+            over.append(thin_labels(links.labels[index[part]] - fallback))
+            apart.append(thin_labels(values[part] - fallback))
         over, apart = torch.cat(over), torch.cat(apart)
 
         def fitted(trend_weight: float, **options: int) -> tuple[Hyperparameters, float]:
             left = over - trend_weight * apart
             if left.is_complex():
-                left = left * damping(left, thin(links.labels[index]), links.query.receivers[index])[:, None]
+                left = left * damping(left, thin_labels(links.labels[index]), links.query.receivers[index])[:, None]
             return fit_hyperparameters(self.scene, links, lambda some: left[rows[some]], **options)
 
         found = {trend_weight: fitted(trend_weight) for trend_weight in WEIGHTS}
@@ -146,8 +129,8 @@ class Kriging(Model):
         self.trend_weight.fill_(best)
         self.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
 
-    def _solve(self, links: Links, values: Float[Tensor, " k *shape"]) -> None:
-        """Kriges the residuals of the known links; arguments as for ``_fit_trend_weight``."""
+    def _solve(self, links: Links, values: Tensor) -> None:
+        """Kriges the residuals of the known links."""
         index, trend_weight = known(links), self.trend_weight.item()
         receivers = links.query.receivers[index]
         for receiver, field in enumerate(self.fields):
@@ -161,8 +144,6 @@ class Kriging(Model):
                 residuals = residuals * damping(residuals, links.labels[index[rows]], receivers[rows])[:, None, None]
             process = Hyperparameters(*self.hyperparameters.tolist())
             field.solve(coordinates(self.scene, links.query[index[rows]], process.scale), residuals, process)
-
-    # --- prediction ---
 
     def forward(self, batch: Batch) -> Prediction:
         query, trend_weight, weight = batch.query, self.trend_weight.item(), self.weight.item()
@@ -180,21 +161,16 @@ class Kriging(Model):
             value[own] = value[own] + self.fields[receiver](places[own], length, batch)
         return Prediction(value if weight == 1 else trend + weight * (value - trend), {})
 
-    # --- reports of a run: those of the trend ---
-
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        return self.trend.parameter_groups()
-
     @property
     def primitives(self) -> Gaussians | None:
         return self.trend.primitives
 
-    def facts(self) -> dict[str, object]:
+    def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
         facts = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
         facts |= Hyperparameters(*self.hyperparameters.tolist()).facts()
-        facts["links"] = sum(len(field.places) for field in self.fields)
-        facts["components"] = max(len(field.components) for field in self.fields)
+        places, components = ([len(getattr(field, name)) for field in self.fields] for name in ("places", "components"))
+        facts |= {"links": sum(places), "components": max(components)}
         return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
@@ -212,6 +188,6 @@ def known(links: Links) -> Int[Tensor, " k"]:
     return torch.cat((links.split.train, links.split.validation))
 
 
-def predicted(model: Model, links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k *shape"]:
+def predicted(model: Model, links: Links, index: Int[Tensor, " k"]) -> Tensor:
     """Predictions of a model for some links, on the CPU."""
     return torch.cat([values.cpu() for values in model.predict_batches(links.query[index], batch_size=64)])

@@ -20,11 +20,7 @@ class Mean(Model):
         self.register_buffer("means", torch.full(shape, torch.nan, dtype=scene.task.dtype))
 
     def fit(self, links: Links) -> None:
-        """Computes the means.
-
-        Raises:
-            ValueError: A receiver has no training or validation links.
-        """
+        """Computes the means."""
         for receiver, index in enumerate(known_links(links)):
             wide = torch.promote_types(self.scene.task.dtype, torch.float64)
             total = sum(links.labels[part].sum(0, dtype=wide) for part in index.split(256))

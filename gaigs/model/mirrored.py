@@ -24,6 +24,7 @@ from gaigs.query import Batch, Query
 from gaigs.rasterizer import Rasterizer
 from gaigs.registry import register
 from gaigs.scene import Scene, carriers, direct_gains, direct_waves
+from gaigs.task.csi import Csi
 
 
 @register("model", "mirrored")
@@ -33,8 +34,7 @@ class MirroredSplatting(GaussianSplatting):
     Powers come first: they locate planes to some centimetres. Then phases count too: each plane moves along its normal
     to the least loss, by steps of a fraction of the wavelength, and descent goes on.
 
-    Args:
-        As for ``GaussianSplatting``, with a placement ``mirrored``; each part defaults to one that suits it.
+    Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that suits it.
 
     Source: ours; docs/methods.md.
     """
@@ -73,16 +73,17 @@ class MirroredSplatting(GaussianSplatting):
         """
         super().fit(links)
         self.places = export.some(links.query[links.split.train])
-        if not isinstance(self.pooling, ChannelPooling) or self.trend is not None:
+        task = self.scene.task
+        if not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling)) or self.trend is not None:
             return
-        train, sign, frequencies = links.split.train, int(self.pooling.sign), self.scene.task.frequencies
+        train, sign, frequencies = links.split.train, int(self.pooling.sign), task.frequencies
         labels, query = links.labels[train], links.query[train]
         waves = direct_gains(self.scene, query)[:, None, None] * direct_waves(self.scene, query, frequencies, sign)
         own = [query.receivers == receiver for receiver in range(len(self.scene.receivers))]
         gains = torch.stack([fit_gain(labels[some], waves[some]) for some in own]) / self.pooling.strength
         gains = torch.where((gains != 0) & (sign != 0), gains, 0.1)
         self.placement.start_from_free_space(gains.conj() if sign > 0 else gains)
-        self.placement.enable_phases(speed_of_light / self.scene.task.frequencies.mean().item())
+        self.placement.enable_phases(speed_of_light / frequencies.mean().item())
 
     @property
     def predicts_untrained(self) -> bool:
@@ -118,8 +119,6 @@ class MirroredSplatting(GaussianSplatting):
         least = 0.03 * placement.diagonal if number == (0 if adds_waves else 2) else 0.0
         moves = ", ".join(f"{move:+.3f}" for move in move_planes(placement, train, wavelength, least, loss))
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
-
-    # --- report ---
 
     def facts(self) -> dict[str, object]:
         """Numbers of planes and paths, and the part of each plane, beside the rasterizer."""

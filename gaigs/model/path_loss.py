@@ -29,19 +29,13 @@ class PathLoss(Model):
     def __init__(self, scene: Scene):
         super().__init__(scene)
         if scene.task.shape or scene.task.dtype.is_complex:
-            raise ValueError(
-                f"model path_loss needs one real number a link as label, got {scene.task.quantity} of shape "
-                f"{scene.task.shape}; choose model=mean or model=knn"
-            )
+            own = f"labels of task {scene.task.name!r}"
+            raise ValueError(f"model 'path_loss' predicts one real number a link, not {own}; take mean or knn")
         self.register_buffer("levels", torch.full((len(scene.receivers),), torch.nan))  # T [dBm]
         self.register_buffer("exponents", torch.full((len(scene.receivers),), torch.nan))  # gamma
 
     def fit(self, links: Links) -> None:
-        """Fits level and exponent of each receiver.
-
-        Raises:
-            ValueError: A receiver has no training or validation links.
-        """
+        """Fits level and exponent of each receiver."""
         for receiver, index in enumerate(known_links(links)):
             labels = links.labels[index].double()
             decades = self._decades(links.query.transmitters[index].double(), links.query.receivers[index])

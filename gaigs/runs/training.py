@@ -134,7 +134,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     if kriged is None:
         return Fitted({name: model}, {name: model}, start, seconds)
     began = time.monotonic()
-    validation_model = kriged.to(device_of(model)).fit(links)
+    validation_model = kriged.to(device_of(model)).krige(links)
     checkpoint.exchange_model(folder / "best.ckpt", kriged, trained="trend")
     models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged, validation_model))
     return Fitted(models, unseen, start, seconds, time.monotonic() - began)

@@ -21,7 +21,7 @@ class Metric(NamedTuple):
     Attributes:
         title: Name for a reader, with the unit in brackets.
         higher_is_better: True for a similarity, False for an error.
-        is_brief: True if a terminal's table shows it too, which has little room.
+        is_brief: True if a terminal's table shows it too.
 
     Example:
         >>> gaigs.registries["task"].get("rssi").metrics()["mae_db"]
@@ -40,17 +40,15 @@ class Task(ABC):
         name: The registered name.
         quantity: Name of the labelled quantity.
         unit: Of a label; empty for a ratio.
-        monitor: Score whose mean over the validation links picks the best checkpoint.
         higher_is_better: True if ``monitor`` is a similarity, False for an error.
         dtype: Of labels and predictions.
         is_noisy: True if labels of one place scatter, so that fine detail cannot be learnt.
-        directions: Directions of a label's pixels; None where a label has none.
+        directions: Directions of a label's pixels; None for a label without.
     """
 
     name: str
     quantity: str
     unit: str = ""
-    monitor: str
     higher_is_better: bool
     dtype: torch.dtype = torch.float32
     is_noisy: bool = False
@@ -60,6 +58,11 @@ class Task(ABC):
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
         """Of one label."""
+
+    @property
+    @abstractmethod
+    def monitor(self) -> str:
+        """Score whose mean over the validation links picks the best checkpoint."""
 
     @property
     def normalisation(self) -> str:
@@ -99,7 +102,7 @@ class Task(ABC):
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
         """Scores of a mean of many labels as the prediction, from scores of one label as that of another.
 
-        Where labels scatter alike and independently, half of the squared difference is left. By default None: unknown.
+        Labels that scatter alike and independently leave half of the squared difference. By default None: unknown.
         """
         return None
 
@@ -117,10 +120,7 @@ class Task(ABC):
         return {"name": self.name, **self.options()}
 
     def thinning(self) -> Thinning:
-        """The part of a batch that a training step reads; parameters are options of ``training.thinning``.
-
-        By default whole labels.
-        """
+        """The part of a batch that a step reads, by default all; parameters are options of ``training.thinning``."""
         return lambda batch, generator: batch
 
     def packed(self, values: Tensor) -> np.ndarray:
@@ -133,22 +133,15 @@ class Task(ABC):
 
 
 def need_samples(scores: Tensor) -> None:
-    """Raises a ``ValueError`` where there is no sample to summarise."""
     if not len(scores):
         raise ValueError("a summary needs at least one sample, got none; the split leaves nothing to test on")
 
 
 def check_values(labels: Tensor, values: Tensor, shape: tuple[int, ...], samples: str) -> None:
-    """Checks labels and values.
-
-    Raises:
-        ValueError: They are not (k, *shape), or not finite.
-    """
+    """Raises a ``ValueError`` unless labels and values are (k, *shape) and finite."""
     if labels.shape != values.shape or labels.ndim < 1 or tuple(labels.shape[1:]) != tuple(shape):
-        wanted = ", ".join(("k", *map(str, shape))) + ("," if not shape else "")
-        raise ValueError(
-            f"labels and predictions must both be ({wanted}), got {tuple(labels.shape)} and {tuple(values.shape)}"
-        )
+        given = f"{tuple(labels.shape)} and {tuple(values.shape)}"
+        raise ValueError(f"labels and predictions must both be {('k', *shape)}, got {given}")
     for name, tensor in (("labels", labels), ("predictions", values)):
         broken = ~tensor.isfinite()[..., None].flatten(1).all(1)
         if broken.any():

@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.registry import register
@@ -21,11 +21,10 @@ class Csi(Task):
 
     - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is the SNR after the best global phase of the prediction,
       for a receiver and a transmitter without a common clock.
-    - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²): near a high SNR, 3 dB for a prediction of 0, and at least 0. The
-      mean SINAD is monitored, since a few links in deep shadow, with an SNR of -50 dB, would dominate a mean SNR.
+    - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²), at least 0. Its mean is monitored: a few links in deep shadow, with
+      an SNR of -50 dB, would dominate a mean SNR.
 
-    All links together have an NMSE [dB], 10 log10(sum |e|² / sum |h|²): the error of a link budget, in which strong
-    links count most.
+    All links together have an NMSE [dB], 10 log10(sum |e|² / sum |h|²), in which strong links count most.
 
     Args:
         elements: Of the receivers' arrays; 1 for single antennas.
@@ -74,19 +73,16 @@ class Csi(Task):
             "snr_aligned_db_p90": Metric("p90 SNR, phase removed [dB]", True, is_brief=False),
         }
 
-    def scores(self, labels: Complex[Tensor, "k e s"], values: Complex[Tensor, "k e s"]) -> dict[str, Tensor]:
+    def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
         """SNR of each link, with its phase and without, SINAD [dB], and the powers of error and label.
 
-        Raises:
-            ValueError: As for every task; or a label is zero throughout, and has no SNR.
+        A label that is zero throughout has no SNR, and is a ``ValueError``.
         """
         check_values(labels, values, self.shape, "channels")
         h, guess = (part.detach().cpu().to(torch.complex128).flatten(1) for part in (labels, values))
         power = h.abs().square().sum(1)
-        if (power == 0).any():
-            raise ValueError(
-                f"labels must not be zero throughout, got {int((power == 0).sum())} such channels; leave them out"
-            )
+        if silent := int((power == 0).sum()):
+            raise ValueError(f"labels must not be zero throughout, got {silent} such channels; leave them out")
         phase = torch.polar(torch.ones_like(power), (guess.conj() * h).sum(1).angle())
         error, aligned = ((h - turned).abs().square().sum(1) for turned in (guess, phase[:, None] * guess))
         return {

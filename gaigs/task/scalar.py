@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.task import Metric, Task, check_values, need_samples
@@ -13,8 +12,7 @@ from gaigs.task import Metric, Task, check_values, need_samples
 class Scalar(Task):
     """One real number a link, with a unit; a subclass gives ``name``, ``quantity``, ``unit`` and ``error_unit``.
 
-    Attributes:
-        error_unit: Of a difference of labels; its lower case ends the names of scores and metrics.
+    ``error_unit`` is the unit of a difference of labels; its lower case ends the names of scores and metrics.
     """
 
     error_unit: str
@@ -38,7 +36,7 @@ class Scalar(Task):
             f"rmse_{suffix}": Metric(f"RMSE [{cls.error_unit}]", False, is_brief=False),
         }
 
-    def scores(self, labels: Float[Tensor, " k"], values: Float[Tensor, " k"]) -> dict[str, Tensor]:
+    def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
         """The absolute error of each prediction."""
         check_values(labels, values, (), "readings")
         return {self.monitor: (values.detach().cpu().double() - labels.detach().cpu().double()).abs()}

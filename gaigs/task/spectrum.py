@@ -1,6 +1,7 @@
 """Spatial spectra: an amplitude in each direction of a grid."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -56,22 +57,14 @@ class Spectrum(Task):
             "mae": Metric("MAE", False),
         }
 
-    def scores(
-        self, labels: Float[Tensor, "k rows columns"], values: Float[Tensor, "k rows columns"]
-    ) -> dict[str, Tensor]:
+    def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
         """SSIM and mean absolute error of each predicted spectrum.
 
-        SSIM is scikit-image's with its default window and ``data_range=1``, computed in float64. The training loss uses
-        another window, so the two differ and have different names. Values outside [0, 1] are scored as they are.
-
-        Raises:
-            ValueError: As for every task; or spectra are smaller than the SSIM's window.
+        SSIM is scikit-image's with its default window and ``data_range=1``, in float64; the training loss uses another
+        window. Values outside [0, 1] are scored as they are. Spectra below the window's size are a ``ValueError``.
         """
         if min(self.shape) < SSIM_WINDOW:
-            raise ValueError(
-                f"SSIM needs spectra of at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {self.shape}; "
-                "use a finer grid"
-            )
+            raise ValueError(f"SSIM needs at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {self.shape}")
         check_values(labels, values, self.shape, "spectra")
         labels, values = labels.detach().cpu().double(), values.detach().cpu().double()
         pairs = zip(labels.numpy(), values.numpy(), strict=True)
@@ -81,8 +74,8 @@ class Spectrum(Task):
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
         """SSIM s becomes 2 s / (1 + s), below 0 becomes 0; absolute errors fall by the root of 2.
 
-        The SSIM of two labels with the same mean that scatter about a pattern is the pattern's share s of the variance.
-        That of the pattern and one label is 2 s / (1 + s). A mean over windows of unlike s is less (Jensen).
+        Two labels with the same mean that scatter about a pattern have as SSIM the pattern's share s of the variance;
+        the pattern and one label have 2 s / (1 + s).
         """
         shares = scores["ssim"].clamp(min=0)
         return {"ssim": 2 * shares / (1 + shares), "mae": scores["mae"] / math.sqrt(2)}
@@ -96,44 +89,32 @@ class Spectrum(Task):
         return dict(zip(self.metrics(), numbers, strict=True))
 
     def thinning(self, stride: int = 1, rays: int | None = None) -> Thinning:
-        """Every ``stride``-th row and column, with random first ones, or ``rays`` random pixels.
+        """Every ``stride``-th row and column, with random first ones, or ``rays`` random pixels for all links alike.
 
         Neighbouring pixels of a spectrum are far closer than the array resolves.
-
-        Args:
-            stride: Step of the rows and columns.
-            rays: Number of random pixels, drawn in each step and the same for all links of a batch; None for a grid.
-
-        Raises:
-            ValueError: An option is out of range, or both are given.
         """
         rows, columns = self.shape
         coarsest = min(rows, columns) // 3  # which leaves the SSIM loss its smallest window
         if not 1 <= stride <= coarsest:
             raise ValueError(f"training.thinning.stride must be in 1..{coarsest} for this grid, got {stride}")
         if rays is not None and not (1 <= rays <= rows * columns and stride == 1):
-            raise ValueError(
-                f"training.thinning.rays must be in 1..{rows * columns} for this grid, with stride=1, got {rays} and "
-                f"stride {stride}"
-            )
+            most = rows * columns
+            raise ValueError(f"training.thinning.rays must be in 1..{most} with stride=1, got {rays}, stride {stride}")
 
         def grid(batch: Batch, generator: torch.Generator) -> Batch:
             row, column = torch.randint(stride, (2,), generator=generator).tolist()
-            rows, columns = slice(row, None, stride), slice(column, None, stride)
-            return Batch(
-                batch.query, batch.directions.thin(rows, columns), batch.labels[:, rows, columns], batch.shares
-            )
+            own = slice(row, None, stride), slice(column, None, stride)
+            return replace(batch, directions=batch.directions.thin(*own), labels=batch.labels[:, *own])
 
         def scattered(batch: Batch, generator: torch.Generator) -> Batch:
             chosen = torch.randperm(rows * columns, generator=generator)[:rays].to(batch.labels.device)
-            return Batch(
-                batch.query, batch.directions.flatten()[chosen], batch.labels.flatten(1)[:, chosen], batch.shares
+            return replace(
+                batch, directions=batch.directions.flatten()[chosen], labels=batch.labels.flatten(1)[:, chosen]
             )
 
         return grid if rays is None else scattered
 
     def packed(self, values: Float[Tensor, "k rows columns"]) -> np.ndarray:
-        """float16, which is precise enough for an image."""
         return values.half().numpy()
 
     def stored(self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:

@@ -12,11 +12,7 @@ def seeded(*numbers: int) -> torch.Generator:
 
 
 class MeanScores:
-    """Means of a task's scores over links, which may be spread over several processes.
-
-    Args:
-        task: Its scores.
-    """
+    """Means of a task's scores over links, which may be spread over several processes."""
 
     def __init__(self, task: Task):
         self.task = task
@@ -31,11 +27,7 @@ class MeanScores:
             self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """The mean of each score, as of ``Task.logged``; every process has to call it.
-
-        Args:
-            strategy: Lightning's, which knows the processes.
-        """
+        """The mean of each score, as of ``Task.logged``; every process has to call it with Lightning's strategy."""
         names = list(self.sums)
         totals = torch.tensor([self.count, *self.sums.values()], dtype=torch.float64, device=strategy.root_device)
         count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()

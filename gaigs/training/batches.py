@@ -1,7 +1,4 @@
-"""Batches of links: shuffled and resumable for training; in order for scores.
-
-Of several processes that train together, each takes its share of every batch.
-"""
+"""Batches of links: shuffled and resumable for training; in order for scores."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -25,21 +22,15 @@ def process() -> tuple[int, int]:
 class Batches:
     """Batches of a fixed number of places with all their links, in an order that follows from seed and step alone.
 
-    A place is a transmitter's position and frequency: its excitation is the same for all receivers, and is computed
-    once where its links come together. Every pass goes through all places once, in a new order. The batch of a step
-    does not depend on an interruption before it, so a resumed training equals an uninterrupted one. Each process gets
-    every ``world_size``-th place of the batch, with the weights (``Batch.shares``) that make the mean over processes
-    the mean over the batch.
+    A place is a transmitter's position and frequency: its excitation is computed once for all receivers. Every pass
+    goes through all places once, in a new order. Each process gets every ``world_size``-th place of the batch, with the
+    weights (``Batch.shares``) that make the mean over processes the mean over the batch.
 
     Args:
-        links: The data set.
-        index: The links to draw from.
+        index: Links to draw from.
         size: Places a batch, of all processes together; the last batch of a pass may hold fewer.
         seed: Of the order.
         steps: Number of batches.
-
-    Raises:
-        ValueError: The size or the number of steps is less than 1.
     """
 
     def __init__(self, links: Links, index: Int[Tensor, " k"], size: int, seed: int, steps: int):
@@ -63,7 +54,7 @@ class Batches:
                 self.position += 1
                 yield self._share([self.places[i] for i in chosen])
 
-    def _share(self, places: list[Int[Tensor, " k"]]) -> Batch:
+    def _share(self, places: list[Tensor]) -> Batch:
         rank, processes = process()
         # A process without a place takes one with weight 0: every process has to take part in the step.
         own = places[rank::processes] or places[:1]
@@ -82,13 +73,7 @@ class Batches:
 
 
 class InOrder:
-    """One pass over links in their order; each process gets every ``world_size``-th link of a batch.
-
-    Args:
-        links: The data set.
-        index: The links to go over.
-        size: Links a batch, of all processes together; the last one may hold fewer.
-    """
+    """One pass over links in their order, ``size`` links a batch; each process gets every ``world_size``-th of them."""
 
     def __init__(self, links: Links, index: Int[Tensor, " k"], size: int):
         self.links = links

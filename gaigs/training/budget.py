@@ -3,30 +3,26 @@
 import time
 from collections.abc import Callable, Mapping
 
-import lightning
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from gaigs.registry import check_type
 
 ENDLESS = 2**40
-"""A number of steps that no training comes to. Without a number Lightning fetches batches ahead of the steps, and a
-resumed training would miss those."""
+"""More steps than any training has; without a number Lightning fetches batches ahead, which a resumption misses."""
 
 
 class Budget(Callback):
     """Measures a training's time, ends it when its time is up, and has it validate by time.
 
     The clock of the first process decides for all, after each step. It goes on while a training validates, and a
-    resumed training starts with the time spent before. Lightning's own validation by time is not used: each process
-    follows a clock of its own there, and no callback can know between steps that a validation is due.
-
-    It stands first among the callbacks, and the trainer has no ``max_time``.
+    resumed training starts with the time spent before. It stands first among the callbacks, and the trainer has no
+    ``max_time``. In Lightning's own validation by time each process follows its own clock.
 
     Args:
-        max_time: Of the training [s]; None where steps alone end it.
+        max_time: Of the training [s]; None if steps alone end it.
         every: Time from the end of a validation to the next [s], or more, so that slow validations take a fifth of the
-            training at the most; None where steps say when to validate.
+            training at the most; None if steps say when to validate.
 
     Attributes:
         share: Share of ``max_time`` spent, the same in all processes; 0 without it.
@@ -37,7 +33,7 @@ class Budget(Callback):
         self.share = 0.0
         self.began = self.validated = 0.0  # the last validation, and its end [s]
         self.is_due = False
-        self.spent, self.start = 0.0, None  # time before this process took over [s], and its clock then
+        self.spent, self.start = 0.0, None  # time before this process [s], and its clock at the start
 
     @property
     def seconds(self) -> float:
@@ -98,11 +94,10 @@ class Budget(Callback):
 def make_budget(options: Mapping) -> tuple[dict, Budget]:
     """The options of Lightning's trainer without those of the budget, and the budget.
 
-    Args:
-        options: Of the configuration: the budget takes ``max_time`` and a ``val_check_interval`` that is a time.
+    The budget takes ``max_time`` and a ``val_check_interval`` that is a time.
 
     Raises:
-        TypeError: A number of steps is no whole number.
+        TypeError: A number of steps is not a whole number.
         ValueError: A time is not as Lightning reads it, or less than a second; nothing ends the training; or an option
             counts in epochs.
     """
@@ -129,33 +124,23 @@ def make_budget(options: Mapping) -> tuple[dict, Budget]:
 
 
 def seconds(option: str, duration: object) -> float:
-    """A duration as Lightning's ``Timer`` reads it [s].
-
-    Args:
-        option: Its name in errors.
-        duration: DD:HH:MM:SS, or a mapping such as ``{minutes: 3}``.
-
-    Raises:
-        ValueError: It is neither, or less than a second.
-    """
+    """A duration [s] as Lightning's ``Timer`` reads it: DD:HH:MM:SS, or a mapping such as ``{minutes: 3}``."""
     try:
-        found = Timer(duration=duration).time_remaining() if isinstance(duration, str | dict) else 0
+        found = Timer(duration=duration).time_remaining() if isinstance(duration, str | dict) else None
     except (MisconfigurationException, TypeError):
-        found = 0
-    if found < 1:
-        raise ValueError(
-            f"{option} must be a time of at least a second as 'DD:HH:MM:SS', in quotes in a file, got {duration!r}"
-        )
+        found = None
+    if not found or found < 1:
+        raise ValueError(f"{option} must be at least 1 s as 'DD:HH:MM:SS', in quotes in a file, got {duration!r}")
     return found
 
 
-def time_share(trainer: lightning.Trainer) -> float | None:
-    """The share of the time that is spent, the same in all processes; None without ``max_time``."""
+def time_share(trainer) -> float | None:
+    """The spent share of the time, the same in all processes; None without ``max_time``."""
     budgets = (callback for callback in trainer.callbacks if isinstance(callback, Budget))
     return next((budget.share for budget in budgets if budget.max_time is not None), None)
 
 
-def share_done(trainer: lightning.Trainer) -> Callable[[int], float]:
+def share_done(trainer) -> Callable[[int], float]:
     """The share of a training done after a number of steps: of its steps or of its time, whichever is more."""
 
     def share(step: int) -> float:

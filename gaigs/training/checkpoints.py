@@ -1,8 +1,4 @@
-"""Checkpoints of a training: the best one, and the last one, from which a stopped training goes on.
-
-Lightning's ``ModelCheckpoint`` is not used: it saves before a due validation, by each process's own clock, and knows no
-stop at a signal, so a training could not go on exactly where it stopped.
-"""
+"""Checkpoints of a training: the best one, and the last one, from which a stopped training goes on."""
 
 import contextlib
 import math
@@ -11,7 +7,6 @@ import threading
 import time
 from pathlib import Path
 
-import lightning
 import torch
 from lightning.pytorch.callbacks import Checkpoint
 
@@ -24,12 +19,7 @@ from gaigs.training import MeanScores
 class KeepBest(Checkpoint):
     """Writes the checkpoint of the best validation score (``Task.monitor``), or of the last step without validation.
 
-    Args:
-        path: The checkpoint.
-        patience: Validations without a better score until the training stops; None: it goes on to the last step.
-
-    Raises:
-        ValueError: The patience is less than one validation.
+    After ``patience`` validations without a better score it stops the training.
     """
 
     def __init__(self, path: Path, patience: int | None):
@@ -45,7 +35,7 @@ class KeepBest(Checkpoint):
         self.best, self.waited = state["best"], state["waited"]
 
     def on_train_start(self, trainer, module) -> None:
-        """The start of a model that predicts untrained counts too: few readings may not better it."""
+        """Scores the start of a model that predicts untrained, too."""
         self._stop_in_time(trainer)  # a run that was killed once it had stopped
         if trainer.enable_validation and self.best == -math.inf and module.model.predicts_untrained:
             self._validate(trainer, module)
@@ -58,7 +48,7 @@ class KeepBest(Checkpoint):
         self._stop_in_time(trainer)
 
     def on_train_end(self, trainer, module) -> None:
-        """The last step counts too, where no validation was due at it."""
+        """Scores the last step too, if no validation was due at it."""
         if trainer.enable_validation and trainer.global_step % trainer.val_check_batch:
             self._validate(trainer, module)
 
@@ -91,24 +81,21 @@ class KeepBest(Checkpoint):
 
 
 class KeepLast(Checkpoint):
-    """Writes the checkpoint to go on from: at intervals, at Ctrl-C or SIGTERM, and at the end.
+    """Writes the checkpoint to go on from: at intervals [s], at Ctrl-C or SIGTERM, and at the end.
 
-    It writes between two steps, after a due validation and after the other callbacks, whose state it stores: from there
-    a training goes on as if it had never stopped. At the first signal the training stops there, at the second at once.
-    Several processes follow the clock of the first, and stop together whichever of them got the signal.
-
-    Args:
-        path: The checkpoint.
-        every: Interval [s].
+    It writes between two steps, after a due validation and the other callbacks, so that a training goes on as if it had
+    never stopped. At the first signal the training stops there, at the second at once. Several processes follow the
+    clock of the first, and stop together whichever of them got the signal. (Lightning's ``ModelCheckpoint`` saves
+    before a due validation, by each process's own clock.)
     """
 
-    def __init__(self, path: Path, every: float):
+    def __init__(self, path: Path, every: float | int):
         self.path, self.every = path, every
         self.received: int | None = None
         self.random: dict | None = None
 
     def state_dict(self) -> dict:
-        """The states of torch's global generators, which a model may draw from."""
+        """The states of torch's global generators."""
         devices = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
         return {"processor": torch.random.get_rng_state(), "devices": devices}
 
@@ -155,19 +142,14 @@ class KeepLast(Checkpoint):
 
 
 class Interrupted(Exception):
-    """Ctrl-C or SIGTERM; at a KeyboardInterrupt Lightning would end the process.
-
-    Args:
-        message: Where the training stopped.
-        number: Of the signal.
-    """
+    """Ctrl-C or SIGTERM; at a KeyboardInterrupt Lightning would end the process."""
 
     def __init__(self, message: str, number: int):
         super().__init__(message)
         self.number = number
 
 
-def save(trainer: lightning.Trainer, path: Path) -> None:
+def save(trainer, path: Path) -> None:
     """Writes a checkpoint atomically, after the log of the steps before it; every process has to call it."""
     for logger in trainer.loggers:
         logger.save()

@@ -23,9 +23,6 @@ class DensityControl(Callback):
         max_count: Largest number of Gaussians to grow to.
         seed: Of the halves' random positions.
 
-    Raises:
-        ValueError: An option is out of range, or the model has no Gaussians.
-
     Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2; thresholds in docs/methods.md.
     """
 
@@ -40,8 +37,10 @@ class DensityControl(Callback):
         max_count: int,
         seed: int,
     ):
-        least = {"every": (every, 1), "start": (start, 0), "stop": (stop, start), "max_count": (max_count, 1)}
-        least |= {"gradient": (gradient, 0), "split_angle": (split_angle, 0)}
+        least: dict[str, tuple[float, int]] = {
+            "every": (every, 1), "start": (start, 0), "stop": (stop, start), "gradient": (gradient, 0),
+            "split_angle": (split_angle, 0), "max_count": (max_count, 1),
+        }  # fmt: skip
         for option, (value, bound) in least.items():
             if not value >= bound:
                 raise ValueError(f"density.{option} must be at least {bound}, got {value}")
@@ -92,8 +91,7 @@ class DensityControl(Callback):
             density.prune(gaussians, optimizer, faint)
         self.steps = 0
         if trainer.world_size > 1:
-            # Gradients are averaged before they are added up here, and all processes draw alike, so all have the same
-            # Gaussians. Lightning's wrapper still holds the replaced parameters.
+            # All processes have the same Gaussians, but Lightning's wrapper still holds the replaced parameters.
             trainer.strategy.model = trainer.strategy._setup_model(module)
 
     def _distances(self, module) -> torch.Tensor:

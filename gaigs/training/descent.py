@@ -23,24 +23,21 @@ class Descent(lightning.LightningModule):
     """A loss with the model's penalties, and a learning rate for each group of parameters.
 
     Args:
-        model: The model to train.
-        loss: The loss to minimise.
-        identity: Entry of a checkpoint beside the weights: what ``gaigs.load`` needs, configuration and split.
+        identity: Entry of a checkpoint beside the weights: scene, configuration and split.
         seed: Of the training's random numbers.
         batch_size: Places a step.
         thinning: Options of the task's thinning: the part of each label in a step.
-        jitter: Standard deviation by which each place is moved along each axis, anew in every step [m]. Places are not
-            known to the centimetre and readings fade within a wavelength: what changes faster is not to be learnt.
+        jitter: Standard deviation by which each place is moved along each axis, anew in every step [m]: places are not
+            known to the centimetre, and readings fade within a wavelength.
         penalties: Weights of penalties by name, in place of ``Model.penalty_weights``.
         learning_rates: At the start, by parameter group, in place of ``Model.learning_rates``.
         optimizer: As ``gaigs.training.schedule.make_optimizer`` takes it.
         schedule: As ``gaigs.training.schedule.make_schedule`` takes it.
         patience: Validations without a better score until the training stops; None: it goes on to the last step.
-        density: Options of ``gaigs.training.density_control.DensityControl``; None for none.
+        density: Options of ``gaigs.training.density_control.DensityControl``; None: a fixed number of Gaussians.
 
     Raises:
-        ValueError: An option is out of range; the model has no such parameter group or penalty, or no learning rate for
-            one of its groups.
+        ValueError: An option is out of range, or parameter groups and penalties are not those of the model.
 
     Source: optimiser and schedules after the released configuration.
     """
@@ -111,8 +108,8 @@ class Descent(lightning.LightningModule):
         if not torch.isfinite(total):
             raise self._diverged(total, terms, batch)
         self.log("train/loss", total, prog_bar=True, logger=False)
-        if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:
-            # Now: Lightning would log after the step's callbacks, and a checkpoint written there would lack the row.
+        if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+            # Lightning would log after the step's callbacks, and a checkpoint written there would lack the row.
             shared = {name: links * term for name, term in terms.items()}
             shared |= {name: places * penalty for name, penalty in penalties.items()}
             values = torch.stack([total, *shared.values()]).detach()
@@ -151,11 +148,7 @@ class Descent(lightning.LightningModule):
 
 
 def _overridden(option: str, defaults: Mapping[str, float], values: Mapping[str, float]) -> dict[str, float]:
-    """A model's defaults with some of them replaced.
-
-    Raises:
-        ValueError: The model has no such name, or a value is negative.
-    """
+    """A model's defaults with some of them replaced."""
     for name, value in values.items():
         if name not in defaults:
             listed = ", ".join(sorted(defaults)) or "none"

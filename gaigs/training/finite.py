@@ -1,9 +1,10 @@
 """The part of a training step that is not finite."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from functools import partial
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gaigs.model import Model
 from gaigs.query import Batch
@@ -11,32 +12,23 @@ from gaigs.query import Batch
 
 @torch.no_grad()
 def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
-    """Names the first quantity of a step's loss that is not finite.
+    """Names the first quantity of a step's loss that is not finite, by a hook at each part of the model.
 
-    It calls the model once more, with a hook at each part.
-
-    Args:
-        model: As it was in the step.
-        batch: Batch of the step, with finite labels.
-        terms: Terms of the loss, by name.
-
-    Returns:
-        The places, a parameter, the output of a part, the prediction, a penalty, or a term of the loss.
+    It is the places, a parameter, the output of a part, the prediction, a penalty, or a term of the loss.
     """
     if not is_finite(batch.query.transmitters):
         return "the places as training.jitter moves them"
     for name, parameter in model.named_parameters():
         if not is_finite(parameter):
             return f"the parameter {name}"
-    found = []
+    found: list[str] = []
 
-    def look(name: str):
-        def hook(part, arguments, output) -> None:
-            found.extend(f"{field} of {name}" for field, tensor in _tensors(output) if not is_finite(tensor))
+    def look(name: str, part: nn.Module, arguments: tuple, output: object) -> None:
+        values = output if isinstance(output, tuple) else (output,)
+        if not all(is_finite(value) for value in values if isinstance(value, Tensor)):
+            found.append(f"the output of {name}")
 
-        return hook
-
-    hooks = [part.register_forward_hook(look(name)) for name, part in model.named_modules() if name]
+    hooks = [part.register_forward_hook(partial(look, name)) for name, part in model.named_modules() if name]
     try:
         value, penalties = model(batch)
     finally:
@@ -52,12 +44,3 @@ def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
 def is_finite(values: Tensor) -> bool:
     """True if every element is finite."""
     return bool(values.isfinite().all())
-
-
-def _tensors(output: object) -> Iterator[tuple[str, Tensor]]:
-    """The tensors in a part's output, each with a name."""
-    if isinstance(output, Tensor):
-        yield "the output", output
-    elif isinstance(output, tuple):
-        names = getattr(output, "_fields", [f"output {number}" for number in range(len(output))])
-        yield from ((name, part) for name, part in zip(names, output, strict=True) if isinstance(part, Tensor))

@@ -15,18 +15,14 @@ from gaigs.training.budget import time_share
 log = logging.getLogger(__name__)
 
 LINKS = 48
-"""Training links, and validation links, of a revision: a search takes hundreds of looks."""
+"""Most training links, and validation links, of a revision: a search evaluates them hundreds of times."""
 
 
 class Revision(Callback):
     """Calls ``Model.revise`` after the shares of the training in ``Model.revisions``.
 
-    Shares are of the training's steps or of its time, whichever comes first. All processes look at the same links, so
-    that they decide alike.
-
-    Args:
-        links: The links of the training.
-        seed: Of their choice.
+    Shares are of the training's steps or of its time, whichever comes first. All processes choose the same links by the
+    seed, so that they decide alike.
     """
 
     def __init__(self, links: Links, seed: int):

@@ -1,7 +1,7 @@
 """Optimizers, and their learning rates over a training."""
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 
 import torch
@@ -13,26 +13,22 @@ from gaigs.registry import call
 
 
 def make_optimizer(
-    config: Mapping, groups: Mapping[str, Iterable[nn.Parameter]], rates: Mapping[str, float]
+    config: Mapping, groups: Mapping[str, Sequence[nn.Parameter]], rates: Mapping[str, float]
 ) -> Optimizer:
     """An optimizer of ``torch.optim`` with a learning rate for each group.
 
     Args:
         config: ``_target_``, a class of ``torch.optim``, and its options. A weight decay acts on the group ``network``
-            alone: positions, scales and opacities have no reason to be small. On a CPU a step is fused where the class
-            can do it and no option says otherwise.
+            alone: positions, scales and opacities have no reason to be small. On a CPU a step is fused if the class can
+            do it and no option says otherwise.
         groups: Parameters by name.
         rates: Learning rate of each group.
-
-    Raises:
-        TypeError: An option is not of its type.
-        ValueError: The target is no class of ``torch.optim``, does not take the options, or one is out of range.
     """
     kind, options = _target("training.optimizer", config, torch.optim, Optimizer)
     if "lr" in options:
         raise ValueError("training.optimizer takes no lr, as each group has its own; set training.learning_rates")
     parts = [{"params": list(parameters), "lr": rates[name], "name": name} for name, parameters in groups.items()]
-    parameters = [parameter for part in parts for parameter in part["params"]]
+    parameters = [parameter for group in groups.values() for parameter in group]
     implementations = {"fused", "foreach", "differentiable"} & inspect.signature(kind).parameters.keys()
     if "fused" in implementations and not implementations & options.keys():
         options["fused"] = all(p.is_floating_point() and p.device.type == "cpu" for p in parameters)
@@ -50,10 +46,6 @@ def make_schedule(config: Mapping, optimizer: Optimizer, share_done: Callable[[i
         config: Options of ``warmup_and_decay``; or ``_target_``, a class of ``torch.optim.lr_scheduler``, with its own.
         optimizer: The optimizer.
         share_done: Share of the training done after a number of steps; a class of torch counts steps alone.
-
-    Raises:
-        TypeError: An option is not of its type.
-        ValueError: The target is no class of ``torch.optim.lr_scheduler``; an option is unknown or out of range.
     """
     if "_target_" not in config:
         return call("training.schedule", warmup_and_decay, config, optimizer=optimizer, share_done=share_done)
@@ -64,17 +56,7 @@ def make_schedule(config: Mapping, optimizer: Optimizer, share_done: Callable[[i
 def warmup_and_decay(
     optimizer: Optimizer, share_done: Callable[[int], float], warmup: int, final: float
 ) -> LRScheduler:
-    """Rates rise linearly at first and fall exponentially.
-
-    Args:
-        optimizer: The optimizer.
-        share_done: Share of the training done after a number of steps.
-        warmup: Steps over which the rates rise.
-        final: Fraction of itself that every rate falls to at the end.
-
-    Raises:
-        ValueError: An option is out of range.
-    """
+    """Rates rise linearly over ``warmup`` steps, and fall exponentially to the fraction ``final`` of themselves."""
     if not 0 < final <= 1:
         raise ValueError(f"training.schedule.final must be in (0, 1], got {final}")
     if warmup < 0:

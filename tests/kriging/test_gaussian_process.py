@@ -14,7 +14,7 @@ from gaigs.data import Split
 from gaigs.kriging import fit
 from gaigs.kriging.fit import NUGGETS, HeldOut, hold_out, negative_log_likelihood
 from gaigs.kriging.kernel import kriging_weights
-from gaigs.model import gaussian_process
+from gaigs.model import Model, gaussian_process
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.query import Query
 from gaigs.registry import registry
@@ -110,25 +110,9 @@ def test_many_links_are_predicted_from_the_nearest(task, monkeypatch):
     assert abs(expected - kriged(model, links, 1, asked)).max() > 1e-4
 
 
-def test_labels_are_held_in_memory_by_parts(monkeypatch):
-    links, asked = make("spectrum"), torch.rand(5, 3)
-    whole = fitted(links).predict(asked)
-    sizes = []
-
-    class Counted:
-        def __getitem__(self, index):
-            sizes.append(len(index))
-            return links.labels[index]
-
-    monkeypatch.setattr(gaussian_process, "PART", 9)
-    model = fitted(replace(links, labels=Counted()))
-    torch.testing.assert_close(model.predict(asked), whole, rtol=0, atol=1e-5)
-    assert sorted(sizes)[-3] == 9, "but for the trend's own two"
-
-
 @pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
 @pytest.mark.parametrize(("task", "trend"), [("spectrum", "mean"), ("rssi", "path_loss"), ("csi", "friis")])
-def test_far_away_the_trend_is_left(task, trend):
+def test_far_from_all_links_only_the_trend_is_predicted(task, trend):
     links = example_links(task)
     model, plain = fitted(links, trend={"name": trend}), registry("model").build({"name": trend}, scene=links.scene)
     plain.fit(links)
@@ -151,7 +135,7 @@ def test_places_measured_twice_do_not_break_the_matrices(task):
     torch.testing.assert_close(found, copies, rtol=0, atol=1e-3)
 
 
-def test_the_distance_is_over_place_and_log_frequency():
+def test_distances_count_place_and_log_frequency():
     links = make("rssi", 120, carriers=(1e9, 1.7e9, 2.9e9))
     links.labels.add_(3 * links.query.frequencies.log() + links.query.transmitters[:, 0])
     model = fitted(links)
@@ -197,7 +181,7 @@ def test_without_a_validation_no_copy_of_a_link_predicts_it():
 def test_a_squared_error_below_zero_by_rounding_has_a_likelihood():
     links = make("rssi", 10)
     products = torch.tensor([[[1.0, 1.1], [1.1, 1.0]]], dtype=torch.float64)
-    held = HeldOut(links.query[[0]], links.query[[0]], products)
+    held = HeldOut(links.query[:1], links.query[:1], products)
     assert negative_log_likelihood(links.scene, held, torch.tensor(1.0), torch.tensor(1e-4)).isfinite()
 
 
@@ -226,12 +210,13 @@ def test_a_receiver_with_hardly_a_link_is_predicted(first, count):
 
 
 def test_a_trend_that_does_not_suit_is_refused(monkeypatch):
-    class Trained(torch.nn.Linear):
+    class Trained(Model):
         def __init__(self, scene):
-            super().__init__(3, 1)
+            super().__init__(scene)
+            self.level = torch.nn.Parameter(torch.zeros(()))
 
     monkeypatch.setitem(registry("model")._registered, "trained", Trained)
-    with pytest.raises(ValueError, match="must be a model without training, got trained; choose mean"):
+    with pytest.raises(ValueError, match="cannot be trained, got trained; take mean"):
         GaussianProcess(example_links().scene, trend={"name": "trained"})
-    with pytest.raises(ValueError, match="model path_loss needs one real number a link"):
+    with pytest.raises(ValueError, match="model 'path_loss' predicts one real number a link"):
         GaussianProcess(example_links().scene, trend={"name": "path_loss"})

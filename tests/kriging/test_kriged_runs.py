@@ -90,20 +90,6 @@ def test_a_run_killed_after_its_kriging_continues(finished, tmp_path, monkeypatc
         torch.testing.assert_close(a[key], b[key], rtol=0, atol=0, equal_nan=True)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["model=knn"], "kriging needs a trained model, got knn; leave kriging out"),
-        (["model=kriging"], "model.trend must be given"),
-        (["kriging_fallback.name=gaussian_process"], "kriging_fallback must be .* got gaussian_process"),
-    ],
-)
-def test_what_cannot_be_kriged_is_refused(overrides, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        runs.run(gaigs.compose(*SMALL, *overrides), tmp_path)
-    assert not (tmp_path / "last.ckpt").exists()
-
-
 def test_kriging_is_not_trained_itself(finished, tmp_path):
     config, _, _ = finished
     model = {"name": "kriging", "trend": config["model"], "fallback": None}

@@ -3,9 +3,10 @@
 import pytest
 import torch
 from skimage.metrics import structural_similarity as skimage_ssim
+from torch.nn.functional import avg_pool2d
 
 from gaigs.geometry import Grid
-from gaigs.loss.l1_ssim import L1Ssim, structural_similarity
+from gaigs.loss.l1_ssim import L1Ssim, structural_similarity, window_means
 from gaigs.query import Batch, Query
 from gaigs.task.spectrum import Spectrum
 
@@ -50,7 +51,7 @@ def test_on_the_full_grid_the_loss_is_that_of_the_reported_scores(pair):
 
 @pytest.mark.parametrize(("step", "window"), [(1, 7), (2, 5), (3, 3), (4, 3), (6, 3)])
 @pytest.mark.parametrize("first", [0, 1])
-def test_a_thinned_grid_is_looked_at_through_the_same_angle(pair, step, window, first):
+def test_the_window_spans_the_same_angle_on_a_thinned_grid(pair, step, window, first):
     part = slice(min(first, step - 1), None, step)
     thinned = [values[:, part, part] for values in pair]
     _, terms = loss_of(*thinned, GRID.thin(part, part))
@@ -60,7 +61,7 @@ def test_a_thinned_grid_is_looked_at_through_the_same_angle(pair, step, window, 
 @pytest.mark.parametrize(
     ("rows", "stride", "window"), [(7, 2, 3), (9, 2, 3), (11, 2, 5), (5, 1, 5), (4, 1, 3), (3, 1, 3)]
 )
-def test_the_window_is_no_larger_than_what_is_looked_at(rows, stride, window):
+def test_the_window_is_at_most_the_thinned_grid(rows, stride, window):
     """The last row and column on, which leaves the fewest."""
     grid = Grid.degrees(range(rows), range(40))
     part = slice(stride - 1, None, stride)
@@ -92,7 +93,7 @@ def test_constant_images_have_finite_gradients(value, label):
 
 def test_single_directions_are_refused(pair):
     rays = [values.flatten(1)[:, :50] for values in pair]
-    with pytest.raises(ValueError, match=r"needs rows and columns, and training\.thinning\.rays draws single"):
+    with pytest.raises(ValueError, match=r"needs rows and columns; with training\.thinning\.rays set loss=absolute"):
         loss_of(*rays, GRID.flatten()[:50])
 
 
@@ -101,3 +102,21 @@ def test_fewer_rows_than_a_window_are_refused(pair, rows):
     few = [values[:, :rows] for values in pair]
     with pytest.raises(ValueError, match=rf"at least 3 x 3 directions, got \({rows}, 33\)"):
         loss_of(*few, GRID.thin(slice(rows), slice(None)))
+
+
+@pytest.mark.parametrize(
+    ("shape", "window"),
+    [((2, 3, 9, 14), 3), ((1, 1, 7, 7), 7), ((3, 2, 8, 7), 5), ((0, 2, 6, 5), 3), ((2, 1, 4, 6), 1)],
+)
+@pytest.mark.parametrize("transposed", [False, True])
+def test_window_means_and_gradients_equal_mean_pooling(shape, window, transposed):
+    torch.manual_seed(0)
+    images = torch.randn(shape, dtype=torch.float64, requires_grad=True)
+    seen = images.mT if transposed else images
+    expected = avg_pool2d(seen, window, stride=1) if len(images) else seen[..., window - 1 :, window - 1 :]
+    before, found = images.detach().clone(), window_means(seen, window)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
+    assert torch.equal(images, before)
+    weights = torch.randn_like(expected)
+    gradients = [torch.autograd.grad(means, images, weights)[0] for means in (found, expected)]
+    torch.testing.assert_close(*gradients, rtol=1e-12, atol=1e-13)

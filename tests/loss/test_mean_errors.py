@@ -5,11 +5,9 @@ import pytest
 import torch
 from scipy.special import huber
 
-from gaigs.geometry import Grid
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import Spectrum
 
 FORMULAS = {
     "absolute": lambda errors: np.abs(errors).mean(),
@@ -35,7 +33,7 @@ def errors():
 
 
 @every
-def test_it_is_the_mean_of_the_formula(name, errors):
+def test_losses_equal_their_formulas(name, errors):
     labels = torch.linspace(-90, -40, 6)
     loss, terms = build(name)(labels + errors, batch_of(labels))
     exact = (labels + errors).double().numpy() - labels.double().numpy()
@@ -45,27 +43,7 @@ def test_it_is_the_mean_of_the_formula(name, errors):
 
 
 @every
-def test_it_takes_spectra_in_any_directions(name):
-    grid = Grid.degrees(range(1, 10), range(12))
-    loss = build(name, Spectrum(grid.elevations, grid.azimuths, "none"))
-    values, labels = torch.rand(2, 3, *grid.shape, generator=torch.Generator().manual_seed(0))
-    expected = FORMULAS[name]((values - labels).double().numpy())
-    assert loss(values, batch_of(labels, grid))[0].item() == pytest.approx(expected, rel=1e-5)
-    rays = loss(values.flatten(1), batch_of(labels.flatten(1), grid.flatten()))[0]
-    assert rays.item() == pytest.approx(expected, rel=1e-5)
-
-
-@every
-def test_the_gradient_is_that_of_the_formula(name, errors):
+def test_gradients_equal_finite_differences(name, errors):
     values = (errors + 0.05).double().requires_grad_()  # off the kinks
     labels = torch.zeros(6, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda values: build(name)(values, batch_of(labels))[0], values)
-
-
-def test_an_outlier_pulls_no_harder_than_another_but_on_the_square(errors):
-    pulls = {}
-    for name in FORMULAS:
-        values = torch.tensor([4.0, 400.0], requires_grad=True)
-        build(name)(values, batch_of(torch.zeros(2)))[0].backward()
-        pulls[name] = (values.grad[1] / values.grad[0]).item()
-    assert pulls == {"absolute": 1, "squared": 100, "huber": 1}

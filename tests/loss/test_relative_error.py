@@ -28,7 +28,7 @@ def pair():
     return torch.randn(2, 6, *TASK.shape, dtype=torch.complex128, generator=generator).unbind(0)
 
 
-def test_it_is_the_mean_over_links_of_their_normalised_error(pair):
+def test_losses_equal_their_formulas_in_numpy(pair):
     values, labels = (part.numpy() for part in pair)
     each = (abs(values - labels) ** 2).sum((1, 2)) / (abs(labels) ** 2).sum((1, 2))
     loss, terms = loss_of(*pair)

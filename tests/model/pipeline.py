@@ -2,7 +2,7 @@
 
 import torch
 
-EUCLIDEAN = {"gaussian_octaves": [-3, 2], "transmitter_octaves": [-2, 4], "hidden": 16, "width": 8}
+EUCLIDEAN = {"gaussian_octaves": (-3, 2), "transmitter_octaves": (-2, 4), "hidden": 16, "width": 8}
 PARTS = {
     "placement": {"name": "free"},
     "tokenizer": {"name": "multiview", "ga": {"name": "ga"}, "euclidean": {"name": "euclidean", **EUCLIDEAN}},

@@ -63,7 +63,7 @@ def heard(links, receiver, index, sign=-1):
 
 
 def make(task, validating=0, sign=-1):
-    """Links of three receivers, the last of which has four known ones; ``validating`` validate, the last ten test.
+    """Links of three receivers, four known ones of the last; ``validating`` validate, the last ten test.
 
     Places have twins, ties, and two that are too near for the law of path loss. Labels have deep shadow, silence, and
     one that is 60 dB too loud.

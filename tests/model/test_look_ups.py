@@ -51,7 +51,7 @@ def test_known_links_are_needed_at_each_receiver(name, task):
     if name != "knn":
         assert model.predict(torch.rand(3, 3)).isnan().all(), "no numbers before the fit"
     links.query.receivers[:20] = 0  # the other is heard in the test alone
-    with pytest.raises(ValueError, match="split 'example' has none of gateway1; choose another split"):
+    with pytest.raises(ValueError, match="split 'example' has no known links of gateway1; choose another split"):
         model.fit(links)
 
 
@@ -114,7 +114,7 @@ def test_a_carrier_that_matters_is_kept_apart_from_others():
     assert error < 0.75 * (models[1].predict(query) - labels).abs().mean()
 
 
-def test_the_distance_is_over_place_and_log_frequency():
+def test_distances_count_place_and_log_frequency():
     links = several_carriers(lambda places, logs: places[:, 0] + 5 * logs)
     model = KNearestNeighbours(links.scene, 5)
     model.fit(links)

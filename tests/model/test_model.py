@@ -7,7 +7,6 @@ import torch
 from pipeline import PARTS, watch
 
 from gaigs.geometry import ExtrapolationWarning, Rays
-from gaigs.model import Model, call_optional
 from gaigs.query import Batch, Query
 
 
@@ -61,18 +60,6 @@ def test_evaluation_in_chunks_equals_the_whole(build, batch, chunk):
 # --- predict ---
 
 
-def test_predict_takes_lists_and_leaves_the_mode(build):
-    model = build().train()
-    values = model.predict([[1, 2, 1.5], [0, 0, 0]], 1)
-    assert model.training
-    assert values.shape == (2, 18, 36)
-    assert not values.requires_grad
-    assert values.isfinite().all()
-    assert model.eval().predict([[1, 2, 1.5]]).shape == (1, 18, 36)
-    assert not model.training
-    assert model.predict(torch.zeros(0, 3)).shape == (0, 18, 36)
-
-
 def test_predict_takes_points_grids_and_receivers_of_any_kind(build):
     model, points = build(), torch.rand(2, 3, 3)
     each = torch.stack([model.predict(points.flatten(0, 1), receiver) for receiver in (0, 1)])
@@ -83,30 +70,21 @@ def test_predict_takes_points_grids_and_receivers_of_any_kind(build):
     close(model.predict(Query(points.flatten(0, 1), receivers), batch_size=4), each[receivers, torch.arange(6)])
 
 
-def test_predict_takes_directions(build, links):
-    model, places = build(), links.query.transmitters[:2]
-    whole = model.predict(places)
-    grid, rays = links.task.directions.thin(slice(0, 3), slice(4, 9)), links.task.directions.flatten()[7:11]
-    close(model.predict(places, directions=grid), whole[:, :3, 4:9])
-    close(model.predict(places, directions=rays), whole.flatten(1)[:, 7:11])
-
-
 @pytest.mark.parametrize("method", ["predict", "predict_batches"])
 @pytest.mark.parametrize(
-    ("options", "error", "message"),
+    ("options", "message"),
     [
-        ({"transmitters": [[1.0, 2]]}, ValueError, r"transmitters must be \(..., 3\) positions"),
-        ({"receiver": "nobody"}, ValueError, "must be one of 0 = gateway0, 1 = gateway1, got 'nobody'"),
-        ({"frequency": 0.0}, ValueError, "must be a carrier"),
-        ({"batch_size": 0}, ValueError, "batch_size must be at least 1 link, got 0"),
-        ({"batch_size": 2.5}, TypeError, "batch_size must be a whole number, got 2.5"),
-        ({"directions": Rays([-2.0], [0.0])}, ValueError, "elevations must be"),
+        ({"transmitters": [[1.0, 2]]}, r"transmitters must be \(..., 3\) positions"),
+        ({"receiver": "nobody"}, "must be one of 0 = gateway0, 1 = gateway1, got 'nobody'"),
+        ({"frequency": 0.0}, "must be a carrier"),
+        ({"batch_size": 0}, "batch_size must be at least 1 link, got 0"),
+        ({"directions": Rays(torch.tensor([-2.0]), torch.zeros(1))}, "elevations must be"),
         # Before any warning:
-        ({"transmitters": [[9e4, 9e4, 9e4]], "receiver": 2}, ValueError, "receiver must be"),
+        ({"transmitters": [[9e4, 9e4, 9e4]], "receiver": 2}, "receiver must be"),
     ],
 )
-def test_impossible_questions_are_refused(build, method, options, error, message):
-    with pytest.raises(error, match=message):
+def test_impossible_questions_are_refused(build, method, options, message):
+    with pytest.raises(ValueError, match=message):
         getattr(build([]), method)(**{"transmitters": [[1.0, 2, 3]]} | options)
 
 
@@ -121,7 +99,7 @@ def test_batches_are_the_prediction_in_parts(build, links, monkeypatch):
     assert asked == []
     first = next(parts)
     assert asked == [5], "a batch is computed when it is asked for"
-    assert model.training, "between two batches the mode is what it was"
+    assert model.training, "between two batches the mode stays"
     assert not first.requires_grad
     rest = [*parts]
     assert [len(part) for part in (first, *rest)] == [5, 5, 5, 5, 4]
@@ -143,13 +121,12 @@ def test_gaussians_that_become_nan_are_not_hidden(build, links):
 def test_far_positions_are_predicted_with_a_warning(build, method):
     message = r"^2 of 3 positions are up to 1\.71e\+05 m outside .* is 7\.04 m across: nothing was measured near there$"
     ask, places = getattr(build(), method), [[9.9e4, -9.9e4, 9.9e4], [1.0, 2.0, 1.0], [-9.9e4, 0.0, 0.0]]
-    with pytest.warns(ExtrapolationWarning, match=message) as warned:
+    with pytest.warns(ExtrapolationWarning, match=message):
         values = ask(places)
     assert torch.cat([*values]).isfinite().all()
-    assert [warning.filename for warning in warned] == [__file__]
 
 
-def test_as_far_away_as_the_scene_is_across_is_near_enough(build):
+def test_positions_within_the_extent_give_no_warning(build):
     model = build()
     model.predict(model.scene.upper + torch.tensor([0.99 * model.scene.extent, 0.0, 0.0]))
     with pytest.warns(ExtrapolationWarning, match="1 of 1 positions"):
@@ -176,7 +153,7 @@ def test_carriers_change_predictions(build, band, tokenizer):
     assert model.predict(query).isfinite().all()  # of a query no warning
 
 
-def test_one_carrier_goes_without_saying(build, band):
+def test_a_single_known_carrier_is_the_default(build, band):
     band = replace(band, query=replace(band.query, frequencies=torch.full((24,), 2e9)))
     model, place = build(scene=band.scene), band.query.transmitters[:1]
     assert torch.equal(model.predict(place), model.predict(place, frequency=2e9))
@@ -186,24 +163,11 @@ def test_a_band_is_left_with_a_warning(build, band):
     model, place = build(scene=band.scene), band.query.transmitters[:1]
     message = r"^2 of 3 positions are asked at 9e\+08 to 6e\+10 Hz, outside .* band of 1e\+09 to 4e\+09 Hz: nothing was"
     for method in (model.predict, model.predict_batches):
-        with pytest.warns(ExtrapolationWarning, match=message) as warned:
+        with pytest.warns(ExtrapolationWarning, match=message):
             values = method(place.expand(3, 3), frequency=torch.tensor([6e10, 2e9, 9e8]))
         assert torch.cat([*values]).isfinite().all()
-        assert [warning.filename for warning in warned] == [__file__]
     for frequency in (1e9, 1e9 * (1 - 5e-7), 3e9, 4e9, 4e9 * (1 + 5e-7)):
         assert model.predict(place, frequency=frequency).isfinite().all()
     for frequency, shown in ((1e9 * (1 - 2e-6), "9.99998e"), (4e9 * (1 + 2e-6), "4.000008e"), (60e9, "6e")):
         with pytest.warns(ExtrapolationWarning, match=f"^1 of 1 positions are asked at {shown}[^ ]* Hz, outside"):
             model.predict(place, frequency=frequency)
-
-
-# --- what a model may have ---
-
-
-def test_optional_methods_are_called_where_there_are_some(links):
-    class Speaking(Model):
-        def facts(self):
-            return {"words": 3}
-
-    assert call_optional(Model(links.scene), "facts") is None
-    assert call_optional(Speaking(links.scene), "facts") == {"words": 3}

@@ -54,7 +54,7 @@ def fitted(links):
 
 @pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
 @pytest.mark.parametrize(("shift", "task"), [(0.0, Rssi()), (1e4, PathGain())])
-def test_its_own_law_comes_back(places, shift, task, monkeypatch):
+def test_level_and_exponent_of_the_law_are_recovered(places, shift, task, monkeypatch):
     monkeypatch.setattr(__name__ + ".GATEWAYS", GATEWAYS + shift)
     places = places + shift
     model = fitted(make(places, torch.cat((law(places[:30], 0, -40, 2.7), law(places[30:], 1, -52, -0.7))), task=task))
@@ -89,7 +89,7 @@ def test_one_link_is_enough(places):
     assert model.exponents[0].item() == 2
 
 
-@pytest.mark.parametrize(("task", "words"), [("spectrum", r"amplitude of shape \(18, 36\)"), ("csi", "channel of")])
-def test_more_than_a_real_number_is_refused(task, words):
-    with pytest.raises(ValueError, match=f"needs one real number a link as label, got {words}"):
+@pytest.mark.parametrize("task", ["spectrum", "csi"])
+def test_more_than_a_real_number_is_refused(task):
+    with pytest.raises(ValueError, match=f"predicts one real number a link, not labels of task '{task}'"):
         PathLoss(example_links(task).scene)

@@ -8,7 +8,7 @@ import torch
 from test_mirrored_model import MIRRORED, build, room_spectra, walled
 
 from gaigs.antenna import Array
-from gaigs.placement.mirrored.search import find_planes, thinned
+from gaigs.placement.mirrored.search import find_planes
 
 WALLS = {0: [1.0, 0, 0, 0], 2: [0, 1.0, 0, 0], 3: [0, 1.0, 0, 5.0]}
 """Normal and offset [m] of walls that these labels determine, by their number in ``walled``."""
@@ -71,15 +71,8 @@ def test_receivers_need_not_have_the_same_array(links):
 
 
 @torch.no_grad()
-def test_where_no_wall_is_missing_none_is_added(links):
+def test_no_plane_is_added_to_a_complete_room(links):
     model = walled(build(links, placement=MIRRORED | {"planes": 8}))
     kept = model.placement.kept.clone()
     assert find_planes(model, links.batch(links.split.train), None, loss_on(model)).startswith("no plane found")
     assert torch.equal(model.placement.kept, kept)
-
-
-def test_fewer_rows_and_columns_of_the_same_labels(links):
-    batch = links.batch(links.split.train[:3])
-    some = thinned(batch, 6)
-    assert some.labels.shape == (3, 6, 12)
-    assert torch.equal(some.labels, batch.labels[:, ::5, ::5])

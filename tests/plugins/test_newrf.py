@@ -210,7 +210,7 @@ def test_a_run_from_start_to_end(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("task", ["spectrum", "rssi"])
 def test_labels_without_delays_are_refused(task):
-    with pytest.raises(ValueError, match=f"model 'newrf' gives complex channels, and labels of task '{task}' are none"):
+    with pytest.raises(ValueError, match=f"model 'newrf' gives complex channels, not labels of task '{task}'"):
         make(example_links(task).scene)
 
 

@@ -511,7 +511,7 @@ def test_options_out_of_range_are_refused(options, message):
 def test_other_labels_are_refused():
     scene = example_links("rssi").scene
     task = type("Delay", (type(scene.task),), {"name": "delay", "unit": "ns"})()
-    with pytest.raises(ValueError, match="predicts spectra, RSSI and channels, and labels of task 'delay' are none"):
+    with pytest.raises(ValueError, match="predicts spectra, RSSI and channels, not labels of task 'delay'"):
         build(replace(scene, task=task))
 
 

@@ -241,7 +241,7 @@ def test_with_a_file_there_is_no_first_stage(write, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("task", ["rssi", "csi"])
 def test_labels_that_are_no_spectra(task):
-    with pytest.raises(ValueError, match=f"learns from spectra, and labels of task '{task}' are none"):
+    with pytest.raises(ValueError, match=f"learns from spectra, not labels of task '{task}'"):
         model_of(example_links(task), fitted=False)
 
 

@@ -134,7 +134,7 @@ def test_the_zone_is_what_the_elements_hear(pattern):
 
 
 def test_other_labels_and_arrays_are_refused():
-    with pytest.raises(ValueError, match="pooling 'element_sum' gives complex channels, and labels of task 'rssi' are"):
+    with pytest.raises(ValueError, match="pooling 'element_sum' gives complex channels, not labels of task 'rssi'"):
         ElementSum(example_links("rssi").scene, [4, 8])
     links = make()
     receivers = links.receivers[0], replace(links.receivers[1], array=Array.single())

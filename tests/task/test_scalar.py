@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.query import Batch, Query
 from gaigs.task.rssi import Rssi
 from gaigs.task.scalar import Scalar
 
@@ -48,19 +47,12 @@ def test_the_signed_error_is_stored():
     assert stored["error"].tolist() == [1, -2]
 
 
-def test_labels_are_not_thinned():
-    batch = Batch(Query(torch.zeros(2, 3), torch.zeros(2, dtype=torch.long)), None, torch.zeros(2))
-    assert Rssi().thinning()(batch, torch.Generator()) is batch
-    with pytest.raises(TypeError, match="stride"):
-        Rssi().thinning(stride=2)
-
-
 @pytest.mark.parametrize(
     ("labels", "values", "message"),
     [
-        (torch.zeros(3), torch.zeros(4), r"must both be \(k,\), got \(3,\) and \(4,\)"),
-        (torch.zeros(3, 1), torch.zeros(3, 1), r"must both be \(k,\)"),
-        (torch.tensor(0.0), torch.tensor(0.0), r"must both be \(k,\), got \(\) and \(\)"),
+        (torch.zeros(3), torch.zeros(4), r"must both be \('k',\), got \(3,\) and \(4,\)"),
+        (torch.zeros(3, 1), torch.zeros(3, 1), r"must both be \('k',\)"),
+        (torch.tensor(0.0), torch.tensor(0.0), r"must both be \('k',\), got \(\) and \(\)"),
         (torch.zeros(3), torch.tensor([0, torch.nan, 0]), "predictions must be finite, got NaN or infinity in 1 of 3"),
         (
             torch.tensor([0, 0, torch.inf]),

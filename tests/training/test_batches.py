@@ -109,7 +109,7 @@ def test_a_pass_for_scores_keeps_the_order(links):
 
 
 @pytest.mark.parametrize(("size", "steps", "option"), [(0, 1, "training.batch_size"), (1, -1, "trainer.max_steps")])
-def test_refuses(links, size, steps, option):
+def test_sizes_below_one_are_refused(links, size, steps, option):
     with pytest.raises(ValueError, match=f"{option} must be at least 1, got"):
         Batches(links, links.split.train, size, 0, steps)
 

@@ -36,25 +36,19 @@ class Linear(Model):
 
 
 @pytest.mark.parametrize("options", [{}, {"thinning": {"rays": 40}, "jitter": 0.05}], ids=str)
-def test_descent_is_as_the_contract_says(links, options):
+def test_descent_keeps_the_contract(links, options):
     build = partial(registry("training").build, {"name": "descent", **OPTIONS, **options})
     check_training(build, Plane, links)
 
 
 @pytest.mark.parametrize("task", ["rssi", "csi"])
-def test_descent_is_as_the_contract_says_for_other_tasks(task):
+def test_descent_keeps_the_contract_for_other_tasks(task):
     check_training(partial(registry("training").build, SIMPLE), Linear, example_links(task))
 
 
 class Forgetful(Descent):
     def on_save_checkpoint(self, checkpoint):
         pass
-
-
-class Careless(Descent):
-    def __init__(self, model, **options):
-        model.trained_by = "descent"
-        super().__init__(model, **options)
 
 
 class Erratic(Descent):
@@ -76,36 +70,6 @@ class Stateful(Descent):
         return super().add_up(self.count * loss, *others)
 
 
-class Lazy(Descent):
-    def configure_optimizers(self):
-        optimizer = torch.optim.SGD([self.model.slope], lr=0.1)
-        return {"optimizer": optimizer}
-
-
-class Twice(Descent):
-    def __init__(self, **options):
-        super().__init__(**options)
-        self.automatic_optimization = False
-
-    def training_step(self, batch, index):
-        for _ in range(2):
-            loss = super().training_step(batch, index)
-            self.optimizers().zero_grad()
-            self.manual_backward(loss)
-            self.optimizers().step()
-
-
-class Unheard(Descent):
-    def log(self, name, *values, **options):
-        if name != "train/loss":
-            super().log(name, *values, **options)
-
-
-class Blind(Descent):
-    def on_validation_epoch_end(self):
-        self.log("validation/score", 0.5)
-
-
 class Flattering(Descent):
     def validation_step(self, batch, index):
         self.scores.add(batch, batch.labels)
@@ -115,23 +79,18 @@ class Flattering(Descent):
     ("kind", "rule"),
     [
         (Forgetful, "a checkpoint must hold the identity as its entry 'gaigs'"),
-        (Careless, "a model of another training must be a ValueError"),
         (Erratic, "the same seed must give the same training"),
         (Stateful, "a resumed training must equal an uninterrupted one"),
-        (Lazy, "the parameters of group network must change in training"),
-        (Twice, "6 batches must be as many steps, got"),
-        (Unheard, "each step must log a finite train/loss for the progress bar"),
-        (Blind, "a validation must log validation/ssim, got .*validation/score"),
         (Flattering, "validation/ssim must be the mean score of the validation links"),
     ],
 )
-def test_what_is_broken_is_found(links, kind, rule):
+def test_each_defect_is_found(links, kind, rule):
     with pytest.raises(AssertionError, match=rule):
         check_training(lambda **context: kind(**context, **OPTIONS), Plane, links)
 
 
 @pytest.mark.parametrize(("name", "value"), [("batch_size", 0), ("patience", 0), ("density", 3)])
-def test_what_a_run_asks_for_has_to_be_there(links, name, value):
+def test_wrong_attributes_are_found(links, name, value):
     def build(**context):
         module = Descent(**context, **OPTIONS)
         setattr(module, name, value)

@@ -10,8 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from fitting import Plane, fit, make_links, make_module
-from lightning.pytorch.callbacks import Callback
+from fitting import Plane, Watch, fit, make_links, make_module
 from torch import nn
 
 from gaigs import checkpoint
@@ -99,7 +98,7 @@ def test_patience_counts_validations_without_a_better_score(tmp_path, kill):
     resumed.on_train_start(again, None)
     assert again.should_stop, "a stopped run stays so"
     with pytest.raises(ValueError, match="patience must be at least 1 validation or null, got 0"):
-        KeepBest(None, patience=0)
+        KeepBest(tmp_path, patience=0)
 
 
 class Level(Model):
@@ -298,20 +297,8 @@ class Noisy(Plane):
         return type(self.prediction)(value + 0.1 * torch.randn(value.shape), penalties)
 
 
-class Watch(Callback):
-    """Losses of all steps; gets a signal after one of them."""
-
-    def __init__(self, at=None):
-        self.losses, self.at = [], at
-
-    def on_train_batch_end(self, trainer, module, outputs, *_):
-        self.losses.append(outputs["loss"].item())
-        if trainer.global_step == self.at:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-
 @pytest.mark.parametrize("at", [3, 5])  # 5: a validation is due, which draws too
-def test_a_training_goes_on_with_the_next_random_numbers(links, tmp_path, at):
+def test_a_resumed_training_draws_the_next_random_numbers(links, tmp_path, at):
     def make():
         torch.manual_seed(0)
         return make_module(links, Noisy(links.scene))

@@ -49,7 +49,7 @@ def step(callback, module, number, pulls, processes=1):
     return len(gaussians)
 
 
-def test_the_narrow_are_cloned_the_wide_split_and_the_faint_pruned(module):
+def test_narrow_gaussians_are_cloned_wide_ones_split_faint_ones_pruned(module):
     callback = control()
     before = module.model.primitives.scales.detach().clone()
     # The bound is 1 per radian, 0.5 per metre at 2 m: the mean pull of the two steps decides, 0.6 and 0.45.
@@ -82,7 +82,7 @@ def test_the_number_grows_to_the_bound_by_the_hardest_pulled(module):
     assert sorted(module.model.primitives.signal[:, 0, 0].tolist()) == sorted([*marks.tolist(), 1, 3])
 
 
-def test_it_goes_on_from_its_state(module):
+def test_density_control_goes_on_from_its_state(module):
     first, second = control(), control()
     step(first, module, 1, [9.0])
     second.load_state_dict(first.state_dict())
@@ -94,7 +94,7 @@ def test_of_several_processes_each_wraps_the_new_parameters(module):
     assert module.strategy.model == "wrapped anew"
 
 
-def test_frozen_positions_end_it(module):
+def test_frozen_positions_end_density_control(module):
     module.model.primitives.means.requires_grad_(False)
     callback = control(every=1, start=1)
     callback.on_before_optimizer_step(None, module, module.optimizer)

@@ -1,14 +1,11 @@
 """Revisions come when the model asks for them, and a resumed training makes each once."""
 
 import math
-import os
-import signal
 from dataclasses import replace
 
 import pytest
 import torch
-from fitting import Plane, fit, make_module
-from lightning.pytorch.callbacks import Callback
+from fitting import Plane, Watch, fit, make_module
 
 from gaigs.data import Split
 from gaigs.training.checkpoints import Interrupted, KeepLast
@@ -32,21 +29,6 @@ class Revised(Plane):
         self.times += 1
         self.slope += 0.1 * torch.randn(2)
         return f"turned for the {number}th time"
-
-
-class Watch(Callback):
-    """Losses and modes of all steps; is interrupted after one of them."""
-
-    def __init__(self, at=None):
-        self.losses, self.at = [], at
-
-    def on_train_batch_start(self, trainer, module, *_):
-        assert module.model.training
-
-    def on_train_batch_end(self, trainer, module, outputs, *_):
-        self.losses.append(outputs["loss"].item())
-        if trainer.global_step == self.at:
-            os.kill(os.getpid(), signal.SIGTERM)
 
 
 def make(links):
@@ -110,9 +92,3 @@ def test_a_revision_gets_no_more_links_than_it_needs(links, tmp_path):
     for _, train, validation, _, _ in module.model.looks:
         assert len(train) == LINKS
         assert validation is None
-
-
-def test_a_model_without_revisions_is_left_alone(links, tmp_path, caplog):
-    caplog.set_level("INFO")
-    fit(make_module(links), links, tmp_path, 2, Revision(links, 0))
-    assert log_of(caplog) == []

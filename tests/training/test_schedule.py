@@ -123,6 +123,6 @@ def test_a_schedule_of_torch_is_stepped_once_a_step(groups):
         (CONSTANT | {"_target_": "torch.optim.SGD"}, ValueError, r"must be a class of torch\.optim\.lr_scheduler, got"),
     ],
 )
-def test_a_schedule_refuses(groups, config, error, message):
+def test_impossible_schedules_are_refused(groups, config, error, message):
     with pytest.raises(error, match=message):
         make_schedule(config, make_optimizer(ADAM, groups, RATES), lambda step: step / 20)

@@ -53,7 +53,9 @@ class ArrayResponse(Model):
     ):
         super().__init__(scene)
         if scene.task.name != "spectrum":
-            raise ValueError("model 'array_response' predicts spectra, and these labels are none; use another model")
+            raise ValueError(
+                f"model 'array_response' predicts spectra, not labels of task {scene.task.name!r}; use another model"
+            )
         if scene.has_band:
             raise ValueError(
                 f"model 'array_response' measures its array in wavelengths, of one carrier, and these links have "

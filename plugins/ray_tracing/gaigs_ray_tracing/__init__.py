@@ -97,8 +97,8 @@ class RayTracing(Model):
             self.beamformer = Beamformer("model 'ray_tracing'", scene)
         elif scene.task.unit != "dBm":
             raise ValueError(
-                f"model 'ray_tracing' predicts spectra, RSSI and channels, and labels of task {scene.task.name!r} are "
-                "none of them; use another model"
+                f"model 'ray_tracing' predicts spectra, RSSI and channels, not labels of task "
+                f"{scene.task.name!r}; use another model"
             )
         learnt = {"log_permittivities": torch.zeros(0), "log_conductivities": torch.zeros(0)}
         if self.beamformer is None:

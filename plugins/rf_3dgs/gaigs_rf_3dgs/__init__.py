@@ -48,8 +48,7 @@ class Rf3dgs(GaussianSplatting):
     def __init__(self, scene: Scene, geometry: str | None, first_stage: float, **options):
         if scene.task.directions is None:
             raise ValueError(
-                f"model 'rf_3dgs' learns from spectra, and labels of task {scene.task.name!r} are none; use another "
-                "model"
+                f"model 'rf_3dgs' learns from spectra, not labels of task {scene.task.name!r}; use another model"
             )
         if not 0 < first_stage < 1:
             raise ValueError(f"model.first_stage must lie between 0 and 1, got {first_stage}")
