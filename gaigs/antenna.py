@@ -11,8 +11,7 @@ from torch import Tensor
 from gaigs.geometry import Pose
 
 PATTERNS = ("isotropic", "cosine")
-"""Field patterns of an element: equal in all directions; or, as of a patch, the cosine of the angle to the array's
-normal, and 0 behind it."""
+"""Field patterns of an element; as of a patch, the cosine of the angle to the array's normal, and 0 behind it."""
 
 
 def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"]]:
@@ -28,9 +27,6 @@ class Array:
     Attributes:
         elements: Positions in the array's own frame (e, 3) [m].
         pattern: Field pattern of each element, one of ``PATTERNS``.
-
-    Raises:
-        ValueError: The pattern is unknown, or the elements are not (e, 3).
 
     Example:
         >>> len(gaigs.Array.planar(4, 4, pitch=0.16)), len(gaigs.Array.single())
@@ -48,7 +44,6 @@ class Array:
 
     @classmethod
     def single(cls) -> "Array":
-        """One isotropic antenna."""
         return cls(torch.zeros(1, 3))
 
     @classmethod
@@ -56,17 +51,13 @@ class Array:
         """Elements in the array's x-y plane, centred, column by column: y varies fastest.
 
         Args:
-            rows: Number of elements along y.
-            columns: Number of elements along x.
+            rows, columns: Numbers of elements along y and along x.
             pitch: Distance of neighbouring elements [m].
             pattern: One of ``PATTERNS``.
-
-        Raises:
-            ValueError: There is no element, or the pitch is not positive and finite.
         """
         if rows < 1 or columns < 1 or not 0 < pitch < math.inf:
             raise ValueError(
-                f"an array must have at least 1 x 1 elements at a positive pitch, got {rows} x {columns} at {pitch} m"
+                f"an array must have 1 x 1 elements or more at a positive pitch, got {rows}, {columns}, {pitch}"
             )
         steps = lambda count: (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * pitch
         x, y = torch.meshgrid(steps(columns), steps(rows), indexing="ij")
@@ -95,12 +86,7 @@ class Array:
 
 @dataclass(frozen=True)
 class Receiver:
-    """An antenna array or gateway.
-
-    Attributes:
-        name: Name in files and tables.
-        pose: Position [m] and orientation in the room.
-        array: Antenna; by default one isotropic element.
+    """An antenna array or gateway: its name in files and tables, its pose in the room, its antenna.
 
     Example:
         >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])

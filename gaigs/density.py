@@ -1,7 +1,5 @@
 """Density control: prune, clone and split Gaussians; the optimizer keeps its state of all others.
 
-The functions take the Gaussians, the optimizer and a mask; a callback has the schedule.
-
 Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2.
 """
 
@@ -16,13 +14,11 @@ from torch.optim import Optimizer
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import quaternions_to_rotations
 
+Pick = Callable[[Tensor], Tensor]
+
 
 def prune(gaussians: Gaussians, optimizer: Optimizer, gone: Bool[Tensor, " n"]) -> None:
-    """Removes Gaussians.
-
-    Raises:
-        ValueError: All Gaussians would be removed.
-    """
+    """Removes Gaussians; a ``ValueError`` if none would be left."""
     if gone.all():
         raise ValueError(f"pruning would remove all {len(gone)} Gaussians; lower the opacity bound")
     keep = ~gone
@@ -30,10 +26,7 @@ def prune(gaussians: Gaussians, optimizer: Optimizer, gone: Bool[Tensor, " n"]) 
 
 
 def clone(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]) -> None:
-    """Doubles Gaussians in place, each with the opacity a' = 1 - sqrt(1 - a), so that both cover as much as one.
-
-    Copies have the signal of the original, and start without momentum.
-    """
+    """Doubles Gaussians in place, each with the opacity a' = 1 - sqrt(1 - a), so that both cover as much as one."""
     copies = _append(gaussians, optimizer, chosen)
     with torch.no_grad():
         # The logit of a' from the logit of a, accurate for opacities near 0 and 1.
@@ -53,21 +46,12 @@ def split(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]
 
 def _append(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]) -> Bool[Tensor, " m"]:
     """Appends copies of the chosen Gaussians; gives a mask of originals and copies."""
-    _rearrange(
-        gaussians,
-        optimizer,
-        lambda values: torch.cat((values, values[chosen])),
-        lambda state: torch.cat((state, torch.zeros_like(state[chosen]))),
-    )
+    copy = lambda values: torch.cat((values, values[chosen]))
+    _rearrange(gaussians, optimizer, copy, lambda state: torch.cat((state, torch.zeros_like(state[chosen]))))
     return torch.cat((chosen, chosen[chosen]))
 
 
-def _rearrange(
-    gaussians: Gaussians,
-    optimizer: Optimizer,
-    pick: Callable[[Tensor], Tensor],
-    pick_state: Callable[[Tensor], Tensor],
-) -> None:
+def _rearrange(gaussians: Gaussians, optimizer: Optimizer, pick: Pick, pick_state: Pick) -> None:
     """Replaces the parameters in the module and in the optimizer."""
     for name in gaussians.PARAMETERS:
         old = getattr(gaussians, name)

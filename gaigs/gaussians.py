@@ -1,13 +1,13 @@
-"""Gaussians: parameters, initial lattice, .ply files; as placed for a query, and as tokens."""
+"""Gaussians: parameters, initial lattice, .ply files; Gaussians of a query, and their tokens."""
 
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Complex, Float
+from numpy.lib.recfunctions import unstructured_to_structured
 from plyfile import PlyData, PlyElement
 from torch import Tensor, nn
 
@@ -23,27 +23,22 @@ class Gaussians(nn.Module):
     """n anisotropic Gaussians, each a virtual transmitter; parameters are raw, properties are activated.
 
     Each receiver gets an equal number of Gaussians on a Fibonacci lattice over a zone of the sphere, at random
-    distances, each wide enough to meet its neighbours. So ``count`` sets the angular detail: over the upper hemisphere
-    neighbours are sqrt(2 pi / count) rad apart.
+    distances. ``count`` sets the angular detail: over the upper hemisphere neighbours are sqrt(2 pi / count) rad apart.
 
     Args:
         scene: Its receivers are the centres of the lattices.
         zone: Lowest and highest elevation of the lattice, in the receivers' frames [rad].
-        channels: Signal channels of a Gaussian, as many as the pooling needs.
+        channels: Signal channels of a Gaussian.
         count: Initial number of Gaussians for all receivers together.
         near, far: Range of the initial distances to their receiver [m].
         spread: Initial standard deviation, as a fraction of the distance to the next Gaussian of the lattice.
         opacity: Initial opacity, in (0, 1).
         signal: Standard deviation of the initial random signal.
-        degree: Degree of the spherical harmonics of the signal over the direction from a Gaussian to the transmitter;
-            coefficients above degree 0 start at zero.
+        degree: Degree of the spherical harmonics of the signal over the direction from a Gaussian to the transmitter.
 
     Attributes:
         learning_rates: Default learning rate of each parameter, that of ``means`` in [m].
         degree: Highest degree in use, at first ``degree``; a lower one smooths the signal.
-
-    Raises:
-        ValueError: An option is out of range.
 
     Source: parametrisation of Kerbl et al., 3D Gaussian Splatting, 2023. By reciprocity the transmitter takes the
     camera's place: a receiver sees each Gaussian from one direction only, where harmonics would add nothing.
@@ -69,19 +64,15 @@ class Gaussians(nn.Module):
     ):
         super().__init__()
         receivers = len(scene.receivers)
-        largest = 1e6  # float32 holds squares and sums of it
         if count < receivers:
             raise ValueError(f"gaussians.count must be at least one a receiver ({receivers}), got {count}")
         if not 0 < near <= far < FAR:
             raise ValueError(f"gaussians.near and far must satisfy 0 < near <= far < {FAR:g} m, got {near} and {far}")
-        if not 0 < spread <= largest:
-            raise ValueError(f"gaussians.spread must be positive and at most {largest:g}, got {spread}")
-        if not 0 < opacity < 1:
-            raise ValueError(f"gaussians.opacity must lie between 0 and 1, got {opacity}")
-        if not 0 <= signal <= largest:
-            raise ValueError(f"gaussians.signal must be at least 0 and at most {largest:g}, got {signal}")
-        if not degree >= 0:
-            raise ValueError(f"gaussians.degree must be at least 0, got {degree}")
+        if not (0 < spread <= 1e6 and 0 < opacity < 1 and 0 <= signal <= 1e6 and degree >= 0):
+            raise ValueError(
+                "gaussians.spread must lie in (0, 1e6], opacity in (0, 1), signal in [0, 1e6], and degree must be at "
+                f"least 0, got {spread=}, {opacity=}, {signal=}, {degree=}"
+            )
         self.degree = degree
         shares = [count // receivers + (i < count % receivers) for i in range(receivers)]
         means, scales = [], []
@@ -104,32 +95,27 @@ class Gaussians(nn.Module):
 
     @property
     def scales(self) -> Float[Tensor, "n 3"]:
-        """Standard deviations along the axes [m]."""
         return self.log_scales.exp()
 
     @property
     def opacities(self) -> Float[Tensor, " n"]:
-        """In (0, 1)."""
         return self.opacity_logits.sigmoid()
 
     @property
     def unit_quats(self) -> Float[Tensor, "n 4"]:
-        """Orientations as unit quaternions (w, x, y, z)."""
         return unit_quaternions(self.quats)
 
     @property
     def covariances(self) -> Float[Tensor, "n 3 3"]:
-        """World frame [m²]."""
         axes = semi_axes(self.quats, self.scales)
         return axes @ axes.mT
 
     @property
     def bands(self) -> Float[Tensor, "n c k"]:
-        """The signal's coefficients in use."""
         return self.signal[..., : (self.degree + 1) ** 2]
 
     def resize(self, count: int) -> None:
-        """Changes the number of Gaussians; their values are undefined until they are set."""
+        """Changes the number of Gaussians; values are undefined."""
         for name in self.PARAMETERS:
             old = getattr(self, name)
             setattr(self, name, nn.Parameter(old.new_empty(count, *old.shape[1:]), old.requires_grad))
@@ -151,14 +137,7 @@ class Gaussians(nn.Module):
 
 
 def fibonacci_lattice(count: int, low: float, high: float) -> Float[Tensor, "count 3"]:
-    """Unit vectors spread evenly over a zone of the sphere.
-
-    Args:
-        count: Number of vectors.
-        low, high: Elevations that bound the zone [rad].
-
-    Source: Swinbank and Purser, Fibonacci grids, 2006.
-    """
+    """Unit vectors evenly over a zone between two elevations [rad]; Swinbank and Purser, Fibonacci grids, 2006."""
     i = torch.arange(count, dtype=torch.float64) + 0.5
     heights = math.sin(low) + (math.sin(high) - math.sin(low)) * i / count
     golden = math.pi * (1 + math.sqrt(5))
@@ -166,13 +145,7 @@ def fibonacci_lattice(count: int, low: float, high: float) -> Float[Tensor, "cou
 
 
 def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> None:
-    """Writes any Gaussians in the format of ``Gaussians.save_ply``.
-
-    Args:
-        path: The file.
-        values: Raw parameters of n Gaussians, by the names in ``Gaussians.PARAMETERS``.
-        comment: A line for the file's header.
-    """
+    """Writes raw parameters, by the names in ``Gaussians.PARAMETERS``, in the format of ``Gaussians.save_ply``."""
     n, channels, _ = values["signal"].shape
     parameters = {name: value.detach().cpu().float() for name, value in values.items()} | {"normals": torch.zeros(n, 3)}
     shown = nn.functional.pad(parameters["signal"], (0, 0, 0, max(0, 3 - channels)))
@@ -186,8 +159,8 @@ def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> N
         "log_scales": [f"scale_{i}" for i in range(3)],
         "quats": [f"rot_{i}" for i in range(4)],
     }
-    columns = torch.cat([parameters[name].reshape(n, -1) for name in properties], 1).numpy().T
-    vertices = np.rec.fromarrays(list(columns), names=[name for names in properties.values() for name in names])
+    rows = torch.cat([parameters[name].reshape(n, -1) for name in properties], 1).numpy()
+    vertices = unstructured_to_structured(rows, names=[name for names in properties.values() for name in names])
     with atomic_write(path) as part:
         PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(part))
 
@@ -197,12 +170,10 @@ class Placed(NamedTuple):
 
     Attributes:
         means: Centres, world frame (1 or b, n, 3) [m].
-        lengths: Length of the path that each Gaussian stands for, from transmitter to receiver (b, n) [m]; None where
-            it is unknown.
+        lengths: Length of each Gaussian's path from transmitter to receiver (b, n) [m]; None: unknown.
         quats, scales, opacities, signal: As of ``Gaussians``; scales (1 or b, n, 3) [m], signal (n, c, 1) or
             (b, n, c, 1). None: those of the free Gaussians.
-        gains: Complex strength of each path's field (b, n), phase included, by which the signal is multiplied.
-            None: 1.
+        gains: Complex factor of the signal, phase included (b, n). None: 1.
         coherences: Share of each path's field, in [0, 1] (n,), with a known phase; the rest adds as power. None: 1.
         bandwidth: Band over which powers are averaged, a scalar [Hz]; None: one carrier.
     """
@@ -222,9 +193,9 @@ class Tokens(NamedTuple):
     """Input of a deformation; any width may be 0.
 
     Attributes:
-        scene: CLS for each query (b, d_scene).
-        gaussians: E(P_x) for each Gaussian (n, d_x), or for each query and Gaussian (b, n, d_x).
-        transmitters: E(P_TX) for each query (b, d_tx).
+        scene: CLS for each query.
+        gaussians: E(P_x) for each Gaussian, or for each query and Gaussian.
+        transmitters: E(P_TX) for each query.
 
     Source: GAI-GS, "Multi-view Tokenizer".
     """

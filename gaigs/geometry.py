@@ -14,7 +14,7 @@ FAR = 1e5
 WITHIN = "positions within 1e5 m of the origin on each axis (subtract a common origin from all)"
 
 FAINTEST = torch.finfo(torch.float32).tiny
-"""Smaller amplitudes and powers are silence: dividing by such a float32 number overflows."""
+"""Smaller amplitudes and powers count as 0: dividing by such a float32 number overflows."""
 
 
 class ExtrapolationWarning(UserWarning):
@@ -27,8 +27,7 @@ class Pose:
 
     Attributes:
         position: Centre of the array, world frame (3,) [m].
-        rotation: The array's axes in the world frame as columns (3, 3): ``rotation.T @ (x - position)`` is a world
-            point x in the array's frame.
+        rotation: The array's axes in the world frame as columns (3, 3).
 
     Example:
         >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])  # scipy's order: looks along the axes
@@ -41,48 +40,34 @@ class Pose:
 
     @classmethod
     def from_xyzw(cls, position, quaternion) -> "Pose":
-        """A pose from a scalar-last quaternion, as scipy and the NeRF² files write it.
-
-        Raises:
-            ValueError: The quaternion is not of unit length (to 1e-3) or a value is not finite.
-        """
+        """A pose from a scalar-last quaternion of unit length (to 1e-3), as in scipy and the NeRF² files."""
         position = torch.as_tensor(position, dtype=torch.float64)
         quaternion = torch.as_tensor(quaternion, dtype=torch.float64)
-        if position.shape != (3,) or quaternion.shape != (4,):
+        if position.shape != (3,) or quaternion.shape != (4,) or not position.isfinite().all():
             raise ValueError(
-                f"a pose needs a position of 3 and a quaternion of 4 numbers, got {tuple(position.shape)} and "
-                f"{tuple(quaternion.shape)}"
-            )
-        if not (torch.isfinite(position).all() and torch.isfinite(quaternion).all()):
-            raise ValueError(
-                f"a pose must be finite, got position {position.tolist()}, quaternion {quaternion.tolist()}"
+                "a pose needs 3 finite coordinates [m] and a quaternion (x, y, z, w), got "
+                f"{position.tolist()} and {quaternion.tolist()}"
             )
         norm = float(quaternion.norm())
-        if abs(norm - 1) > 1e-3:
-            raise ValueError(
-                f"a rotation quaternion must have length 1, got {norm:.6g} for {quaternion.tolist()}; normalise it"
-            )
+        if not abs(norm - 1) <= 1e-3:
+            raise ValueError(f"a rotation quaternion must have length 1, got {norm:.6g}; normalise it")
         rotation = quaternions_to_rotations(quaternion.roll(1))
         return cls(position.float(), rotation.float())
 
     def to(self, like: Tensor) -> "Pose":
-        """The same pose on the device and in the dtype of ``like``."""
         return Pose(self.position.to(like), self.rotation.to(like))
 
     def local(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """World points [m] in the array's own frame [m]."""
+        """World points in the array's frame [m]."""
         return (points - self.position) @ self.rotation
 
     def world(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Points of the array's own frame [m] in the world's [m]."""
+        """Points of the array's frame in the world frame [m]."""
         return points @ self.rotation.mT + self.position
 
 
 def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z) of any length; length zero means no rotation.
-
-    The matrix is that of the normalised quaternion; the gradient has no component along the quaternion.
-    """
+    """Rotation matrices of quaternions (w, x, y, z) of any length; length zero means no rotation."""
     quats = _of_moderate_length(quats)
     w, x, y, z = quats.unbind(-1)
     squares = (quats * quats).sum(-1)
@@ -106,12 +91,8 @@ def _of_moderate_length(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*bat
     return quats / torch.where(largest == 0, 1, largest)
 
 
-def semi_axes(quats: Float[Tensor, "*batch 4"], scales: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Semi-axes R diag(scales) of Gaussians as columns [m], from quaternions (w, x, y, z) and standard deviations [m].
-
-    Times its transpose this is the covariance, whose condition number is the square: for a Gaussian 10,000 times as
-    long as wide float32 loses the width there.
-    """
+def semi_axes(quats: Float[Tensor, "*#batch 4"], scales: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Semi-axes R diag(scales) of Gaussians as columns, from quaternions (w, x, y, z) and standard deviations [m]."""
     return quaternions_to_rotations(quats) * scales[..., None, :]
 
 
@@ -130,16 +111,13 @@ def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Ten
 
 
 def from_spherical(azimuths: Float[Tensor, "*batch"], elevations: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
-    """Unit vectors towards azimuths and elevations [rad]; the inverse of ``to_spherical``."""
+    """Unit vectors towards azimuths and elevations [rad]."""
     horizontal = torch.cos(elevations)
     return torch.stack((horizontal * torch.cos(azimuths), horizontal * torch.sin(azimuths), torch.sin(elevations)), -1)
 
 
 def polar(amplitudes: Float[Tensor, "*batch"], phases: Float[Tensor, "*batch"]) -> Complex[Tensor, "*batch"]:
-    """Complex waves of amplitudes (at least 0) and phases [rad]; value and gradient are 0 below ``FAINTEST``.
-
-    The gradient of ``torch.polar`` itself is NaN for amplitudes just above 0.
-    """
+    """``torch.polar`` with value and gradient 0 below ``FAINTEST``, where its own gradient is NaN."""
     return torch.polar(amplitudes.masked_fill(amplitudes < FAINTEST, 0), phases)
 
 
@@ -153,14 +131,8 @@ def spherical_harmonics(vectors: Float[Tensor, "*batch 3"], degree: int) -> Floa
     """The k = (degree + 1)² real spherical harmonics of degree n up to ``degree`` in given directions.
 
     Number n² + n + m is sqrt(2) N P_n^|m|(z) times cos(m az) for m > 0, sin(|m| az) for m < 0, and N P_n(z) for m = 0.
-    P has the factor (-1)^m, and N makes the mean square over the sphere 1 / 4 pi, as in .ply viewers.
-
-    The recurrence over n runs on N P_n^m / sin^m of the polar angle, a polynomial in z; the sine joins the azimuth's
-    functions in (x + j y)^m. So values and gradients are finite at the poles.
-
-    Args:
-        vectors: Unit vectors.
-        degree: The highest n.
+    P has the factor (-1)^m, and N makes the mean square over the sphere 1 / 4 pi, as in .ply viewers. The recurrence
+    over n runs on N P_n^m / sin^m, a polynomial in z, so values and gradients are finite at the poles.
 
     Source: Holmes and Featherstone, A unified approach to the Clenshaw summation, 2002, section 3.
     """
@@ -189,11 +161,7 @@ def spherical_harmonics(vectors: Float[Tensor, "*batch 3"], degree: int) -> Floa
 
 @dataclass
 class Rays:
-    """Any list of directions, in the array's frame.
-
-    Attributes:
-        elevations: One a ray [rad].
-        azimuths: One a ray [rad].
+    """A list of directions in the array's frame [rad].
 
     Example:
         >>> gaigs.Rays(elevations=torch.tensor([0.0, 0.5]), azimuths=torch.tensor([0.0, 3.0])).vectors().shape
@@ -208,7 +176,6 @@ class Rays:
         return (len(self.elevations),)
 
     def flatten(self) -> "Rays":
-        """The same, as a list of rays."""
         return self
 
     def vectors(self) -> Float[Tensor, "k 3"]:
@@ -219,17 +186,12 @@ class Rays:
         return Rays(self.elevations[index], self.azimuths[index])
 
     def to(self, where: torch.device | str | torch.dtype | Tensor) -> "Rays":
-        """The same directions on another device or in another dtype."""
         return Rays(self.elevations.to(where), self.azimuths.to(where))
 
 
 @dataclass
 class Grid:
-    """Directions of a spectrum's pixel centres, in the array's frame.
-
-    Attributes:
-        elevations: One a row [rad].
-        azimuths: One a column [rad].
+    """Directions of a spectrum's pixel centres in the array's frame, an elevation a row and an azimuth a column [rad].
 
     Example:
         >>> gaigs.Grid.degrees().shape, gaigs.Grid.degrees(elevations=range(-30, 31, 10), azimuths=range(8)).shape
@@ -247,11 +209,7 @@ class Grid:
 
     @classmethod
     def sphere(cls, rows: int, columns: int) -> "Grid":
-        """The full sphere in pixels of equal solid angle: the sines of the rows' elevations are evenly spaced.
-
-        Raises:
-            ValueError: There are fewer than 2 rows or 3 columns.
-        """
+        """The full sphere in at least 2 x 3 pixels of equal solid angle: the rows' sines are evenly spaced."""
         if rows < 2 or columns < 3:
             raise ValueError(f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x {columns}")
         sines = (2 * torch.arange(rows, dtype=torch.float64) + 1 - rows) / rows
@@ -264,17 +222,12 @@ class Grid:
 
     @property
     def pitch(self) -> float:
-        """Distance between neighbouring rows, their mean [rad]."""
-        rows = self.shape[0]
-        return ((self.elevations[-1] - self.elevations[0]) / max(rows - 1, 1)).abs().item()
+        """Mean distance between neighbouring rows [rad]."""
+        return ((self.elevations[-1] - self.elevations[0]) / max(len(self.elevations) - 1, 1)).abs().item()
 
     @property
     def solid_angles(self) -> Float[Tensor, "rows columns"]:
-        """Shares of the pixels in the grid's; rows meet where the sine of the elevation is halfway between theirs.
-
-        Raises:
-            ValueError: There are fewer than 2 rows: the extent of a single one is unknown.
-        """
+        """Shares of the pixels in the grid's; rows meet where the sine of the elevation is halfway between theirs."""
         if len(self.elevations) < 2:
             raise ValueError(f"solid angles take at least 2 rows, got {len(self.elevations)}; use a finer grid")
         sines = self.elevations.double().sin()
@@ -288,7 +241,7 @@ class Grid:
         return Grid(self.elevations[rows], self.azimuths[columns])
 
     def flatten(self) -> Rays:
-        """The pixels row by row, as a list of rays."""
+        """The pixels, row by row."""
         elevations, azimuths = torch.meshgrid(self.elevations, self.azimuths, indexing="ij")
         return Rays(elevations.flatten(), azimuths.flatten())
 
@@ -297,7 +250,6 @@ class Grid:
         return self.flatten().vectors().unflatten(0, self.shape)
 
     def to(self, where: torch.device | str | torch.dtype | Tensor) -> "Grid":
-        """The same directions on another device or in another dtype."""
         return Grid(self.elevations.to(where), self.azimuths.to(where))
 
 

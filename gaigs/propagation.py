@@ -1,4 +1,4 @@
-"""Waves: free space, reflection, the beamformer of an array, and gains and phases of measured channels."""
+"""Free space, reflection, the beamformer of an array, and gains and phases of measured channels."""
 
 import math
 
@@ -15,17 +15,16 @@ NEAREST = 1e-2
 """Smallest distance of a spherical wave [m]; smaller ones count as this."""
 
 TELLING = 5
-"""Fewest links of a receiver that show a sign: with fewer, chance may keep all of the power."""
+"""Fewest links of a receiver that show a sign of the phases; with fewer, chance decides."""
 
 
 def free_space(
-    distances: Float[Tensor, "*batch"], frequencies: Float[Tensor, "*batch"], sign: int = -1
+    distances: Float[Tensor, "*#batch"], frequencies: Float[Tensor, "*#batch"], sign: int = -1
 ) -> Complex[Tensor, "*batch"]:
     """lambda / (4 pi d) exp(sign j 2 pi f d / c): unit power between isotropic antennas, computed in float64.
 
     Args:
-        distances: Between transmitter and receiver [m].
-        frequencies: Broadcast against the distances [Hz].
+        distances, frequencies: [m] and [Hz], broadcast against each other.
         sign: -1 for the time dependence exp(+j omega t), +1 for exp(-j omega t), 0 for the amplitude alone.
 
     Source: Friis, A note on a simple transmission formula, 1946.
@@ -36,26 +35,21 @@ def free_space(
 
 def bartlett(
     responses: Complex[Tensor, "*batch elements f"], grid: Directions, array: Array, frequency: float
-) -> Float[Tensor, "*batch rows columns"]:
+) -> Float[Tensor, "..."]:
     """Amplitudes of the conventional (Bartlett) beamformer of element signals, root mean square over the frequencies.
 
     At one frequency it is |sum_n y_n exp(-j 2 pi / lambda (r_n . u))| for element n at r_n and the direction u. Its
-    square depends on the covariance of the y_n only through the sums over pairs of elements with the same difference of
-    places; of a 4 x 4 array 49 of them instead of 256 pairs make it cheap.
+    square depends on the y_n through sums over pairs of elements a lag apart: a 4 x 4 array has 49 lags, 256 pairs.
 
     Args:
         responses: Linear amplitudes of the array's elements at each frequency (..., e, f), for the time dependence
             exp(+j omega t).
-        grid: Directions in the array's frame [rad]: ``gaigs.Grid`` or ``gaigs.Rays``.
+        grid: Directions in the array's frame [rad].
         array: Positions of the elements [m].
         frequency: Carrier of the weights [Hz].
 
     Returns:
         (..., rows, columns), or (..., k) of rays; differentiable, with a gradient of 0 where the amplitude is 0.
-
-    Raises:
-        TypeError: The responses are not a complex tensor.
-        ValueError: Their elements are not the array's, or the frequency is not a carrier.
 
     Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
 
@@ -68,13 +62,9 @@ def bartlett(
         (torch.Size([90, 360]), 16.0)
     """
     check_carrier("frequency", frequency)
-    if not isinstance(responses, Tensor) or not responses.is_complex():
-        raise TypeError(
-            f"responses must be a complex tensor, got {getattr(responses, 'dtype', type(responses).__name__)}"
-        )
-    if responses.ndim < 2 or responses.shape[-2] != len(array):
+    if not responses.is_complex() or responses.ndim < 2 or responses.shape[-2] != len(array):
         raise ValueError(
-            f"responses must be (..., elements, frequencies) of the array's {len(array)} elements, got "
+            f"responses must be complex (..., elements, frequencies) of {len(array)} elements, got {responses.dtype} "
             f"{tuple(responses.shape)}"
         )
     batch, responses = responses.shape[:-2], responses.flatten(0, -3) if responses.ndim > 2 else responses[None]
@@ -87,7 +77,7 @@ def bartlett(
     phases = math.pi * steps @ directions.T
     cosines, sines = (part.to(lags.real) for part in (torch.cos(phases), torch.sin(phases)))
     power = lags.real @ cosines + lags.imag @ sines
-    # In a null of the pattern rounding may leave the power a little below zero.
+    # In a null rounding may leave the power a little below zero.
     power = torch.where(power > 0, power, 1).sqrt() * (power > 0)
     return power.reshape(*batch, *grid.shape)
 
@@ -99,7 +89,7 @@ def min_max(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b rows c
 
 
 def fresnel(
-    permittivity: complex | Complex[Tensor, "*batch"], cosines: Float[Tensor, "*batch"]
+    permittivity: complex | Complex[Tensor, "*#batch"], cosines: Float[Tensor, "*#batch"]
 ) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
     """Fresnel reflection coefficients of a half-space, electric field across (TE) and in (TM) the plane of incidence.
 
@@ -116,18 +106,10 @@ def fresnel(
 
 
 def fit_gain(channels: Complex[Tensor, " k *shape"], waves: Complex[Tensor, " k *shape"]) -> Complex[Tensor, ""]:
-    """The complex gain of measured channels over waves predicted at a gain of 1; complex128.
+    """The complex gain of measured channels h over waves w predicted at a gain of 1; complex128.
 
     Its magnitude is the median over the links of |h| / |w|, its phase that of the sum of w* h / (|w| |h|). So each link
-    counts once, weak or strong: least squares follows the strongest links, least relative errors follow links in the
-    deepest shadow (docs/results.md has both figures).
-
-    Args:
-        channels: Measured, h of each link.
-        waves: Predicted, w of each link. A link with h = 0 or w = 0 does not count.
-
-    Returns:
-        The gain; 0 where no link counts.
+    counts once, weak or strong. Links with h = 0 or w = 0 do not count; without any other the gain is 0.
     """
     h, w = (part.to(torch.complex128).flatten(1) for part in (channels, waves))
     sizes, strengths = h.norm(dim=1), w.norm(dim=1)
@@ -143,12 +125,7 @@ def strength(
 ) -> float:
     """Amplitude of channels over waves: the median over a receiver's links, the geometric mean over receivers.
 
-    Args:
-        channels, waves: As for ``fit_gain``.
-        receivers: Receiver of each link.
-
-    Returns:
-        The amplitude; 1 where all channels are 0.
+    It is 1 where all channels are 0.
     """
     gains = [fit_gain(channels[own], waves[own]).abs() for own in (receivers == k for k in receivers.unique())]
     heard = [gain.log() for gain in gains if gain > 0]
@@ -158,30 +135,22 @@ def strength(
 def phase_sign(
     channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, " k"]
 ) -> int:
-    """The sign with which the phases of channels follow the direct distance.
+    """The sign with which the phases of channels follow the direct distance: -1 or 1; 0 for neither.
 
     Divided by free space, a direct path alone is the same number at all links of a receiver. For each sign, the mean
-    over links keeps a share of the power; by chance alone the share is about 1 / links. All links count alike.
-
-    Args:
-        channels: Measured.
-        waves: ``direct_waves`` of the same links, with the sign -1.
-        receivers: Receiver of each link.
-
-    Returns:
-        -1 or 1; 0 where neither share exceeds 0.01 plus four times that of chance. With fewer than ``TELLING`` links a
-        receiver neither can.
+    over links keeps a share of the power, by chance about 1 / links. The larger share wins if it exceeds 0.01 plus four
+    times that of chance: never with fewer than ``TELLING`` links a receiver. ``waves`` are ``direct_waves`` of the same
+    links with the sign -1.
     """
     relative, phases = _normalised(channels / waves.abs()), waves.angle()
     kept = {-1: 0.0, 1: 0.0}
     for receiver in receivers.unique().tolist():
         own = receivers == receiver
         for sign in kept:
-            # waves.angle() is that of the sign -1, which it undoes where the channels have it.
             still = relative[own] * torch.polar(torch.ones_like(phases[own]), sign * phases[own])
             kept[sign] += int(own.sum()) * still.mean(0).abs().square().mean().item()
     total = relative.abs().square().mean().item() * len(receivers)
-    best = max(kept, key=kept.get)
+    best = max(kept, key=kept.__getitem__)
     chance = len(receivers.unique()) / len(receivers)
     return best if kept[best] > (0.01 + 4 * chance) * total else 0
 
@@ -189,14 +158,8 @@ def phase_sign(
 def array_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"]) -> int:
     """The sign with which phases follow the direct distance from one element or subcarrier of a link to another.
 
-    It shows even where each link has a random phase in common.
-
-    Args:
-        channels: Measured.
-        waves: ``direct_waves`` of the same links, with the sign -1.
-
-    Returns:
-        -1 or 1, whichever keeps more power in the mean over elements and subcarriers; -1 where neither does.
+    It shows even where each link has a random phase in common. The sign, -1 or 1, keeps more power in the mean over
+    elements and subcarriers; -1 where neither does. Arguments are as for ``phase_sign``.
     """
     relative, phases = _normalised(channels / waves.abs()), waves.angle()
     kept = [
@@ -207,6 +170,6 @@ def array_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s
 
 
 def _normalised(channels: Complex[Tensor, "k e s"]) -> Complex[Tensor, "k e s"]:
-    """Channels of a mean power of 1 each; silent ones stay so."""
+    """Channels of a mean power of 1 each; channels of 0 stay 0."""
     powers = channels.abs().square().mean((1, 2), keepdim=True)
     return channels / torch.where(powers > 0, powers, 1).sqrt()

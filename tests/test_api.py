@@ -237,7 +237,7 @@ def test_mirrored_gaussians_have_parts_that_suit_them():
 
 
 def test_models_that_cannot_be_stored_are_refused(spectra, tmp_path):
-    with pytest.raises(ValueError, match="model 'knn' has no state that a file could hold"):
+    with pytest.raises(ValueError, match="model 'knn' is a look-up without a state"):
         gaigs.train("knn", spectra).save(tmp_path / "knn.ckpt")
 
     class Own(EuclideanTokenizer):

@@ -80,7 +80,7 @@ OPTIMIZERS = {
 
 @pytest.mark.parametrize("name", CHANGES)
 @pytest.mark.parametrize("kind", OPTIMIZERS.values(), ids=OPTIMIZERS)
-def test_the_optimizer_keeps_its_memory_of_those_that_stay(gaussians, scene, chosen, name, kind):
+def test_the_optimizer_keeps_the_state_of_remaining_gaussians(gaussians, scene, chosen, name, kind):
     optimizer = optimizer_of(gaussians, kind)
     train(gaussians, optimizer, scene)
     old = dict(gaussians.named_parameters())
@@ -108,16 +108,14 @@ def test_the_optimizer_keeps_its_memory_of_those_that_stay(gaussians, scene, cho
 
 
 SCALED = {name: getattr(torch.optim, name) for name in ("AdamW", "Adagrad", "Adafactor") if hasattr(torch.optim, name)}
-"""Optimizers whose steps do not depend on the gradient's size; Adafactor (torch 2.5) keeps a row and a column of each
-parameter."""
+"""Optimizers whose steps do not depend on the gradient's size; Adafactor (torch 2.5) keeps rows and columns."""
 
 
 @pytest.mark.parametrize("name", CHANGES)
-@pytest.mark.parametrize("steps", [0, 3])
 @pytest.mark.parametrize("kind", SCALED.values(), ids=SCALED)
-def test_training_goes_on(gaussians, scene, chosen, name, steps, kind):
+def test_training_goes_on(gaussians, scene, chosen, name, kind):
     optimizer = optimizer_of(gaussians, kind)
-    train(gaussians, optimizer, scene, steps)
+    train(gaussians, optimizer, scene)
     CHANGES[name](gaussians, optimizer, chosen)
     before = {name: parameter.detach().clone() for name, parameter in gaussians.named_parameters()}
     train(gaussians, optimizer, scene, 2)
@@ -148,7 +146,7 @@ def test_pruning_keeps_all_others_and_refuses_to_remove_all(gaussians, chosen):
 
 def test_a_clone_and_its_original_cover_what_one_did(gaussians, chosen):
     with torch.no_grad():
-        gaussians.opacity_logits.copy_(torch.linspace(-12, 40, N))  # 40: float32 can no longer tell 1 - a from 0
+        gaussians.opacity_logits.copy_(torch.linspace(-12, 40, N))  # at 40, 1 - a is 0 in float32
     logits = gaussians.opacity_logits.detach().double()
     density.clone(gaussians, optimizer_of(gaussians), chosen)
     originals, clones = gaussians.opacity_logits[:N][chosen], gaussians.opacity_logits[N:]
@@ -174,28 +172,21 @@ def test_cloning_leaves_the_image_to_first_order(gaussians, scene):
     before = render(gaussians, scene)[0, 0]
     density.clone(gaussians, optimizer_of(gaussians), only)
     after = render(gaussians, scene)[0, 0]
-    # Of A = a G the two make A + a² (G - G²) / 4 + ..., where neither is cut off.
+    # Instead of A = a G the two give A + a² (G - G²) / 4 + ... above ALPHA_MIN.
     whole = before > 2.2 * ALPHA_MIN
     assert whole.sum() > 10
     change = (after - before)[whole].abs().max().item()
     assert 0.1 * 0.2**2 / 16 < change < 1.3 * 0.2**2 / 16
 
 
-def test_halves_are_smaller_and_drawn_from_the_whole(gaussians):
-    chosen = torch.zeros(N, dtype=torch.bool)
-    chosen[5] = True
-    with torch.no_grad():
-        gaussians.log_scales[5] = torch.tensor([0.5, 0.1, 2.0]).log()
+def test_halves_are_smaller_and_all_else_stays(gaussians):
+    chosen, halves = torch.arange(N) == 5, torch.tensor([5, N])
     before = {key: value.clone() for key, value in gaussians.state_dict().items()}
     density.split(gaussians, optimizer_of(gaussians), chosen, torch.Generator().manual_seed(1))
-    halves = torch.tensor([5, N])
     torch.testing.assert_close(gaussians.scales[halves] * 1.6, before["log_scales"][[5, 5]].exp())
     for key in ("quats", "opacity_logits", "signal"):
         assert torch.equal(gaussians.state_dict()[key][halves], before[key][[5, 5]])
-    others = torch.arange(N) != 5
-    assert all(torch.equal(value[:N][others], before[key][others]) for key, value in gaussians.state_dict().items())
-    assert (gaussians.means[halves] - before["means"][5]).norm(dim=-1).min() > 0.05
-    assert (gaussians.means[5] - gaussians.means[N]).norm() > 0.05
+    assert all(torch.equal(value[:N][~chosen], before[key][~chosen]) for key, value in gaussians.state_dict().items())
 
 
 def test_the_places_of_halves_follow_the_whole(scene):
@@ -209,6 +200,6 @@ def test_the_places_of_halves_follow_the_whole(scene):
 
     density.split(gaussians, optimizer_of(gaussians), everyone, torch.Generator().manual_seed(0))
     places = gaussians.means.detach()
-    # Of 8,000 draws a covariance is known to a fraction sqrt(2 / 8000) = 1.6 % of the largest variance.
+    # 8,000 draws show a covariance to a fraction sqrt(2 / 8000) = 1.6 % of the largest variance.
     torch.testing.assert_close(places.T.cov(), covariance, rtol=0, atol=0.08 * covariance.max().item())
     torch.testing.assert_close(places.mean(0), torch.tensor([1.0, 2, 3]), rtol=0, atol=0.06)

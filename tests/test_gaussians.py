@@ -31,9 +31,6 @@ def gaussians_of(scene, **options):
     return Gaussians(scene, **(OPTIONS | options))
 
 
-# --- where they start ---
-
-
 @pytest.mark.parametrize(("low", "high"), [(-math.pi / 2, math.pi / 2), (0.0, math.pi / 2), (0.2, 0.6)])
 def test_the_lattice_is_even(low, high):
     count = 2000
@@ -42,18 +39,17 @@ def test_the_lattice_is_even(low, high):
     torch.testing.assert_close(distances, torch.ones(count))
     assert elevations.min() > low
     assert elevations.max() < high
-    # Within the zone every patch of the same solid angle holds as many.
+    # Patches of the zone of equal solid angle hold equal numbers.
     heights = (points[:, 2] - math.sin(low)) / (math.sin(high) - math.sin(low))
     patches = (heights * 10).long() * 8 + ((azimuths / math.tau + 0.5) * 8).long().clamp(0, 7)
     assert (patches.bincount(minlength=80) - count / 80).abs().max() <= 5
-    # And none stands much nearer to its neighbour than evenness allows.
     pitch = math.sqrt(math.tau * (math.sin(high) - math.sin(low)) / count)
     nearest = cKDTree(points.numpy()).query(points.numpy(), 2)[0][:, 1]
     assert nearest.min() > 0.7 * pitch
     assert nearest.max() < 1.3 * pitch
 
 
-def test_every_receiver_gets_its_share_in_the_directions_that_its_map_shows(scene):
+def test_each_receiver_gets_an_equal_number_within_the_zone(scene):
     gaussians = gaussians_of(scene)
     assert len(gaussians) == 41
     shares = gaussians.means.split((21, 20))
@@ -66,7 +62,7 @@ def test_every_receiver_gets_its_share_in_the_directions_that_its_map_shows(scen
         assert azimuths.max() - azimuths.min() > 5
 
 
-def test_they_start_as_wide_as_to_meet_their_neighbours(scene):
+def test_initial_widths_reach_the_neighbours(scene):
     scene = replace(scene, receivers=scene.receivers[:1])
     gaussians = gaussians_of(scene, count=500)
     points = scene.receivers[0].pose.local(gaussians.means.detach())
@@ -94,13 +90,12 @@ def test_activations(scene):
         ({"near": 0.0}, "0 < near <= far < 100000 m, got 0.0 and 5.0"),
         ({"near": 6.0}, "0 < near <= far"),
         ({"far": math.inf}, "0 < near <= far < 100000 m, got 2.0 and inf"),
-        ({"far": 1e30}, "0 < near <= far < 100000 m, got 2.0 and 1e\\+30"),
-        ({"spread": 0.0}, "spread must be positive and at most 1e[+]06, got 0.0"),
-        ({"spread": math.nan}, "spread must be positive .* got nan"),
-        ({"signal": -1.0}, "signal must be at least 0 and at most 1e[+]06, got -1.0"),
-        ({"degree": -1}, "degree must be at least 0, got -1"),
-        ({"opacity": 1.0}, "between 0 and 1, got 1.0"),
-        ({"opacity": 0.0}, "between 0 and 1"),
+        ({"spread": 0.0}, "spread=0.0"),
+        ({"spread": math.nan}, "spread=nan"),
+        ({"signal": -1.0}, "signal=-1.0"),
+        ({"degree": -1}, "degree=-1"),
+        ({"opacity": 1.0}, "opacity=1.0"),
+        ({"opacity": 0.0}, "opacity=0.0"),
     ],
 )
 def test_impossible_options_are_refused(scene, options, message):
@@ -108,28 +103,15 @@ def test_impossible_options_are_refused(scene, options, message):
         gaussians_of(scene, **options)
 
 
-# --- another number of them ---
-
-
-def test_a_state_dict_of_another_number_is_taken_over(scene):
+def test_a_state_dict_may_have_another_number_of_gaussians(scene):
     trained, fresh = gaussians_of(scene, count=70), gaussians_of(scene)
+    fresh.means.requires_grad_(False)
     holder = nn.ModuleDict({"gaussians": fresh})
     holder.load_state_dict({f"gaussians.{name}": value for name, value in trained.state_dict().items()})
     assert len(fresh) == 70
     for name in Gaussians.PARAMETERS:
         assert torch.equal(getattr(fresh, name), getattr(trained, name))
-        assert isinstance(getattr(fresh, name), nn.Parameter)
-
-
-def test_resizing_keeps_what_is_frozen_frozen(scene):
-    gaussians = gaussians_of(scene)
-    gaussians.means.requires_grad_(False)
-    gaussians.resize(5)
-    assert [parameter.shape[0] for parameter in gaussians.parameters()] == [5] * 5
-    assert [name for name, parameter in gaussians.named_parameters() if not parameter.requires_grad] == ["means"]
-
-
-# --- .ply ---
+        assert getattr(fresh, name).requires_grad == (name != "means")
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 5])

@@ -25,23 +25,23 @@ from gaigs.testing import example_links
         ("loss", "log_relative_error", {}, "spectrum", "'spectrum' are real, not complex"),
         ("tokenizer", "euclidean", {"transmitter_octaves": (3, 2)}, "rssi", r"within -30..30, got \[3, 2\]"),
         ("tokenizer", "euclidean", {"gaussian_octaves": (-31, 2)}, "rssi", r"within -30..30, got \[-31, 2\]"),
-        ("tokenizer", "euclidean", {"hidden": 0}, "rssi", "hidden must be at least 1, got 0"),
-        ("tokenizer", "euclidean", {"width": 0}, "rssi", "width must be at least 1, got 0"),
-        ("tokenizer", "euclidean", {"hidden": None}, "rssi", "both be given, or both be null .* got None and 64"),
+        ("tokenizer", "euclidean", {"hidden": 0}, "rssi", "hidden and width .* got 0, 64"),
+        ("tokenizer", "euclidean", {"width": 0}, "rssi", "hidden and width .* got 256, 0"),
+        ("tokenizer", "euclidean", {"hidden": None}, "rssi", "hidden and width .* got None, 64"),
         ("tokenizer", "euclidean", {"width": None}, "rssi", "hidden and width must both be given"),
         ("tokenizer", "ga", {"algebra": "conformal"}, "rssi", "projective, spacetime, got 'conformal'"),
         *(
             ("tokenizer", "ga", {option: 0}, "rssi", f"{option} must be at least 1, got 0")
             for option in ("anchors", "blocks", "multivectors", "scalars", "heads", "width")
         ),
-        ("tokenizer", "ga", {"scalars": 2}, "rssi", "make both multiples of 4"),
+        ("tokenizer", "ga", {"scalars": 2}, "rssi", "must be multiples of 4 heads"),
         ("tokenizer", "ga", {"multivectors": 3, "heads": 1}, "rssi", "must be even, got 3"),
         ("tokenizer", "multiview", {"ga": {"name": "ga", "depth": 1}}, "rssi", "tokenizer 'ga' has no option 'depth'"),
         ("tokenizer", "multiview", {"euclidean": "euclid"}, "rssi", "unknown tokenizer 'euclid'"),
         ("deformation", "two_branch", {"heads": ["signal", "shift", "phase"]}, "rssi", "opacity, .* got phase, shift"),
-        ("deformation", "two_branch", {"width": 0}, "rssi", r"deformation\.width must be at least 1, got 0"),
-        ("deformation", "two_branch", {"attenuation_layers": -1}, "rssi", "attenuation_layers must be at least 0"),
-        ("deformation", "two_branch", {"signal_layers": -2}, "rssi", "signal_layers must be at least 0, got -2"),
+        ("deformation", "two_branch", {"width": 0}, "rssi", r"deformation\.width must be at least 1, .* got 0"),
+        ("deformation", "two_branch", {"attenuation_layers": -1}, "rssi", "got 64, -1 and 1"),
+        ("deformation", "two_branch", {"signal_layers": -2}, "rssi", "got 64, 2 and -2"),
     ],
 )
 def test_impossible_options_are_refused(kind, name, options, task, message):

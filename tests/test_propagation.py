@@ -1,4 +1,4 @@
-"""Free space against sums in numpy, reflection against Snell's law, signs against phases that are known."""
+"""Free space and reflection against numpy, signs against known phases."""
 
 import cmath
 import math
@@ -47,15 +47,12 @@ def test_free_space_is_friis_formula(sign):
             assert abs(found[i, j].item() - expected) < 1e-9 * abs(expected)
 
 
-def test_without_a_sign_the_amplitude_alone_is_left():
+def test_sign_0_gives_the_amplitude_alone_and_near_waves_are_those_of_a_centimetre():
     found = free_space(torch.tensor([2.0]), torch.tensor([1e9]), 0)
     assert found.item() == pytest.approx(abs(friis(2.0, 1e9, -1)))
     assert found.imag.item() == 0
 
-
-def test_at_the_antenna_itself_a_wave_is_that_of_a_centimetre():
     near = free_space(torch.tensor([0.0, 1e-3, 1e-2]), torch.tensor([1e9]))
-    assert near.isfinite().all()
     assert near[0] == near[1] == near[2]
     assert near[0].item() == pytest.approx(friis(1e-2, 1e9, -1))
 
@@ -92,8 +89,6 @@ def test_the_pattern_is_that_towards_the_transmitter():
     assert direct_gains(scene(Array.planar(2, 2, 0.06, "cosine")), on_top).item() == 1
 
 
-# --- reflection ---
-
 SURFACES = {"glass": 6.31 - 0.05j, "wet_brick": 12 - 4j, "metal": 1 - 3.6e7j, "foam": 1.05 + 0j}
 """Relative permittivities."""
 
@@ -110,16 +105,6 @@ def test_reflection_follows_snells_law(surface):
         np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("surface", SURFACES)
-def test_reflection_is_passive_and_total_at_grazing(surface):
-    te, tm = fresnel(SURFACES[surface], torch.linspace(0, 1, 200, dtype=torch.float64))
-    assert te.abs().max() <= 1
-    assert tm.abs().max() <= 1
-    assert te[0].item() == pytest.approx(-1)
-    assert tm[0].item() == pytest.approx(-1)
-    torch.testing.assert_close(te[-1], -tm[-1])
-
-
 def test_each_surface_may_have_its_own_permittivity_and_learns_it():
     permittivities = torch.tensor([*SURFACES.values()], dtype=torch.complex128, requires_grad=True)
     cosines = torch.linspace(0.05, 1, 7, dtype=torch.float64)[:, None].requires_grad_()
@@ -128,9 +113,6 @@ def test_each_surface_may_have_its_own_permittivity_and_learns_it():
         for whole, alone in zip(together, fresnel(surface, cosines[:, 0]), strict=True):
             torch.testing.assert_close(whole[:, i], alone)
     torch.autograd.gradcheck(fresnel, (permittivities[[0, 1]], cosines))
-
-
-# --- carriers ---
 
 
 def test_the_carrier_of_a_link_is_its_own_or_the_datas_only_one():
@@ -143,13 +125,8 @@ def test_the_carrier_of_a_link_is_its_own_or_the_datas_only_one():
     assert middle.tolist() == pytest.approx([2.44e9] * 2)
     assert middle.dtype == torch.float32
     for known in (band, band[:0]):
-        with pytest.raises(
-            ValueError, match=rf"each link must have a frequency \[Hz\], as the data have {len(known)} carriers"
-        ):
+        with pytest.raises(ValueError, match=r"each link must have a frequency \[Hz\]"):
             carriers(replace(spectra, frequencies=known), silent)
-
-
-# --- signs ---
 
 
 def made(count=40, gains=(1.0, 1.0), clutter=0.0, seed=0):
@@ -161,31 +138,26 @@ def made(count=40, gains=(1.0, 1.0), clutter=0.0, seed=0):
 
 
 @pytest.mark.parametrize("clutter", [0.0, 1.0])
-def test_the_sign_is_what_the_phases_show(clutter):
+def test_the_sign_follows_the_phases_of_the_direct_path(clutter):
     gains = 3e4 * cmath.exp(1j), 2e4 * cmath.exp(-2j)  # clocks of their own
     query, waves, channels = made(gains=gains, clutter=2e4 * clutter)
     assert phase_sign(channels, waves, query.receivers) == -1
     assert phase_sign(channels.conj(), waves, query.receivers) == 1
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_random_phases_show_no_sign(seed):
     query, waves, _ = made(count=100)
     phases = 2 * math.pi * torch.rand(100, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     turned = waves * torch.polar(torch.ones_like(phases), phases)
     assert phase_sign(turned, waves, query.receivers) == 0
-    # What elements and subcarriers of a link have in common is left.
     assert array_sign(turned, waves) == -1
     assert array_sign(turned.conj(), waves) == 1
 
 
-def test_a_handful_of_links_shows_no_sign():
+def test_few_links_show_no_sign_and_single_numbers_no_sign_between_elements():
     query, waves, channels = made(count=4)
     assert phase_sign(channels, waves, query.receivers) == 0
-
-
-def test_a_single_number_a_link_has_no_sign_of_its_own():
-    query = ask(10)
     waves = direct_waves(scene(Array.single()), query, FREQUENCIES[:1])
     assert array_sign(waves.abs().to(waves.dtype), waves) == -1
 
@@ -193,7 +165,7 @@ def test_a_single_number_a_link_has_no_sign_of_its_own():
 def test_arrays_must_fit_the_labels():
     links = example_links("csi")
     check_elements("model 'm'", links.scene)
-    with pytest.raises(ValueError, match="labels have 4 elements, and the array of gateway0 9; give the data's"):
+    with pytest.raises(ValueError, match="gateway0"):
         check_elements("model 'm'", scene(Array.planar(3, 3, 0.06)))
-    with pytest.raises(ValueError, match="model 'm' gives complex channels, not labels of task 'rssi'"):
+    with pytest.raises(ValueError, match="model 'm' gives complex channels"):
         check_elements("model 'm'", example_links("rssi").scene)

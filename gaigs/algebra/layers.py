@@ -18,21 +18,21 @@ from torch.nn import functional
 from gaigs.algebra import Algebra
 from gaigs.algebra.mix import Mix
 
+Multivectors = Float[Tensor, "... _ k"]
+Scalars = Float[Tensor, "... _"]
+
 
 class EquivariantLinear(nn.Module):
-    """The most general equivariant linear map, learnt for every pair of channels.
+    """The most general equivariant linear map, learnt for every pair of channels (in, out).
 
     It is a sum of basis maps: the projection to each of the n + 1 grades and, with a null vector e0, e0 times each
-    grade but the highest: nine maps for the projective algebra, five for space-time. Multiplication by the pseudoscalar
-    is excluded, because a mirror changes its sign. Scalars mix with the multivectors' component 1, which has the bias.
-
-    Args:
-        algebra: Signature of the multivectors.
-        multivectors: Channels in and out.
-        scalars: Channels in and out.
+    grade but the highest. Multiplication by the pseudoscalar is excluded, because a mirror changes its sign. Scalars
+    mix with the multivectors' component 1, which has the bias.
 
     Source: GATr, proposition 2.
     """
+
+    maps: Tensor
 
     def __init__(self, algebra: Algebra, multivectors: tuple[int, int], scalars: tuple[int, int]):
         super().__init__()
@@ -48,9 +48,7 @@ class EquivariantLinear(nn.Module):
         for layer in (self.from_scalars, self.to_scalars):
             nn.init.zeros_(layer.bias)
 
-    def forward(
-        self, multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
-    ) -> tuple[Float[Tensor, "*batch c_out k"], Float[Tensor, "*batch s_out"]]:
+    def forward(self, multivectors: Multivectors, scalars: Scalars) -> tuple[Multivectors, Scalars]:
         device = self.weight.device.type
         if torch.is_autocast_enabled(device):  # computed in the precision of the weights
             with torch.autocast(device, enabled=False):
@@ -63,12 +61,8 @@ class EquivariantLinear(nn.Module):
 class GeometricBilinear(nn.Module):
     """Products of learnt pairs of channels: the geometric product and the join of each.
 
-    Joins give the lines and planes through points, which geometric products do not. A mirror changes a join's sign, so
-    joins are multiplied by the e123 component of a reference, whose sign it also changes. Without a null vector
-    products alone reach every grade, so there are twice as many products and no joins.
-
-    Raises:
-        ValueError: The multivectors are odd in number and half of them would have to be joins.
+    A mirror changes a join's sign, so joins are multiplied by the e123 component of a reference, whose sign it also
+    changes. Without a null vector products alone reach every grade, so there are twice as many products and no joins.
 
     Source: GATr, "Geometric bilinears"; Spinner et al., 2024, without joins.
     """
@@ -83,11 +77,8 @@ class GeometricBilinear(nn.Module):
         self.output = EquivariantLinear(algebra, (multivectors, multivectors), (scalars, scalars))
 
     def forward(
-        self,
-        multivectors: Float[Tensor, "*batch tokens c k"],
-        scalars: Float[Tensor, "*batch tokens s"],
-        reference: Float[Tensor, "*#batch k"],
-    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
+        self, multivectors: Multivectors, scalars: Scalars, reference: Float[Tensor, "... k"]
+    ) -> tuple[Multivectors, Scalars]:
         factors, scalars = self.factors(multivectors, scalars)
         left, right = factors.chunk(2, -2)
         if not self.algebra.r:
@@ -110,23 +101,21 @@ class GeometricAttention(nn.Module):
     x and y, with w(h) = h / (h² + floor).
 
     Args:
-        algebra: Signature of the multivectors.
-        multivectors: Channels; a multiple of ``heads``.
-        scalars: Channels; a multiple of ``heads``.
+        multivectors, scalars: Channels, multiples of ``heads``.
         heads: Attention maps, each of an equal share of the channels.
-
-    Raises:
-        ValueError: The heads cannot share the channels equally.
 
     Source: GATr, "Geometric attention" and, for the distances, appendix "Distance-aware dot-product attention".
     """
+
+    blades: Tensor
+    ideal: Tensor
+    form: Tensor
 
     def __init__(self, algebra: Algebra, multivectors: int, scalars: int, heads: int):
         super().__init__()
         if multivectors % heads or scalars % heads:
             raise ValueError(
-                f"{heads} heads must share the channels equally, got {multivectors} multivectors and {scalars} "
-                f"scalars; make both multiples of {heads}"
+                f"multivectors and scalars must be multiples of {heads} heads, got {multivectors}, {scalars}"
             )
         self.algebra = algebra
         self.heads = heads
@@ -144,7 +133,7 @@ class GeometricAttention(nn.Module):
         self.register_buffer("ideal", ideal[ideal_blades], persistent=False)
         self.register_buffer("form", form, persistent=False)
 
-    def features(self, multivectors: Float[Tensor, "*batch c k"]) -> Float[Tensor, "*batch c f"]:
+    def features(self, multivectors: Multivectors) -> Float[Tensor, "*batch c f"]:
         """Factors of the logits: components of the inner product, and w(h) (x·x, h², h x) of points."""
         seen, x = multivectors.index_select(-1, self.blades).split(self.parts, -1)
         if not x.shape[-1]:
@@ -154,21 +143,17 @@ class GeometricAttention(nn.Module):
         size = (x.square() * self.ideal).sum(-1, keepdim=True)
         return torch.cat((seen, weight * torch.cat((size, h.square(), h * x), -1)), -1)
 
-    def forward(
-        self, multivectors: Float[Tensor, "*batch tokens c k"], scalars: Float[Tensor, "*batch tokens s"]
-    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
-        """Each token's attention to all tokens."""
+    def forward(self, multivectors: Multivectors, scalars: Scalars) -> tuple[Multivectors, Scalars]:
         query, key, value = self._project(multivectors, scalars)
         return self._read(functional.scaled_dot_product_attention(query, key, value).movedim(-3, -2))
 
     def look(
-        self, multivectors: Float[Tensor, "tokens c k"], scalars: Float[Tensor, "tokens s"], groups: tuple[int, int]
-    ) -> tuple[Float[Tensor, "b c k"], Float[Tensor, "b s"]]:
+        self, multivectors: Multivectors, scalars: Scalars, groups: tuple[int, int]
+    ) -> tuple[Multivectors, Scalars]:
         """Attention of the first token of each group to its group and to the tokens common to all groups.
 
         Args:
-            multivectors: Tokens' multivectors: one group after the other, then any common ones.
-            scalars: Likewise.
+            multivectors, scalars: One group after the other, then any common tokens.
             groups: Number of groups, and of tokens in each.
         """
         query, key, value = self._project(multivectors, scalars)
@@ -180,10 +165,7 @@ class GeometricAttention(nn.Module):
         mixed = (grouped[..., None, :] @ value[:, :own].unflatten(1, groups)).squeeze(-2) + alike @ value[:, own:]
         return self._read(mixed.movedim(0, 1))
 
-    def _project(
-        self, multivectors: Float[Tensor, "*batch tokens c k"], scalars: Float[Tensor, "*batch tokens s"]
-    ) -> list[Float[Tensor, "*batch heads tokens f"]]:
-        """Query, key and value of each token."""
+    def _project(self, multivectors: Multivectors, scalars: Scalars) -> list[Float[Tensor, "*batch heads tokens f"]]:
         multivectors, scalars = self.project(multivectors, scalars)
         # Query, key and value first, then heads before tokens.
         multivectors = multivectors.unflatten(-2, (3, self.heads, -1)).movedim((-4, -3), (0, -4))
@@ -193,10 +175,7 @@ class GeometricAttention(nn.Module):
         channels = zip((query @ self.form, key, value[0]), scalars, strict=True)
         return [torch.cat((x.flatten(-2), s), -1) for x, s in channels]
 
-    def _read(
-        self, mixed: Float[Tensor, "*tokens heads f"]
-    ) -> tuple[Float[Tensor, "*tokens c k"], Float[Tensor, "*tokens s"]]:
-        """Multivectors and scalars of mixed values."""
+    def _read(self, mixed: Float[Tensor, "*tokens heads f"]) -> tuple[Multivectors, Scalars]:
         width = self.project.to_scalars.out_features // (3 * self.heads)
         multivectors, scalars = mixed.split((mixed.shape[-1] - width, width), -1)
         multivectors = multivectors.unflatten(-1, (-1, self.algebra.size)).flatten(-3, -2)
@@ -204,20 +183,16 @@ class GeometricAttention(nn.Module):
 
 
 NORM_FLOOR = 0.01
-"""Added to the squared size: components with e0 have no size and light-like ones cancel, so large tokens may have size
-zero. They grow at most tenfold, and the gradient at zero is finite. GATr's value."""
+"""Added to the squared size, which may be zero for large tokens with e0 or light-like ones. GATr's value."""
 
 
-def equivariant_norm(
-    algebra: Algebra, multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
-) -> tuple[Float[Tensor, "*batch c k"], Float[Tensor, "*batch s"]]:
+def equivariant_norm(algebra: Algebra, multivectors: Multivectors, scalars: Scalars) -> tuple[Multivectors, Scalars]:
     """Layer normalisation: a token's multivectors by their mean size, its scalars by mean and variance.
 
     The squared size of a multivector is the sum over its grades of |inner(x, x)|: invariant, and without cancellation
     between grades in a signature of both signs.
 
-    Source: GATr, "Layer normalization"; de Haan, Cohen & Brehmer, Euclidean, Projective, Conformal, 2023, for the sum
-    over grades.
+    Source: GATr, "Layer normalization"; de Haan, Cohen & Brehmer, Euclidean, Projective, Conformal, 2023.
     """
     by_grade = (algebra.table("grades", multivectors) * algebra.table("metric", multivectors)).mT
     size = (multivectors.square() @ by_grade).abs().sum(-1).mean(-1)
@@ -225,9 +200,7 @@ def equivariant_norm(
     return multivectors, functional.layer_norm(scalars, scalars.shape[-1:])
 
 
-def gated_gelu(
-    multivectors: Float[Tensor, "*batch c k"], scalars: Float[Tensor, "*batch s"]
-) -> tuple[Float[Tensor, "*batch c k"], Float[Tensor, "*batch s"]]:
+def gated_gelu(multivectors: Multivectors, scalars: Scalars) -> tuple[Multivectors, Scalars]:
     """Every multivector times the GELU of its component 1; scalars through a plain GELU.
 
     Source: GATr, "Scalar-gated nonlinearities".
@@ -237,12 +210,6 @@ def gated_gelu(
 
 class GATrBlock(nn.Module):
     """A transformer block: attention, then products and a gated GELU, each on normalised tokens and added to them.
-
-    Args:
-        algebra: Signature of the multivectors.
-        multivectors: Channels; a multiple of ``heads``.
-        scalars: Channels; a multiple of ``heads``.
-        heads: Attention maps, each of an equal share of the channels.
 
     Source: GATr, figure 1.
     """
@@ -255,42 +222,26 @@ class GATrBlock(nn.Module):
         self.linear = EquivariantLinear(algebra, (multivectors, multivectors), (scalars, scalars))
 
     def forward(
-        self,
-        multivectors: Float[Tensor, "*batch tokens c k"],
-        scalars: Float[Tensor, "*batch tokens s"],
-        reference: Float[Tensor, "*#batch k"],
-    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
+        self, multivectors: Multivectors, scalars: Scalars, reference: Float[Tensor, "... k"]
+    ) -> tuple[Multivectors, Scalars]:
         """Tokens after the block.
 
-        Args:
-            multivectors: Tokens' multivectors.
-            scalars: Tokens' scalars.
-            reference: A multivector that moves with the tokens, such as the mean of the network's inputs. Only its e123
-                has an influence, and only in an algebra with a null vector; see ``GeometricBilinear``.
+        ``reference`` moves with the tokens, such as the mean of the network's inputs; see ``GeometricBilinear``.
         """
-        return self.transform(*self.attend(multivectors, scalars), reference)
-
-    def attend(
-        self, multivectors: Float[Tensor, "*batch tokens c k"], scalars: Float[Tensor, "*batch tokens s"]
-    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
-        """The block's first half: attention between tokens."""
         attended = self.attention(*equivariant_norm(self.algebra, multivectors, scalars))
-        return multivectors + attended[0], scalars + attended[1]
+        return self.transform(multivectors + attended[0], scalars + attended[1], reference)
 
     def look(
-        self, multivectors: Float[Tensor, "tokens c k"], scalars: Float[Tensor, "tokens s"], groups: tuple[int, int]
-    ) -> tuple[Float[Tensor, "b 1 c k"], Float[Tensor, "b 1 s"]]:
-        """``attend`` for the first token of each group alone; see ``GeometricAttention.look``."""
-        seen = self.attention.look(*equivariant_norm(self.algebra, multivectors, scalars), groups)
-        firsts = (x[: math.prod(groups)].unflatten(0, groups)[:, :1] for x in (multivectors, scalars))
-        return tuple(first + part[:, None] for first, part in zip(firsts, seen, strict=True))
+        self, multivectors: Multivectors, scalars: Scalars, groups: tuple[int, int]
+    ) -> tuple[Multivectors, Scalars]:
+        """The block's first half for the first token of each group alone; see ``GeometricAttention.look``."""
+        attended = self.attention.look(*equivariant_norm(self.algebra, multivectors, scalars), groups)
+        first, first_scalars = (x[: math.prod(groups)].unflatten(0, groups)[:, :1] for x in (multivectors, scalars))
+        return first + attended[0][:, None], first_scalars + attended[1][:, None]
 
     def transform(
-        self,
-        multivectors: Float[Tensor, "*batch tokens c k"],
-        scalars: Float[Tensor, "*batch tokens s"],
-        reference: Float[Tensor, "*#batch k"],
-    ) -> tuple[Float[Tensor, "*batch tokens c k"], Float[Tensor, "*batch tokens s"]]:
+        self, multivectors: Multivectors, scalars: Scalars, reference: Float[Tensor, "... k"]
+    ) -> tuple[Multivectors, Scalars]:
         """The block's second half, for each token alone."""
         products = self.bilinear(*equivariant_norm(self.algebra, multivectors, scalars), reference)
         made = self.linear(*gated_gelu(*products))

@@ -1,7 +1,4 @@
-"""The function of ``layers.EquivariantLinear`` with its gradient by hand.
-
-Its tensors are so small that autograd's calls would take most of a training step.
-"""
+"""The function of ``layers.EquivariantLinear`` with its gradient by hand."""
 
 import torch
 from torch import Tensor
@@ -11,20 +8,18 @@ from torch.autograd.function import once_differentiable
 class Mix(torch.autograd.Function):
     """Mixes components and channels of multivectors, and scalars.
 
-    One matrix for each component, (k, tokens, channels), is three times as fast on a CPU as one matrix over channels
-    and components, nine tenths of which are zeros. The result has that order in memory, so only the first layer copies.
+    The tensors are so small that autograd's own calls would take most of a training step. One matrix for each
+    component, (k, tokens, channels), is three times as fast on a CPU as one over channels and components, nine tenths
+    zeros. The result has that order in memory, so only the first layer copies.
 
     Args:
         multivectors: (*tokens, c, k).
         scalars: (*tokens, s).
         weight: A matrix for each equivariant map (maps, c, c_out).
-        from_weight, from_bias: Linear map from scalars to components 1, as of ``torch.nn.Linear``.
-        to_weight, to_bias: Linear map from components 1 and scalars to scalars, likewise.
+        from_weight, from_bias: Linear map from scalars to components 1.
+        to_weight, to_bias: Linear map from components 1 and scalars to scalars.
         maps: Number of the map that leads from each wedge to each component (2**r, k).
-        null_wedges: Matrix of the wedge with each blade of null vectors, the first of which is 1 (2**r, k, k).
-
-    Returns:
-        (*tokens, c_out, k) and (*tokens, s_out).
+        null_wedges: Matrix of the wedge with each blade of null vectors, first with 1 (2**r, k, k).
     """
 
     @staticmethod

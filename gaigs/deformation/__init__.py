@@ -35,11 +35,11 @@ class Deformation(nn.Module, ABC):
     sees_receivers: bool = False
 
     @abstractmethod
-    def forward(self, tokens: Tokens | None, placed: Placed, query: Query) -> Residuals:
+    def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
         """Changes for each query.
 
         Args:
             tokens: Tokens of the queries and Gaussians; None if ``reads_tokens`` is False.
             placed: Placed Gaussians, without a gradient.
-            query: Transmitters, receivers and frequencies.
+            query: The links.
         """

@@ -13,5 +13,4 @@ class NoDeformation(Deformation):
     reads_tokens = False
 
     def forward(self, tokens: Tokens | None, placed: Placed, query: Query) -> Residuals:
-        """No residuals."""
         return Residuals()

@@ -26,8 +26,7 @@ LEAST_ATTENUATION = 1e-6
 class TokenLinear(nn.Module):
     """A linear layer on the concatenation [hidden, E(P_x), E(P_TX), CLS] of every (transmitter, Gaussian) pair.
 
-    It is the sum of a linear map of each part, computed n times for the Gaussians, b times for transmitters and scenes,
-    and b x n times only for ``hidden``; the concatenation is never built.
+    It is the sum of a linear map of each part, computed b x n times only for ``hidden``.
     """
 
     def __init__(self, tokens: tuple[int, int, int], width: int, hidden: int = 0):
@@ -78,9 +77,6 @@ class TwoBranch(Deformation):
         attenuation_layers, signal_layers: Residual layers of each branch after its first layer.
         heads: Heads in use, of ``HEADS``; branches that no head needs have no parameters.
 
-    Raises:
-        ValueError: There is no such head, or a width or number of layers is out of range.
-
     Source: GAI-GS, "Scene Mapping Network".
     """
 
@@ -94,32 +90,26 @@ class TwoBranch(Deformation):
         heads: Sequence[str] = ("signal", "opacity"),
     ):
         super().__init__()
-        unknown = set(heads) - set(HEADS)
-        if unknown:
+        if unknown := set(heads) - set(HEADS):
             raise ValueError(f"deformation.heads must be among {', '.join(HEADS)}, got {', '.join(sorted(unknown))}")
-        for option, count, least in (
-            ("width", width, 1),
-            ("attenuation_layers", attenuation_layers, 0),
-            ("signal_layers", signal_layers, 0),
-        ):
-            if count < least:
-                raise ValueError(f"deformation.{option} must be at least {least}, got {count}")
+        if width < 1 or min(attenuation_layers, signal_layers) < 0:
+            sizes = f"{width}, {attenuation_layers} and {signal_layers}"
+            raise ValueError(f"deformation.width must be at least 1, the numbers of layers at least 0, got {sizes}")
         self.heads = nn.ModuleDict()
         if not heads:
             return
         self.attenuation_first = TokenLinear(tokenizer_widths, width)
         self.attenuation_rest = nn.Sequential(*(ResidualLayer(width) for _ in range(attenuation_layers)))
-        if "opacity" in heads:
-            self.heads["opacity"] = nn.Linear(width, 1)
-        if "attenuation" in heads:
-            self.heads["attenuation"] = nn.Linear(width, 1)
+        for name in ("opacity", "attenuation"):
+            if name in heads:
+                self.heads[name] = nn.Linear(width, 1)
         self.has_signal_branch = not set(heads).isdisjoint(("rotation", "scale", "signal"))
         if self.has_signal_branch:
             self.signal_first = TokenLinear(tokenizer_widths, width, hidden=width)
             self.signal_rest = nn.Sequential(*(ResidualLayer(width) for _ in range(signal_layers)))
-        for head, size in (("rotation", 4), ("scale", 3), ("signal", channels)):
-            if head in heads:
-                self.heads[head] = nn.Linear(2 * width, size)
+        for name, size in (("rotation", 4), ("scale", 3), ("signal", channels)):
+            if name in heads:
+                self.heads[name] = nn.Linear(2 * width, size)
         for name, head in self.heads.items():
             if name != "signal":
                 nn.init.zeros_(head.weight)
@@ -128,8 +118,6 @@ class TwoBranch(Deformation):
             nn.init.constant_(self.heads["attenuation"].bias, math.log(INITIAL_ATTENUATION / (1 - INITIAL_ATTENUATION)))
 
     def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
-        """Residuals for every pair of a query and a Gaussian."""
-        results = dict.fromkeys(HEADS)
         if not self.heads:
             return Residuals()
         attenuation = self.attenuation_rest(functional.gelu(self.attenuation_first(tokens)))
@@ -137,13 +125,12 @@ class TwoBranch(Deformation):
         if self.has_signal_branch:
             signal = self.signal_rest(functional.gelu(self.signal_first(tokens, attenuation)))
             features |= dict.fromkeys(("rotation", "scale", "signal"), torch.cat((attenuation, signal), -1))
-        for name, head in self.heads.items():
-            results[name] = head(features[name])
-        if "signal" in self.heads:
+        results = {name: head(features[name]) for name, head in self.heads.items()}
+        if "signal" in results:
             results["signal"] = results["signal"][..., None]
-        if "opacity" in self.heads:
-            results["opacity"] = results["opacity"].squeeze(-1)
-        if "attenuation" in self.heads:
-            shares = results["attenuation"].squeeze(-1).sigmoid()
+        for name in results.keys() & {"opacity", "attenuation"}:
+            results[name] = results[name].squeeze(-1)
+        if "attenuation" in results:
+            shares = results["attenuation"].sigmoid()
             results["attenuation"] = LEAST_ATTENUATION + (1 - LEAST_ATTENUATION) * shares
-        return Residuals(*results.values())
+        return Residuals(*(results.get(name) for name in HEADS))

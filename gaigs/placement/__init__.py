@@ -29,12 +29,12 @@ class Placement(nn.Module, ABC):
     penalty_weights: Mapping[str, float] = {}
 
     @abstractmethod
-    def forward(self, gaussians: Gaussians | None, query: Query) -> Placed:
+    def forward(self, gaussians: Gaussians, query: Query) -> Placed:
         """The Gaussians of each query.
 
         Args:
-            gaussians: The free Gaussians; None for none.
-            query: Transmitters, receivers and frequencies.
+            gaussians: The free Gaussians; where ``has_own`` is True, None if there are no free ones.
+            query: The links.
         """
 
     def fit(self, links: Links) -> None:
@@ -45,5 +45,5 @@ class Placement(nn.Module, ABC):
         return {"network": list(self.parameters())}
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
-        """Terms added to the loss, by the names in ``penalty_weights``; by default none."""
+        """Terms added to the loss, by the names in ``penalty_weights``."""
         return {}

@@ -14,5 +14,4 @@ class Free(Placement):
     """
 
     def forward(self, gaussians: Gaussians, query: Query) -> Placed:
-        """The means, for any query."""
         return Placed(gaussians.means[None])

@@ -1,4 +1,4 @@
-"""Planes, obstacles and paths of a room that a model has learnt, as plain numbers for figures."""
+"""Planes, obstacles and paths of a learnt room, for figures."""
 
 from typing import NamedTuple
 
@@ -7,13 +7,9 @@ from numpy import ndarray
 
 
 class LearntPlane(NamedTuple):
-    """The part of a learnt plane that is drawn.
+    """The drawn part of a learnt plane: its number in ``metrics.json``, its share of the received power.
 
-    Attributes:
-        number: By which ``metrics.json`` calls it.
-        corners: Of a convex polygon, counterclockwise as seen from outside the room [m].
-        normal: Of unit length, out of the room.
-        share: Of the received power, in [0, 1].
+    ``corners`` are a convex polygon, counterclockwise as seen from outside the room [m]; the unit normal points out.
     """
 
     number: int
@@ -23,13 +19,7 @@ class LearntPlane(NamedTuple):
 
 
 class Matter(NamedTuple):
-    """Gaussians that dim what passes through them.
-
-    Attributes:
-        centres: World frame [m].
-        widths: Standard deviations along the world's axes [m].
-        densities: At the centres [dB/m].
-    """
+    """Obstacles: centres [m], standard deviations along the world's axes [m], densities at the centres [dB/m]."""
 
     centres: Float[ndarray, "k 3"]
     widths: Float[ndarray, "k 3"]
@@ -37,19 +27,14 @@ class Matter(NamedTuple):
 
 
 class LearntPath(NamedTuple):
-    """One way through the room.
-
-    Attributes:
-        points: The transmitter, where it bounces, and the receiver [m].
-        power_db: Over that of the strongest path [dB].
-    """
+    """Transmitter, bounces and receiver of a path [m], and its power relative to the strongest path [dB]."""
 
     points: Float[ndarray, "p 3"]
     power_db: float
 
 
 class LearntRoom(NamedTuple):
-    """Planes by their share, the strongest first; matter, None where there is none; a transmitter's strongest paths."""
+    """Planes, strongest first; matter, None without obstacles; a transmitter's strongest paths."""
 
     planes: list[LearntPlane]
     matter: Matter | None

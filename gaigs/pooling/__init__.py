@@ -12,14 +12,12 @@ from gaigs.query import Query
 
 
 class Pooling(nn.Module, ABC):
-    """The contract of kind ``pooling``. A pooling reads maps; one of ``gaigs.pooling.paths.PathPooling`` reads paths.
+    """The contract of kind ``pooling``. A pooling reads maps; a ``gaigs.pooling.paths.PathPooling`` reads paths.
 
     Attributes:
         channels: Real numbers that a Gaussian sends: channels of the map, or real and imaginary part of a path.
-        grid: Directions of the map that it sums over. None: the label has a value for each direction, and the map is
-            rendered in those asked for.
-        zone: Lowest and highest elevation from which anything is heard, where the label has no direction for each pixel
-            of the map [rad].
+        grid: Directions of the map that it sums over. None: the map is rendered in the label's directions.
+        zone: Lowest and highest elevation from which the receiver hears anything [rad]; read where ``grid`` is set.
     """
 
     channels: int = 2
@@ -27,7 +25,7 @@ class Pooling(nn.Module, ABC):
     zone: tuple[float, float] = (-math.pi / 2, math.pi / 2)
 
     def fit(self, links: Links) -> None:
-        """Takes what can be computed from the training links at once; by default nothing."""
+        """Computes its state from the training links before the training; by default nothing."""
 
     @abstractmethod
     def forward(self, received, query: Query, directions: Directions | None = None) -> Tensor:
@@ -36,20 +34,12 @@ class Pooling(nn.Module, ABC):
         Args:
             received: Maps (b, c, rows, columns), or ``ReceivedPaths``.
             query: The link of each map or set of paths; all to one receiver.
-            directions: Directions asked for, where the label has a value for each and the pooling does not read them
-                from the map; None for all of the task's.
+            directions: Wanted directions, where the label has any and they are not the map's; None: the task's.
         """
 
 
 def sphere(option: str, shape: Sequence[int]) -> Grid:
-    """A pooling's own grid from its option [rows, columns].
-
-    Raises:
-        ValueError: The option is not two whole numbers, or too few of either.
-    """
-    if not isinstance(shape, list | tuple) or len(shape) != 2 or not all(type(size) is int for size in shape):
-        raise ValueError(f"{option} must be [rows, columns], two whole numbers, got {shape}")
-    try:
-        return Grid.sphere(*shape)
-    except ValueError as error:
-        raise ValueError(f"{option} must be of a sphere: {error}") from None
+    """A pooling's own grid from its option [rows, columns]."""
+    if len(shape) != 2:
+        raise ValueError(f"{option} must be [rows, columns], got {list(shape)}")
+    return Grid.sphere(*shape)

@@ -21,11 +21,7 @@ class ArrayResponsePooling(Pooling):
     """Beamforming with the field at each element: the complex map over the solid angle, times the element's pattern.
 
     Args:
-        scene: Its task has the directions and the normalisation, its receivers the arrays.
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
-
-    Raises:
-        ValueError: As of ``Beamformer``; or the grid is none of a sphere.
     """
 
     def __init__(self, scene: Scene, grid: Sequence[int] = (24, 48)):
@@ -37,7 +33,6 @@ class ArrayResponsePooling(Pooling):
     def forward(
         self, image: Float[Tensor, "b 2 rows columns"], query: Query, directions: Directions | None = None
     ) -> Float[Tensor, "b ..."]:
-        """Spectra of complex maps."""
         waves = torch.complex(*image.flatten(2).unbind(1))
         array = self.beamformer.array(query)
         vectors = self.grid.flatten().vectors().to(image)

@@ -13,9 +13,6 @@ from gaigs.geometry import FAINTEST, Directions, Grid
 from gaigs.query import Query
 from gaigs.scene import Scene, carriers
 
-NORMALISATION = "min-max of each spectrum's amplitude"
-"""Scaling of labels, in the words of their task, that the beamformer reproduces."""
-
 
 class Beamformer:
     """The amplitude of the conventional beamformer, scaled as the labels are.
@@ -25,14 +22,8 @@ class Beamformer:
     with R(D) the mean covariance of the n_D pairs of elements that are D apart.
 
     Args:
-        owner: The component that takes nothing else, as errors name it.
+        owner: Component named in errors.
         scene: Its task has the directions and the normalisation, its receivers the arrays.
-
-    Attributes:
-        zone: Lowest and highest elevation from which the arrays hear anything [rad].
-
-    Raises:
-        ValueError: The labels are no spectra, are normalised otherwise, or an array has a single element.
 
     Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
     """
@@ -41,24 +32,23 @@ class Beamformer:
         task = scene.task
         if task.directions is None:
             raise ValueError(
-                f"{owner} gives spectra, and labels of task {task.name!r} are none\ntake a pooling of that task, such "
-                "as mean_power for RSSI or element_sum for channels"
+                f"{owner} gives spectra, not labels of task {task.name!r}\n"
+                "take a pooling of that task, such as mean_power for RSSI or element_sum for channels"
             )
-        if task.normalisation != NORMALISATION:
+        if task.normalisation != (needed := "min-max of each spectrum's amplitude"):
             raise ValueError(
-                f"{owner} takes labels scaled by {NORMALISATION}, got {task.normalisation!r}; take pooling=spectrum"
+                f"{owner} takes labels scaled by {needed}, got {task.normalisation!r}; take pooling=spectrum"
             )
         for receiver in scene.receivers:
             if len(receiver.array) < 2:
                 raise ValueError(
-                    f"{owner} takes arrays of at least 2 elements, got {len(receiver.array)} of {receiver.name}; give "
-                    "the data's elements and frequency"
+                    f"{owner} takes arrays of at least 2 elements, got {len(receiver.array)} of {receiver.name}; set "
+                    "elements and frequency of the data"
                 )
         self.scene = scene
         is_cosine = all(receiver.array.pattern == "cosine" for receiver in scene.receivers)
         self.zone = 0.0 if is_cosine else -math.pi / 2, math.pi / 2
-        # 16 rows, and columns in proportion, show the label's extremes: 6 degrees apart in a hemisphere, a quarter of
-        # what 16 elements resolve.
+        # 16 rows, 6 degrees apart in a hemisphere, show the label's extremes: 16 elements resolve a quarter of that.
         step = max(1, task.directions.shape[0] // 16)
         self.coarse = task.directions.thin(slice(None, None, step), slice(None, None, step))
         self._kept: dict[tuple, Tensor] = {}
@@ -71,7 +61,7 @@ class Beamformer:
         Args:
             lags: Mean covariance of the pairs of elements at each of ``array.lags``.
             query: The link of each row; all to one receiver.
-            directions: Directions asked for; None for all of the task's.
+            directions: Wanted directions; None: the task's.
         """
         own = self.scene.task.directions
         asked = own if directions is None else directions
@@ -80,7 +70,8 @@ class Beamformer:
         # Relative to the power, so that no scale of the fields overflows; silence has no spectrum, and 0 stands for it.
         relative = lags[:, half:] / torch.where(power < FAINTEST, 1, power)[:, None]
         parts = torch.cat((relative.real, relative.imag), 1)
-        is_whole = _are_same(asked, own)
+        pairs = (asked.elevations, own.elevations), (asked.azimuths, own.azimuths)
+        is_whole = asked is own or (asked.shape == own.shape and all(torch.equal(a, b.to(a)) for a, b in pairs))
         spectra, order = [parts.new_zeros(0, math.prod(asked.shape))], [torch.zeros(0).long().to(parts.device)]
         for carrier, links in self.by_carrier(query):
             amplitudes = self._look(parts[links], carrier, query, asked)
@@ -109,7 +100,7 @@ class Beamformer:
     def _look(self, parts: Tensor, carrier: float, query: Query, directions: Directions) -> Tensor:
         """Amplitudes of the beamformer in some directions (b, k)."""
         key, basis = None, None
-        if isinstance(directions, Grid):  # training thins one grid in a few ways, time and again; rays hardly come back
+        if isinstance(directions, Grid):  # training thins one grid in a few ways; rays hardly come back
             axes = (axis.cpu().numpy().tobytes() for axis in (directions.elevations, directions.azimuths))
             key = int(query.receivers[0]), carrier, parts.dtype, parts.device, *axes
             basis = self._kept.get(key)
@@ -122,9 +113,7 @@ class Beamformer:
                     self._kept.clear()
                 self._kept[key] = basis
         power = parts @ basis
-        # Of the mean power over all pixels: sums of tens of float32 terms round at this, and below it the slope of the
-        # root has no bound.
-        least = 1e-6
+        least = 1e-6  # of the mean power: sums of tens of float32 terms round at this
         return power.clamp_min(least).sqrt() if torch.is_grad_enabled() else power.clamp_min_(least).sqrt_()
 
     def _basis(self, carrier: float, query: Query, directions: Directions) -> Float[Tensor, "m k"]:
@@ -137,10 +126,3 @@ class Beamformer:
         vectors = directions.to(steps).flatten().vectors()
         phases = 2 * math.pi * carrier / speed_of_light * (steps[half:] @ vectors.T)
         return torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None]))
-
-
-def _are_same(asked: Directions, own: Directions) -> bool:
-    if asked is own:
-        return True
-    pairs = (asked.elevations, own.elevations), (asked.azimuths, own.azimuths)
-    return asked.shape == own.shape and all(torch.equal(a, b.to(a)) for a, b in pairs)

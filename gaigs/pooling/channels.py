@@ -3,6 +3,7 @@
 import math
 
 import torch
+from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.pooling import Pooling
@@ -13,22 +14,20 @@ from gaigs.scene import Scene, check_elements, direct_waves
 class ChannelPooling(Pooling):
     """Fits the level and the phase convention of the training channels.
 
-    The sign of phases is -1 as for the time dependence exp(+j omega t), or +1. Where phases follow the distance with
-    neither sign, as without a common clock, ``array_sign`` is how they differ between the elements and subcarriers of a
-    link.
-
     Args:
         scene: Its task has the subcarriers, its receivers the elements.
         name: Registered name, for errors.
 
     Attributes:
         strength: Amplitude of the channels relative to free space.
-        sign: Sign with which phases follow the direct distance; 0 for neither.
-        array_sign: Sign between elements and subcarriers, -1 or 1.
-
-    Raises:
-        ValueError: The labels are no channels, or an array has another number of elements than they.
+        sign: Sign with which phases follow the direct distance, -1 for the time dependence exp(+j omega t) or 1; 0 for
+            neither, as without a common clock.
+        array_sign: Sign between the elements and subcarriers of a link, -1 or 1.
     """
+
+    strength: Tensor
+    sign: Tensor
+    array_sign: Tensor
 
     def __init__(self, scene: Scene, name: str):
         super().__init__()
@@ -42,7 +41,6 @@ class ChannelPooling(Pooling):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Takes strength and signs from the training channels."""
         train = links.split.train
         labels, query = links.labels[train].to(torch.complex128), links.query[train]
         waves = direct_waves(self.scene, query, self.scene.task.frequencies)

@@ -22,15 +22,10 @@ class ElementSum(ChannelPooling):
 
     m_f is the map at subcarrier f, complex: its real parts are the map's channels before all imaginary ones. x_e is an
     element's place, a its pattern, w the share of the direction's solid angle. F is the wave of free space over the
-    direct distance d, and g the channels' ``strength`` over it: the map is relative to both, so that a direct path is
-    the same in it from everywhere. s is ``array_sign``. Without a common clock F is its amplitude alone.
+    direct distance d (without a common clock its amplitude), g the channels' ``strength`` over it. s is ``array_sign``.
 
     Args:
-        scene: Its task has the subcarriers, its receivers the elements.
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
-
-    Raises:
-        ValueError: The labels are no channels, or an array has another number of elements than they.
     """
 
     def __init__(self, scene: Scene, grid: Sequence[int] = (8, 16)):
@@ -46,7 +41,6 @@ class ElementSum(ChannelPooling):
             return torch.zeros(0, *self.scene.task.shape, dtype=image.dtype.to_complex(), device=image.device)
         waves = torch.complex(*image.flatten(2).unflatten(1, (2, -1)).unbind(1))
         steering = self._steering(int(query.receivers[0]), int(self.array_sign)).to(waves)
-        # One product of matrices a subcarrier; a link's row is its map.
         channels = (waves.permute(1, 0, 2) @ steering).permute(1, 2, 0)
         frequencies = self.scene.task.frequencies
         direct = direct_waves(self.scene, query, frequencies, int(self.sign), at_elements=False)

@@ -23,10 +23,9 @@ class MeanPower(Pooling):
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
         channels: 1 (real) or 2 (complex).
         floor_db: Power of the noise relative to the model's trend, between -300 and 0 [dB].
-
-    Raises:
-        ValueError: An option is out of range.
     """
+
+    weights: Tensor
 
     def __init__(self, grid: Sequence[int] = (4, 8), channels: int = 2, floor_db: float = -60.0):
         super().__init__()
@@ -40,16 +39,9 @@ class MeanPower(Pooling):
     def forward(
         self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
     ) -> Float[Tensor, " b"]:
-        """Level relative to the model's trend [dB]; float32 where the map is of half precision.
-
-        Raises:
-            ValueError: The map is not of the grid's size.
-        """
+        """Level relative to the model's trend [dB]; float32 where the map is of half precision."""
         if image.shape[2:] != self.weights.shape:
-            raise ValueError(
-                f"pooling 'mean_power' was built for maps of {tuple(self.weights.shape)} pixels, got "
-                f"{tuple(image.shape[2:])}; build it with the map's own grid"
-            )
+            raise ValueError(f"maps must have {tuple(self.weights.shape)} pixels, got {tuple(image.shape[2:])}")
         image = image.to(torch.promote_types(image.dtype, torch.float32))
         # Scaled by the largest, squares neither overflow nor underflow.
         largest = image.detach().abs().amax((1, 2, 3)).clamp(min=self.floor)
@@ -58,11 +50,7 @@ class MeanPower(Pooling):
 
 
 def noise_amplitude(floor_db: float) -> float:
-    """Amplitude of a receiver's noise from its level [dB].
-
-    Raises:
-        ValueError: The level is not between -300 and 0 dB.
-    """
+    """Amplitude of a receiver's noise from its level [dB]."""
     if not -300 <= floor_db <= 0:
         raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
     return 10 ** (floor_db / 20)

@@ -16,14 +16,7 @@ from gaigs.scene import Scene, direct_waves
 
 @register("pooling", "path_csi")
 class PathCsi(ChannelPooling, PathPooling):
-    """h(e, f) = g lambda / (4 pi) y(e, f), with y the field of the paths over the unit of 1 / distance.
-
-    Args:
-        scene: Its task has the subcarriers, its receivers the elements.
-
-    Raises:
-        ValueError: The labels are no channels, or an array has another number of elements than they.
-    """
+    """h(e, f) = g lambda / (4 pi) y(e, f), with y the field of the paths over the unit of 1 / distance."""
 
     def __init__(self, scene: Scene):
         super().__init__(scene, "path_csi")

@@ -13,14 +13,7 @@ from gaigs.scene import Scene
 
 @register("pooling", "path_spectrum")
 class PathSpectrum(LagPooling):
-    """Beamforming with the covariance of the array's elements.
-
-    Args:
-        scene: Its task has the directions and the normalisation, its receivers planar arrays.
-
-    Raises:
-        ValueError: As of ``Beamformer`` and ``LagPooling``.
-    """
+    """Beamforming with the covariance of the array's elements."""
 
     def __init__(self, scene: Scene):
         super().__init__(scene)

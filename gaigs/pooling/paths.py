@@ -1,4 +1,4 @@
-"""Propagation paths as the elements of an array hear them, summed in closed form without a map."""
+"""Sums of propagation paths at the elements of an array, in closed form and without a map."""
 
 import math
 from abc import abstractmethod
@@ -56,17 +56,14 @@ class PathPooling(Pooling):
 
     @abstractmethod
     def read(self, received: Complex[Tensor, "b ..."], query: Query, directions: Directions | None = None) -> Tensor:
-        """The label from what ``sum_paths`` gives; arguments as for ``forward``."""
+        """The label from the result of ``sum_paths``; arguments as for ``forward``."""
 
 
 class LagPooling(PathPooling):
     """Base of poolings that read the covariance of the array's elements, in which powers add.
 
     Args:
-        scene: Its receivers have planar arrays.
-
-    Raises:
-        ValueError: An array is not planar.
+        scene: Its receivers have planar arrays; others raise a ``ValueError``.
     """
 
     def __init__(self, scene: Scene):
@@ -75,17 +72,12 @@ class LagPooling(PathPooling):
             height = receiver.array.elements[:, 2].abs().max()
             if height > 1e-6:  # [m]; float32 places metres no better
                 raise ValueError(
-                    f"a pooling of path powers takes planar arrays, got elements up to z = {height:.3g} m in "
-                    f"{receiver.name}\ntake projection=mercator rasterizer=fastest and a pooling of maps, such as "
-                    "array_response"
+                    f"a pooling of path powers takes planar arrays, got z up to {height:.3g} m in {receiver.name}\n"
+                    "take projection=mercator rasterizer=fastest and a pooling of maps, such as array_response"
                 )
 
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b l"]:
-        """Covariance of the elements at each of ``array.lags``.
-
-        In direction cosines a path is at least as wide as a pixel of a map of 24 x 48. A path on the receiver has no
-        direction and is left out.
-        """
+        """Covariance of the elements at each of ``array.lags``; a path is at least as wide as a pixel of 24 x 48."""
         plane = DirectionCosine(Grid.sphere(24, 48).pitch)
         splats = plane.project(paths.means, paths.semi_axes, paths.receiver.pose)
         own = paths.amplitudes, paths.lengths, paths.coherences, paths.bandwidth
@@ -110,13 +102,7 @@ class LagPooling(PathPooling):
         Two paths interfere by the product of their coherences, and over a band by sinc(bandwidth (t - t')), with t
         their delays: the mean over the band of cos(2 pi f (t - t')).
 
-        Args:
-            splats: The paths in direction cosines: directions u and covariances S, one set a query. A path that is not
-                visible is left out.
-            amplitudes, lengths, coherences, bandwidth, carriers: As of ``ReceivedPaths``.
-            array: Planar.
-
-        Source: as ``element_fields``.
+        ``splats`` are the paths in direction cosines: directions u and covariances S; only visible ones count.
         """
         amplitudes, directions = torch.where(splats.visible, amplitudes, 0), splats.means2d
         steps, pairs, counts = (part.to(amplitudes.device) for part in array.lags)
@@ -130,7 +116,7 @@ class LagPooling(PathPooling):
         real, imaginary = ((powers[..., None] * narrow * part).sum(1) for part in (angles.cos(), angles.sin()))
         later = torch.complex(real, imaginary)
         found = torch.cat((later[:, 1:].conj().flip(1), later), 1)
-        sure = coherences.nonzero()[:, 0]  # pairs of the others have no phase: they cost nothing
+        sure = coherences.nonzero()[:, 0]  # the others have no phase
         if not len(sure):
             return found
         waves = (amplitudes * coherences)[:, sure]
@@ -159,15 +145,12 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
 
     with p the Gaussian's centre and S its covariance in direction cosines.
 
-    Args:
-        paths: To one receiver.
-        offsets: Frequencies over the carrier [Hz].
+    ``offsets`` are frequencies over the carrier [Hz].
 
     Source: ours; the Fourier transform of a Gaussian, and Van Trees, Optimum Array Processing, 2002, section 2.2.
     """
     amplitudes, lengths, pose = paths.amplitudes, paths.lengths, paths.receiver.pose.to(paths.means)
     points, semi_axes = pose.local(paths.means), pose.rotation.mT @ paths.semi_axes
-    # Distances below NEAREST count as that: of the amplitudes they are the unit.
     elements, exact = paths.receiver.array.elements.to(points), points.norm(dim=-1, keepdim=True)
     # Plain differences: by the matrix product an element far from a near point would lose its digits.
     own = torch.cdist(points, elements, compute_mode="donot_use_mm_for_euclid_dist")
@@ -205,7 +188,7 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
 def _footprints(
     splats: Splats, steps: Float[Tensor, "k 2"], wavelengths: Float[Tensor, "b 1 1"]
 ) -> Float[Tensor, "b n k"]:
-    """exp(-(2 pi)² D' S D / 2) of each path and step D [m]."""
+    """exp(-(2 pi)² D' S D / 2) for each path and step D [m]."""
     squares = (steps[:, :, None] * steps[:, None]).flatten(1)
     covariances = splats.covariances2d.expand(len(wavelengths), -1, -1, -1).flatten(2)
     return ((-0.5 * (2 * math.pi / wavelengths) ** 2) * (covariances @ squares.T)).exp()

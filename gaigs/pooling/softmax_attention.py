@@ -27,31 +27,28 @@ class SoftmaxAttention(Pooling):
         prior: Share of the uniform weights, between 0 and 1; with 1 the average is the plain mean.
         learn: Train both, as the temperature's logarithm and the prior's logit, which keeps them in their ranges.
 
-    Raises:
-        ValueError: An option is out of range, or a prior of 0 or 1 is to be learnt, whose logit is infinite.
-
     Source: GAI-GS, section "Mapping, Projection and Render Module".
     """
 
     channels = 1
+    log_temperature: Tensor
+    prior_logit: Tensor
 
     def __init__(
         self, grid: Sequence[int] = (4, 8), temperature: float = 0.434, prior: float = 0.1, learn: bool = False
     ):
         super().__init__()
         if not 1e-6 <= temperature <= 1e6:
-            raise ValueError(
-                f"pooling option temperature must lie between 1e-6 and 1e6 bels, got {temperature}; "
-                "maximum and mean are nearer than these"
-            )
+            raise ValueError(f"pooling option temperature must lie between 1e-6 and 1e6 bels, got {temperature}")
         if not 0 <= prior <= 1:
             raise ValueError(f"pooling option prior must lie between 0 and 1, got {prior}")
         if learn and prior in (0, 1):
-            raise ValueError(f"a prior that is learnt must start between 0 and 1, got {prior}; e.g. 0.1")
+            raise ValueError(f"a learnt prior must start between 0 and 1, got {prior}; e.g. 0.1")
         self.grid = sphere("pooling.grid", grid)
-        options = {"log_temperature": torch.tensor(math.log(temperature))}
-        options["prior_logit"] = torch.tensor(float(prior)).logit()
-        for name, value in options.items():
+        for name, value in (
+            ("log_temperature", torch.tensor(math.log(temperature))),
+            ("prior_logit", torch.tensor(float(prior)).logit()),
+        ):
             if learn:
                 self.register_parameter(name, nn.Parameter(value))
             else:

@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,8 +14,7 @@ from gaigs.geometry import Directions, Grid, Pose, semi_axes
 from gaigs.registry import is_built, name_of, registry
 
 NEAR = 1e-6
-"""A Gaussian nearer to the receiver than this sits on it [m]. Float32 resolves no direction between positions so close
-together, and down to here the determinant of a footprint is finite."""
+"""Distance below which float32 resolves no direction, and the determinant of a footprint may overflow [m]."""
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class Splats:
     """Gaussians on the perception plane of one receiver.
 
     Attributes:
-        means2d: Centres (n, 2) as (u, v); (b, n, 2) where they differ from query to query, as those of paths.
+        means2d: Centres (u, v), (n, 2), or (b, n, 2) where they differ from query to query.
         factors: p, q and r of the lower triangular factor [[p, 0], [q, r]] of each covariance, p and r above 0
-            (1 or b, n, 3); one for all transmitters where nothing deforms the Gaussians.
-        depths: Distance to the receiver, as many as centres [m].
-        visible: False where a Gaussian has no direction (it sits on the receiver), as many as centres.
+            (1 or b, n, 3).
+        depths: Distances to the receiver [m].
+        visible: False where a Gaussian sits on the receiver and so has no direction.
     """
 
     means2d: Float[Tensor, "*b n 2"]
@@ -36,19 +36,19 @@ class Splats:
 
     @property
     def covariances2d(self) -> Float[Tensor, "b n 2 2"]:
-        """The factor times its transpose, with fewer digits for long and thin splats."""
+        """The factor times its transpose, less exact for long and thin splats."""
         p, q, r = self.factors.unbind(-1)
         return torch.stack((p * p, p * q, p * q, q * q + r * r), -1).unflatten(-1, (2, 2))
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Where the label's pixel centres lie on the perception plane.
+    """The label's pixel centres on the perception plane.
 
     Attributes:
         u: (1, columns), or (rows, columns) where the projection mixes azimuth and elevation.
         v: (rows, 1), or (rows, columns).
-        period: u repeats after this; a splat then acts at the nearest of its images. None: no wrap.
+        period: u repeats after this; a splat acts at the nearest of its images. None: no wrap.
     """
 
     u: Float[Tensor, "r columns"]
@@ -61,11 +61,11 @@ class Plane:
 
 
 class Projection(ABC):
-    """The contract of kind ``projection``, and what all projections share.
+    """The contract of kind ``projection``.
 
-    A projection is a smooth map from directions to the plane, ``coordinates``; a Gaussian's footprint there is that of
-    the map's linearisation at its centre, ``jacobian`` (EWA splatting). To it comes the variance of a square pixel,
-    so that a splat narrower than a pixel is not lost between two pixel centres; docs/methods.md says where that fails.
+    A projection is a smooth map from directions to the plane, ``coordinates``. A Gaussian's footprint there is that of
+    the map's linearisation at its centre, ``jacobian`` (EWA splatting), plus the variance of a square pixel: a splat
+    narrower than a pixel is not lost between two pixel centres. docs/methods.md has the limits.
 
     Args:
         pixel: Edge of that pixel, the pitch of the label's grid [rad].
@@ -95,12 +95,9 @@ class Projection(ABC):
         """u repeats after this; None: it does not."""
 
     def check_sees(self, directions: Directions) -> None:
-        """Raises a ``ValueError`` where directions below the array's plane would fall on those above."""
+        """Raises a ``ValueError`` if directions below the array's plane would fall on those above."""
         if not self.sees_below and directions.elevations.min() < 0:
-            raise ValueError(
-                f"the grid reaches below the array's plane, which {name_of(self)} folds onto the half above; take "
-                "mercator or equirectangular"
-            )
+            raise ValueError(f"the grid reaches below the array's plane, which {name_of(self)} folds up; take mercator")
 
     def plane(self, directions: Directions) -> Plane:
         """Plane coordinates of a label's pixel centres; a list of rays becomes a single row."""
@@ -114,7 +111,7 @@ class Projection(ABC):
         Args:
             means: Centres, world frame [m]; one set, or one a transmitter.
             semi_axes: A column for each axis, world frame [m]; one set (b = 1), or one a transmitter.
-            receiver: Position [m] and orientation of the antenna array.
+            receiver: Pose of the antenna array.
         """
         receiver = receiver.to(means)
         points = receiver.local(means)
@@ -127,11 +124,11 @@ class Projection(ABC):
 
 
 def project(
-    means: Float[Tensor, "*b n 3"],
-    quats: Float[Tensor, "*b n 4"],
-    scales: Float[Tensor, "*b n 3"],
+    means: Float[Tensor, "*#b n 3"],
+    quats: Float[Tensor, "*#b n 4"],
+    scales: Float[Tensor, "*#b n 3"],
     *,
-    receiver: Pose,
+    receiver: Any,
     grid: Directions,
     projection: str | Mapping | Projection = "mercator",
     pixel: float | None = None,
@@ -142,18 +139,15 @@ def project(
         means: Centres, world frame (n, 3) [m].
         quats: Orientations, the columns of whose rotation matrices are the Gaussians' axes in the world frame (n, 4).
         scales: Standard deviations along these axes (n, 3) [m].
-        receiver: A ``gaigs.Pose``, or a ``gaigs.Receiver``, whose pose counts.
-        grid: Directions of the pixels in the receiver's frame [rad], ``gaigs.Grid`` or ``gaigs.Rays``.
+        receiver: A ``gaigs.Pose``, or a ``gaigs.Receiver`` with one.
+        grid: Directions of the pixels in the receiver's frame [rad].
         projection: Name, configuration or object.
-        pixel: Edge of the pixel by whose variance footprints are widened [rad]; None is the grid's pitch, which rays
-            have none of. Ignored where the projection is an object.
+        pixel: Edge of the pixel by whose variance footprints are widened [rad]. None: the pitch of a ``gaigs.Grid``.
+            Ignored where the projection is an object.
 
     Returns:
-        The splats, and where the pixels lie on the plane; differentiable in means, quaternions and scales. Each input
-        may have a leading axis b of transmitters.
-
-    Raises:
-        ValueError: A shape does not fit, or there is no such projection.
+        The splats, and the pixels on the plane; differentiable in means, quaternions and scales. Each input may have a
+        leading axis b of transmitters.
 
     Example:
         >>> from gaigs.projection import project
@@ -163,20 +157,16 @@ def project(
         >>> splats.means2d.shape, splats.covariances2d.shape, plane.shape  # (azimuth, stretched elevation)
         (torch.Size([1, 2]), torch.Size([1, 1, 2, 2]), (90, 360))
     """
+    n = means.shape[-2]
     for name, values, size in (("means", means, 3), ("quats", quats, 4), ("scales", scales, 3)):
-        if values.ndim not in (2, 3) or values.shape[-1] != size or values.shape[-2] != means.shape[-2]:
-            raise ValueError(
-                f"{name} must be (n, {size}) or (b, n, {size}) with the n of means, got {tuple(values.shape)} beside "
-                f"{tuple(means.shape)}"
-            )
+        if values.ndim not in (2, 3) or values.shape[-2:] != (n, size):
+            raise ValueError(f"{name} must be ({n}, {size}) or (b, {n}, {size}), got {tuple(values.shape)}")
     if pixel is None and isinstance(grid, Grid):
         pixel = grid.pitch or grid.thin(slice(1), slice(None)).azimuths.diff().abs().sum().item() / grid.shape[1]
     if not is_built(projection) and not pixel:
         raise ValueError("pixel must be given for rays and for a single pixel, in rad: e.g. gaigs.Grid.degrees().pitch")
-    if not len(grid.elevations) or not len(grid.azimuths):
-        raise ValueError("the grid must have directions, got none")
-    if (most := grid.elevations.abs().max().item()) > math.pi / 2 + 1e-4:
-        raise ValueError(f"elevations must lie within 1.5708 rad, got {most:g}; gaigs.Grid.degrees takes degrees")
+    if not (grid.elevations.abs() <= math.pi / 2 + 1e-4).all():
+        raise ValueError("elevations must lie within 1.5708 rad; gaigs.Grid.degrees takes degrees")
     chosen = registry("projection").build(projection, pixel=pixel)
     grid = grid.to(means)
     chosen.check_sees(grid)
@@ -192,10 +182,6 @@ def factor(
 
     With e = across / p: q = e . along and r² = variance + |e x along|² + variance |along|² / p². Roots are of sums of
     squares alone, so no digit is lost to a difference, however long and thin the ellipse is.
-
-    Args:
-        across, along: Footprints of the semi-axes in u and v, k = 3.
-        variance: Added to both variances of the ellipse, above 0.
     """
     p = (across.square().sum(-1) + variance).sqrt()
     unit = across / p[..., None]

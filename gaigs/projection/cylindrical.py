@@ -14,12 +14,9 @@ class Cylindrical(Projection):
     """u = azimuth, with period 2 pi, and v = f(elevation).
 
     Args:
-        pixel: See ``Projection`` [rad].
+        pixel: As of ``Projection`` [rad].
         limit_deg: Elevations are clamped to this absolute value [deg], in (0, 90): towards the pole the azimuth of a
-            small step diverges as 1 / cos(elevation), and beyond the limit a Gaussian is as wide as at it.
-
-    Raises:
-        ValueError: An option is out of range.
+            small step diverges as 1 / cos(elevation).
     """
 
     period = 2 * math.pi
@@ -44,7 +41,7 @@ class Cylindrical(Projection):
         clamped = elevations.clamp(-self.limit, self.limit)
         _, slope = self.stretch(clamped)
         sin, cos = torch.sin(azimuths), torch.cos(azimuths)
-        # Where azimuth grows and where elevation grows, unit vectors; how fast, per metre.
+        # Unit vectors of growing azimuth and of growing elevation, and their rates per metre.
         east = torch.stack((-sin, cos, torch.zeros_like(sin)), -1)
         height, horizontal = torch.sin(elevations), torch.cos(elevations)
         north = torch.stack((-height * cos, -height * sin, horizontal), -1)
@@ -52,7 +49,7 @@ class Cylindrical(Projection):
         return rates[..., None] * torch.stack((east, north), -2)
 
     def plane(self, directions: Directions) -> Plane:
-        """Plane coordinates; of a grid's columns and rows apart, as they are separable."""
+        """Plane coordinates; u and v of a grid are separable."""
         v, _ = self.stretch(directions.elevations.clamp(-self.limit, self.limit))
         rows = v[:, None] if isinstance(directions, Grid) else v[None]
         return Plane(directions.azimuths[None], rows, self.period)

@@ -12,13 +12,10 @@ from gaigs.registry import register
 class DirectionCosine(Projection):
     """(u, v) = (l, m) = (cos(el) cos(az), cos(el) sin(az)), in which a planar array's response is shift-invariant.
 
-    No seam and no pole: smooth on the whole hemisphere. As a planar array does, it cannot tell a direction below the
-    array's plane from its mirror image above. Rows and columns of a spectrum mix, so ``plane`` gives full grids.
+    No seam and no pole: smooth on the whole hemisphere. As with a planar array, a direction below the array's plane
+    and its mirror image above are one. Rows and columns of a spectrum mix, so ``plane`` gives full grids.
 
-    Args:
-        pixel: Edge of the pixel whose variance a splat is widened by [rad].
-
-    Source: any text on planar arrays, e.g. Van Trees, Optimum Array Processing, chapter 4.
+    Source: Van Trees, Optimum Array Processing, 2002, chapter 4.
     """
 
     sees_below = False

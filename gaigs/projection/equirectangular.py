@@ -9,12 +9,7 @@ from gaigs.registry import register
 
 @register("projection", "equirectangular")
 class Equirectangular(Cylindrical):
-    """u = azimuth, v = elevation.
-
-    Args:
-        pixel: Edge of the pixel whose variance a splat is widened by [rad].
-        limit_deg: Elevations are clamped to this absolute value [deg].
-    """
+    """u = azimuth, v = elevation; options as for ``Cylindrical``."""
 
     def __init__(self, pixel: float, limit_deg: float = 89.5):
         super().__init__(pixel, limit_deg)

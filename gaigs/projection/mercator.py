@@ -17,9 +17,7 @@ class Mercator(Cylindrical):
     default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection conformal: a small round Gaussian
     stays round wherever it lies.
 
-    Args:
-        pixel: Edge of the pixel whose variance a splat is widened by [rad].
-        limit_deg: Elevations are clamped to this absolute value [deg].
+    Options are those of ``Cylindrical``.
 
     Source: GAI-GS, "Projection and Render Module".
     """

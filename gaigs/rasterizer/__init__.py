@@ -1,48 +1,41 @@
 """Rasterizers composite splats front to back into a map over directions."""
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor, cat
 
-from gaigs.geometry import Directions, Pose, Rays
+from gaigs.geometry import Directions, Rays
 from gaigs.projection import Plane, Projection, Splats, project
 from gaigs.registry import registry
 
 ALPHA_MIN = 1 / 255
-"""A splat acts on a pixel where its opacity a G is at least this, the field's customary bound (one grey level)."""
+"""A splat acts on a pixel where its opacity a G is at least this, the customary bound (one grey level)."""
 
 ALPHA_MAX = 0.99
-"""Largest opacity a G of one splat at a pixel, the field's customary bound: log(1 - a G) stays finite, and dividing by
-(1 - a G) in a gradient costs two of float32's seven digits at the most."""
-
+"""Largest opacity a G of one splat at a pixel, the customary bound: log(1 - a G) stays finite."""
 
 OPAQUE = -(2.0**18)
-"""The logarithm of an attenuation of 0: wherever a footprint acts, G times this is as good as minus infinity in float64
-too, and products with it stay finite."""
+"""The logarithm of an attenuation of 0: G times this is in effect minus infinity, and its products stay finite."""
 
 STEEPEST = 1e-30
-"""Attenuation below which the gradient is that at this value, as its own would overflow float32."""
+"""Below this attenuation the gradient is that at this value, as its own would overflow float32."""
 
 
 @runtime_checkable
 class Rasterizer(Protocol):
     """The contract of kind ``rasterizer``.
 
-    Front to back by ``depths`` (ties by index), with a_i the effective opacity in [0, 1], d_i the attenuation in
-    [0, 1], G_i the footprint exp(-x' C^-1 x / 2) at the pixel, A_i = min(a_i G_i, ALPHA_MAX) where that is at least
-    ALPHA_MIN (elsewhere splat i does nothing at this pixel):
+    Front to back by ``depths`` (ties by index), with a_i the opacity and d_i the attenuation in [0, 1], G_i the
+    footprint exp(-x' C^-1 x / 2) at the pixel, A_i = min(a_i G_i, ALPHA_MAX), or 0 below ALPHA_MIN:
 
         map = sum_i signal_i A_i T_i        T_i = prod_{j<i} (1 - A_j) d_j^{G_j}
 
     x is the pixel minus the splat's centre, u taken to the nearest image where the plane is periodic. Splats that are
-    not ``visible`` do nothing. Every input but depths is differentiable: means2d, factors, signal, opacities,
-    attenuations. A signal may have any number of channels.
+    not ``visible`` do nothing. Every input but depths and visible is differentiable.
 
-    Attributes:
-        used: Rasterizer of the last map, for a run's metrics: the name, and the device where there is a choice. None
-            before the first map where it depends on the map.
+    ``used`` names the rasterizer of the last map, and its device where there is a choice, for a run's metrics.
 
     Source: GAI-GS, "Mapping, Projection and Render Module"; the area over which d_j acts is ours (docs/methods.md).
     """
@@ -62,19 +55,19 @@ class Rasterizer(Protocol):
 
 
 def rasterize(
-    means: Float[Tensor, "*b n 3"],
-    quats: Float[Tensor, "*b n 4"],
-    scales: Float[Tensor, "*b n 3"],
-    opacities: Float[Tensor, "*b n"],
-    signal: Float[Tensor, "*b n c"],
-    attenuations: Float[Tensor, "*b n"] | None = None,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    signal: Tensor,
+    attenuations: Tensor | None = None,
     *,
-    receiver: Pose,
+    receiver: Any,
     grid: Directions,
     projection: str | Mapping | Projection = "mercator",
     rasterizer: str | Mapping | Rasterizer = "fastest",
     pixel: float | None = None,
-) -> tuple[Float[Tensor, "*b c rows columns"], Float[Tensor, "*b rows columns"]]:
+) -> tuple[Tensor, Tensor]:
     """The map that Gaussians make at a receiver. Quaternions are (w, x, y, z) of any length, in the world frame.
 
     Gaussians are composited front to back by their distance to the receiver; ``Rasterizer`` has the equation.
@@ -85,20 +78,14 @@ def rasterize(
         scales: Standard deviations along these axes (n, 3) [m].
         opacities: In [0, 1] (n,).
         signal: Of each Gaussian, any number of real channels (n, c); a complex channel is two, real and imaginary part.
-        attenuations: Share of the field from behind that each lets through, in [0, 1] (n,); None for all of it.
-        receiver: A ``gaigs.Pose``, or a ``gaigs.Receiver``, whose pose counts.
-        grid: Directions of the pixels in the receiver's frame [rad]: ``gaigs.Grid``, or ``gaigs.Rays``.
-        projection, rasterizer: Names, configurations or objects.
-        pixel: Edge of the pixel by whose variance footprints are widened [rad]; None is the grid's pitch, which rays
-            have none of.
+        attenuations: Share of the field from behind that each lets through, in [0, 1] (n,). None: 1.
+        receiver, grid, projection, pixel: As for ``gaigs.projection.project``.
+        rasterizer: Name, configuration or object.
 
     Returns:
         The map (c, rows, columns), and the share that passes all Gaussians (rows, columns); of k rays (c, k) and (k,).
         Where an input has a leading axis b of transmitters, both have it. Differentiable in all tensors. ``opencl`` and
         ``torch`` agree to 2e-6 of the map's maximum in float32.
-
-    Raises:
-        ValueError: Shapes or dtypes do not fit, or a name is unknown.
 
     Source: GAI-GS, "Projection and Render Module"; Zwicker et al., EWA Splatting, 2002.
 
@@ -116,29 +103,29 @@ def rasterize(
         >>> means.grad.shape
         torch.Size([2, 3])
     """
-    given = means, quats, scales, opacities, signal, *([] if attenuations is None else [attenuations])
-    if not all(isinstance(values, Tensor) for values in given):
-        raise TypeError("means, quats, scales, opacities, signal and attenuations must be torch tensors")
-    n = means.shape[-2] if means.ndim > 1 else 0
-    inputs = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "scales": (scales, (n, 3))}
-    inputs |= {"opacities": (opacities, (n,)), "signal": (signal, (n, *signal.shape[-1:]))}
-    inputs |= {} if attenuations is None else {"attenuations": (attenuations, (n,))}
+    n, c = opacities.shape[-1], signal.shape[-1]
+    inputs = {
+        "means": (means, (n, 3)),
+        "quats": (quats, (n, 4)),
+        "scales": (scales, (n, 3)),
+        "signal": (signal, (n, c)),
+    }
+    rest = {"opacities": opacities} | ({} if attenuations is None else {"attenuations": attenuations})
+    inputs |= {name: (values[..., None], (n, 1)) for name, values in rest.items()}
     sizes = {1}
     for name, (values, shape) in inputs.items():
-        extra = values.ndim - len(shape)
-        if extra not in (0, 1) or tuple(values.shape[extra:]) != shape:
-            raise ValueError(f"{name} must be {shape} or {('b', *shape)}, got {tuple(values.shape)}")
+        if values.ndim not in (2, 3) or tuple(values.shape[-2:]) != shape:
+            raise ValueError(f"{name} must have {n} rows of {shape[1]}, got {tuple(values.shape)}")
         if values.dtype != means.dtype or not values.is_floating_point():
             raise ValueError(f"{name} must be real numbers of means' {means.dtype}, got {values.dtype}")
-        sizes |= set(values.shape[:extra])
+        sizes |= set(values.shape[:-2])
     if len(sizes) > 2:
         raise ValueError(f"inputs must have one number of transmitters, got {', '.join(map(str, sorted(sizes - {1})))}")
     chosen = registry("rasterizer").build(rasterizer)
-    is_batch = any(values.ndim > len(shape) for values, shape in inputs.values())
+    is_batch = any(values.ndim == 3 for values, _ in inputs.values())
     b = max(sizes)
-    batched = lambda values, ndim: values.expand(b, *values.shape[-ndim:])
-    signal, opacities = batched(signal, 2), batched(opacities, 1)
-    attenuations = None if attenuations is None else batched(attenuations, 1)
+    signal, opacities = signal.expand(b, n, c), opacities.expand(b, n)
+    attenuations = None if attenuations is None else attenuations.expand(b, n)
     rows = [slice(k, k + 1) for k in range(b)] if means.ndim == 3 else [slice(None)]
     maps = []
     for row in rows:

@@ -5,26 +5,14 @@ import os
 
 import pyopencl as cl
 
-PROBE = "kernel void probe(global int *value) { value[0] = 1; }"
-"""A minimal program to build."""
-
 
 def devices() -> list[str]:
-    """The OpenCL devices of this machine, each as "platform: device (kind)".
-
-    Raises:
-        RuntimeError: There is no OpenCL driver, or it is broken.
-    """
+    """The OpenCL devices of this machine, each as "platform: device (kind)"; a ``RuntimeError`` without a driver."""
     return [name_of(device) for device in _devices()]
 
 
 def default_device() -> str:
-    """The default of ``devices``.
-
-    Raises:
-        RuntimeError: There is no OpenCL driver, or it is broken.
-        ValueError: No device has the name in GAIGS_OPENCL_DEVICE.
-    """
+    """The default of ``devices``."""
     return name_of(_choose(os.environ.get("GAIGS_OPENCL_DEVICE")))
 
 
@@ -52,16 +40,7 @@ def name_of(device: cl.Device) -> str:
 
 
 def open_queue(name: str | None) -> cl.CommandQueue:
-    """The queue of a device, made once.
-
-    Args:
-        name: Part of a name that ``devices`` lists; None takes what GAIGS_OPENCL_DEVICE says, and without it the first
-            CPU.
-
-    Raises:
-        RuntimeError: There is no OpenCL driver, or it is broken.
-        ValueError: No device has such a name.
-    """
+    """The queue of a device, made once; the name is as for ``OpenCLRasterizer``."""
     return _open(name or os.environ.get("GAIGS_OPENCL_DEVICE"))
 
 
@@ -72,13 +51,13 @@ def _open(name: str | None) -> cl.CommandQueue:
         return cl.CommandQueue(cl.Context([device]))
     except cl.Error as error:
         raise RuntimeError(
-            f"rasterizer 'opencl': {name_of(device)} cannot be opened ({error}); mend its driver, take another device "
-            "with GAIGS_OPENCL_DEVICE, or use rasterizer=torch"
+            f"rasterizer 'opencl': {name_of(device)} cannot be opened ({error})\n"
+            "choose another device with GAIGS_OPENCL_DEVICE, or use rasterizer=torch"
         ) from error
 
 
 def _choose(name: str | None) -> cl.Device:
-    """The first device whose name has such a part; without one the first CPU, or the first device of any kind."""
+    """The first device with this part of a name; for None the first CPU, or else the first device."""
     found = _devices()
     if name:
         chosen = [device for device in found if name.lower() in name_of(device).lower()]
@@ -92,19 +71,16 @@ def _choose(name: str | None) -> cl.Device:
 
 @functools.cache
 def find_fault(queue: cl.CommandQueue) -> str | None:
-    """Cause in the driver's words why a device cannot build kernels; None if it can.
-
-    A driver may list a processor that its compiler does not know.
-    """
+    """The driver's reason why a device, such as a processor unknown to its compiler, builds no kernels; or None."""
     try:
-        cl.Program(queue.context, PROBE).build()
+        cl.Program(queue.context, "kernel void probe(global int *value) { value[0] = 1; }").build()
     except cl.Error as error:
         return cause_of(error)
     return None
 
 
 def cause_of(error: cl.Error) -> str:
-    """The first error in the log of a build that failed, or else the log's last line."""
+    """The first error in a build's log, or else its last line."""
     lines = [line.strip() for line in str(error).splitlines()]
     lines = [line for line in lines if line and not line.startswith("(")]  # pyopencl's notes on options and source
     return next((line for line in lines if "error:" in line), lines[-1])

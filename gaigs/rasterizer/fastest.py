@@ -2,7 +2,6 @@
 
 import logging
 
-from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.projection import Plane, Splats
@@ -16,9 +15,6 @@ class FastestRasterizer:
     """``opencl`` for float32 on the CPU where a driver builds kernels, else ``torch``; the log says which.
 
     The two agree to 2e-6 of the image's maximum, so a checkpoint may be rendered by either.
-
-    Attributes:
-        used: Rasterizer of the last call, for a run's metrics; None before the first.
     """
 
     used: str | None = None
@@ -34,14 +30,8 @@ class FastestRasterizer:
             log.info("rasterizer: opencl for float32 on the CPU, torch for all else")
 
     def __call__(
-        self,
-        splats: Splats,
-        signal: Float[Tensor, "b n c"],
-        opacities: Float[Tensor, "b n"],
-        attenuations: Float[Tensor, "b n"] | None,
-        plane: Plane,
-    ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
-        """The map, and the transmittance left behind the last splat; see ``gaigs.rasterizer.Rasterizer``."""
+        self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
+    ) -> tuple[Tensor, Tensor]:
         arguments = splats, signal, opacities, attenuations, plane
         if self.opencl is not None and self.opencl.takes(*arguments):
             self.used = self.opencl.used

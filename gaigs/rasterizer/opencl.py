@@ -8,7 +8,6 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.tools
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.projection import Plane, Splats
@@ -37,24 +36,18 @@ class OpenCLRasterizer:
     """Tiles of 16 rows of 8 pixels, a work-item each, their rows in vector registers; the gradient is written by hand.
 
     Splats are sorted by depth once, and listed by the tiles that their ellipses reach: once for all transmitters where
-    these share covariances, which then share footprints too. On a CPU device tensors are handed over without a copy.
-    Signals of many channels come in chunks of ``CHANNELS``. Two runs give the same bits. Contract and formulas:
-    ``gaigs.rasterizer.Rasterizer``.
+    these share covariances, which then share footprints too. A CPU device reads tensors without a copy. Two runs give
+    the same bits.
 
     Args:
-        device: Part of a name that ``devices`` lists, e.g. "cpu" or "pocl"; None takes the environment variable
+        device: Part of a name that ``devices`` lists, e.g. "cpu" or "pocl". None: the environment variable
             GAIGS_OPENCL_DEVICE, and without it the first CPU, for which the kernels are made.
-
-    Raises:
-        RuntimeError: There is no OpenCL driver, or it is broken, or it does not know the processor.
-        ValueError: No device has such a name.
     """
 
     def __init__(self, device: str | None = None):
         self.device = device
         queue = open_queue(device)
-        fault = find_fault(queue)
-        if fault is not None:
+        if fault := find_fault(queue):
             raise RuntimeError(
                 f"rasterizer 'opencl': {name_of(queue.device)} cannot build kernels ({fault}); use rasterizer=torch, "
                 "or install a newer driver"
@@ -62,44 +55,23 @@ class OpenCLRasterizer:
 
     @property
     def used(self) -> str:
-        """Name and device, for a run's metrics."""
         return f"opencl on {name_of(open_queue(self.device).device)}"
 
     def takes(
-        self,
-        splats: Splats,
-        signal: Float[Tensor, "b n c"],
-        opacities: Float[Tensor, "b n"],
-        attenuations: Float[Tensor, "b n"] | None,
-        plane: Plane,
+        self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
     ) -> bool:
-        """True if dtypes, devices and counts suit; otherwise ``torch`` takes them."""
+        """True if dtypes, devices and counts suit."""
         floats = splats.means2d, splats.factors, splats.depths, signal, opacities, attenuations, plane.u, plane.v
         suits = (x is None or (x.dtype == torch.float32 and x.device.type == "cpu") for x in floats)
         return all(suits) and signal.shape[2] >= 1 and signal.shape[1] < SPLATS
 
     def __call__(
-        self,
-        splats: Splats,
-        signal: Float[Tensor, "b n c"],
-        opacities: Float[Tensor, "b n"],
-        attenuations: Float[Tensor, "b n"] | None,
-        plane: Plane,
-    ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
-        """The map, and the transmittance left behind the last splat; see ``gaigs.rasterizer.Rasterizer``.
-
-        Raises:
-            TypeError: A tensor is not float32 (``visible``: bool), or not on the CPU.
-            ValueError: Shapes do not fit together, there is no channel, or there are too many splats.
-            RuntimeError: The device cannot build the kernels.
-        """
+        self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
+    ) -> tuple[Tensor, Tensor]:
         _check(splats, signal, opacities, attenuations, plane)
-        call = functools.partial(
-            _CompositeByKernels.apply, open_queue(self.device), splats, plane, torch.is_grad_enabled()
-        )
-        # Autograd differentiates by arguments only; `_Render` finds the same tensors in the splats.
+        common = open_queue(self.device), splats, plane, torch.is_grad_enabled(), splats.means2d, splats.factors
         chunks = [
-            call(splats.means2d, splats.factors, part, opacities, attenuations) for part in signal.split(CHANNELS, 2)
+            _CompositeByKernels.apply(*common, part, opacities, attenuations) for part in signal.split(CHANNELS, 2)
         ]
         images, transmittances = zip(*chunks, strict=True)
         return torch.cat(images, 1) if len(images) > 1 else images[0], transmittances[0]
@@ -119,8 +91,8 @@ def _source() -> str:
 
 @functools.cache
 def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel]:
-    """The kernels of one shape family; PoCL keeps what it compiled on disk."""
-    # -w: a CPU without registers of the vectors' width is worth a warning to the compiler.
+    """The kernels of one shape family; PoCL caches the compiled program on disk."""
+    # -w: no warning about a CPU without registers of the vectors' width.
     options = ["-w", *(f"-D{macro}={value}" for macro, value in macros.items())]
     try:
         program = cl.Program(queue.context, _source()).build(options)
@@ -136,19 +108,18 @@ def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tens
     """Raises where tensors do not fit: kernels check nothing."""
     b, n, c = signal.shape
     height, width = plane.shape
-    tensors = {
+    tensors: dict[str, tuple[Tensor, list[tuple[int, ...]]]] = {
         "means2d": (splats.means2d, [(n, 2)]),
         "factors": (splats.factors, [(1, n, 3), (b, n, 3)]),
         "depths": (splats.depths, [(n,)]),
         "visible": (splats.visible, [(n,)]),
         "signal": (signal, [(b, n, c)]),
         "opacities": (opacities, [(b, n)]),
-        "attenuations": (attenuations, [(b, n)]),
         "plane.u": (plane.u, [(1, width), (height, width)]),
         "plane.v": (plane.v, [(height, 1), (height, width)]),
     }
-    if attenuations is None:
-        del tensors["attenuations"]
+    if attenuations is not None:
+        tensors["attenuations"] = attenuations, [(b, n)]
     for name, (tensor, shapes) in tensors.items():
         dtype = torch.bool if name == "visible" else torch.float32
         if tensor.dtype != dtype or tensor.device.type != "cpu":
@@ -159,13 +130,14 @@ def _check(splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tens
         if tuple(tensor.shape) not in shapes:
             allowed = " or ".join(map(str, shapes))
             raise ValueError(f"{name} must be {allowed} where signal is {(b, n, c)}, got {tuple(tensor.shape)}")
-    if c < 1:
-        raise ValueError(f"rasterizer 'opencl' takes at least 1 channel, got {c}; use rasterizer=torch")
-    if n >= SPLATS:
-        raise ValueError(f"rasterizer 'opencl' takes fewer than 2^24 splats, got {n}; use rasterizer=torch")
+    if c < 1 or n >= SPLATS:
+        allowed = "at least 1 channel and fewer than 2^24 splats"
+        raise ValueError(f"rasterizer 'opencl' takes {allowed}, got {c} and {n}; use rasterizer=torch")
 
 
 class _CompositeByKernels(torch.autograd.Function):
+    """Autograd differentiates by the arguments; ``_Render`` finds the same tensors in the splats."""
+
     @staticmethod
     def forward(ctx, queue, splats, plane, grad_enabled, means, factors, signal, opacities, attenuations):
         ctx.render = _Render(queue, splats, signal, opacities, attenuations, plane)
@@ -189,8 +161,8 @@ class _Sizes(ctypes.Structure):
 class _Render:
     """One call: splats in depth order, the tiles' lists of them, and the kernels over both.
 
-    Lists come in sets: one for all transmitters where covariances are shared, else one a transmitter. Transmitters come
-    in groups, which one work-item composites at once.
+    Lists come in sets: one for all transmitters where covariances are shared, else one a transmitter. A work-item
+    composites a group of transmitters at once.
     """
 
     def __init__(self, queue, splats, signal, opacities, attenuations, plane):
@@ -218,12 +190,13 @@ class _Render:
         self.kernels = _kernels(queue, **macros)
 
         order = self._share(_front_to_back(splats.depths))
-        u, v, spans, edges = _tiling(queue, *map(_freeze, (plane.u, plane.v)), plane.period)
+        coordinates = [(part.detach().numpy().tobytes(), tuple(part.shape)) for part in (plane.u, plane.v)]
+        u, v, spans, edges = _tiling(queue, *coordinates, plane.period)
         geometry = self._empty(sets * words * WORD * GEOMETRY)
         appearance = self._empty(words * WORD * b * appearance_size)
         hits = self._empty(sets * words * (across + down if separable else 2 * self.tiles))
-        inputs = splats.means2d, splats.factors, splats.visible, signal, opacities, attenuations
-        inputs = [self._share(tensor) for tensor in inputs]  # named, so that they live until the kernels are through
+        tensors = splats.means2d, splats.factors, splats.visible, signal, opacities, attenuations
+        inputs = [self._share(tensor) for tensor in tensors]  # named, so that they outlive the kernels
         self._run("prepare", sets * words, order, *inputs, spans, geometry, appearance, hits)
 
         counts = np.empty(self.lists, np.int32)
@@ -271,11 +244,11 @@ class _Render:
         return gradients
 
     def _run(self, kernel, items, *buffers):
-        if items:  # OpenCL cannot run none
+        if items:  # OpenCL cannot run 0 items
             self.kernels[kernel](self.queue, (items,), (1,), self.sizes, *buffers)
 
     def _share(self, values):
-        """The host's memory as the device sees it, on a CPU the same; nothing is the null pointer."""
+        """The host's memory as the device sees it; the null pointer for no values."""
         if isinstance(values, Tensor):
             values = values.detach().numpy()
         if values is None or not values.size:
@@ -288,10 +261,10 @@ class _Render:
         return _pool(self.queue).allocate(4 * max(1, int(size)))
 
     def _finish(self, *buffers):
-        """Waits until what kernels wrote into the host's memory is there."""
+        """Waits until the kernels' results are in the host's memory."""
         for buffer in filter(None, buffers):
             cl.enqueue_map_buffer(self.queue, buffer, cl.map_flags.READ, 0, (buffer.size,), np.uint8)
-        self.queue.finish()  # no kernel outlives the host's memory, not even where there was no output to wait for
+        self.queue.finish()  # no kernel outlives the host's memory, even without outputs
 
 
 def _literal(value: float) -> str:
@@ -307,20 +280,16 @@ def _front_to_back(depths: Tensor) -> np.ndarray:
     return (keys & 0xFFFFFFFF).astype(np.int32)
 
 
-def _freeze(coordinate: Tensor) -> tuple[bytes, tuple[int, int]]:
-    return coordinate.detach().numpy().tobytes(), tuple(coordinate.shape)
-
-
 @functools.lru_cache(maxsize=64)  # a training that thins has a plane for each row and column it may start from
-def _tiling(queue: cl.CommandQueue, u: tuple, v: tuple, period: float | None) -> list[cl.Buffer]:
-    """A plane in whole tiles, as the kernels read it; it is the same from step to step, and known by its bytes.
+def _tiling(
+    queue: cl.CommandQueue, of_u: tuple[bytes, tuple], of_v: tuple[bytes, tuple], period: float | None
+) -> list[cl.Buffer | None]:
+    """A plane in whole tiles, as the kernels read it, from the bytes and shapes of u and v.
 
-    Returns:
-        u and v, filled up to whole tiles by repetition: one u a column and one v a row where the plane is separable,
-        else two full grids; spans (centre, half size) of u and then of v; and edges, the least v of the rows of each
-        span of v and then their largest.
+    Returns u and v, filled up by repetition, one a column and one a row where the plane is separable; spans (centre,
+    half size) of u, then of v; and edges, the least v of the rows of each span of v and then their largest.
     """
-    u, v = (np.frombuffer(data, np.float32).reshape(shape) for data, shape in (u, v))
+    u, v = (np.frombuffer(data, np.float32).reshape(shape) for data, shape in (of_u, of_v))
     height, width = len(v), u.shape[1]
     down, across = -(-height // ROWS), -(-width // COLUMNS)
     y, x = np.minimum(np.arange(down * ROWS), height - 1), np.minimum(np.arange(across * COLUMNS), width - 1)

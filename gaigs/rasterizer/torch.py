@@ -1,9 +1,8 @@
 """The rasterizer in eager torch: any device, float32 and float64."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.projection import Plane, Splats
@@ -22,35 +21,22 @@ class TorchRasterizer:
     """Tiles of 16 x 16 pixels, each against the splats that reach it; the gradient is written by hand.
 
     Splats are sorted by depth once, for all transmitters. A tile keeps those whose bounding box, at the opacity
-    ``ALPHA_MIN`` and over all transmitters, meets it. Tiles of similar length are worked on together, in chunks whose
-    intermediate arrays are small and are computed anew in the backward pass, so memory does not grow with the number of
-    (splat, pixel) pairs. Contract and formulas: ``gaigs.rasterizer.Rasterizer``.
+    ``ALPHA_MIN`` and over all transmitters, meets it. Tiles with lists of similar length are composited together, in
+    small chunks that the backward pass computes anew: memory does not grow with the number of (splat, pixel) pairs.
     """
 
     used = "torch"
 
     def __call__(
-        self,
-        splats: Splats,
-        signal: Float[Tensor, "b n c"],
-        opacities: Float[Tensor, "b n"],
-        attenuations: Float[Tensor, "b n"] | None,
-        plane: Plane,
-    ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
-        """The map, and the transmittance left behind the last splat; see ``gaigs.rasterizer.Rasterizer``."""
+        self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
+    ) -> tuple[Tensor, Tensor]:
         order = torch.argsort(splats.depths, stable=True)
         order = order[splats.visible[order]]
         factors = splats.factors[:, order]
         with torch.no_grad():
             tiles = _Tiles(plane, splats.means2d[order], factors, opacities[:, order])
-        return _Composite.apply(
-            tiles,
-            splats.means2d[order],
-            factors,
-            signal[:, order],
-            opacities[:, order],
-            None if attenuations is None else attenuations[:, order],
-        )
+        own = None if attenuations is None else attenuations[:, order]
+        return _Composite.apply(tiles, splats.means2d[order], factors, signal[:, order], opacities[:, order], own)
 
 
 class _Tiles:
@@ -58,21 +44,22 @@ class _Tiles:
 
     def __init__(self, plane: Plane, means: Tensor, factors: Tensor, opacities: Tensor):
         self.shape = plane.shape
-        self.period = None if plane.period is None else _split(plane.period, plane.u.dtype)
+        self.period = None
+        if plane.period is not None:  # rounded to the dtype, and the remainder
+            rounded = torch.tensor(plane.period, dtype=plane.u.dtype).item()
+            self.period = rounded, plane.period - rounded
         self.down, self.across = (-(-edge // TILE) for edge in self.shape)
-        u, v = (self._cut(coordinate) for coordinate in (plane.u, plane.v))
-        self.u, self.v = u, v
-        self.chunks = []
+        self.u, self.v = self._cut(plane.u), self._cut(plane.v)
+        self.chunks: list[tuple[Tensor, Tensor]] = []
         if not len(opacities):
             return
-
         # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box has these halves.
         # Comparisons with NaN keep the splat, so that NaN shows in the map.
         reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()
         p, q, r = factors.unbind(-1)
         halves = (reach[..., None] * torch.stack((p, torch.hypot(q, r)), -1)).amax(0)
         touches = ~(opacities.amax(0) < ALPHA_MIN).expand(self.down * self.across, -1)
-        for axis, (coordinate, period) in enumerate(((u, self.period), (v, None))):
+        for axis, (coordinate, period) in enumerate(((self.u, self.period), (self.v, None))):
             coordinate = coordinate.flatten(1)
             low, high = coordinate.amin(1, keepdim=True), coordinate.amax(1, keepdim=True)
             offset = _nearest(means[:, axis], (low + high) / 2, period).abs()
@@ -105,11 +92,6 @@ class _Tiles:
             start += size
         return chunks
 
-    def offsets(self, tiles: Tensor, means: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixel minus splat centre (t, k, y or 1, x or 1) in u and v for splats (t, k, 2)."""
-        du = _nearest(self.u[tiles][:, None], means[..., 0, None, None], self.period)
-        return du, self.v[tiles][:, None] - means[..., 1, None, None]
-
     def join(self, tiled: Tensor) -> Tensor:
         """Tiles (..., t, y x) as an image (..., rows, columns)."""
         image = tiled.unflatten(-1, (TILE, TILE)).unflatten(-3, (self.down, self.across))
@@ -123,17 +105,10 @@ class _Tiles:
         return tiled.flatten(-2).flatten(-3, -2)
 
 
-def _split(period: float, dtype: torch.dtype) -> tuple[float, float]:
-    """A period rounded to a dtype, and the remainder."""
-    rounded = torch.tensor(period, dtype=dtype).item()
-    return rounded, period - rounded
-
-
 def _nearest(a: Tensor, b: Tensor, period: tuple[float, float] | None) -> Tensor:
-    """a - b taken to the nearest image, the period as ``_split`` gives it.
+    """a - b taken to the nearest image, by a rounded period and its remainder.
 
-    The period is subtracted from the exact a - b = offset + rest (Knuth's two-sum), since at the seam what remains is
-    smaller by far than the rounding error of a - b alone.
+    The period is subtracted from the exact a - b = offset + rest (Knuth's two-sum), so no digit is lost at the seam.
     """
     offset = a - b
     if period is None:
@@ -144,9 +119,8 @@ def _nearest(a: Tensor, b: Tensor, period: tuple[float, float] | None) -> Tensor
     return (offset - turns * period[0]) + (rest - turns * period[1])
 
 
-@dataclass
-class _Weights:
-    """One chunk composited: all is (b, t, k, y x) but ``left`` (b, t, y x), and ``s`` and ``y`` of ``_whiten``."""
+class _Weights(NamedTuple):
+    """One chunk composited: all is (b, t, k, y x) but ``left`` (b, t, y x), and ``s`` and ``y`` of ``_weigh``."""
 
     s: Tensor
     y: Tensor
@@ -157,21 +131,17 @@ class _Weights:
     left: Tensor
 
 
-def _whiten(du: Tensor, dv: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-    """(s, y) = L^-1 (du, dv), in which the footprint is exp(-(s² + y²) / 2).
-
-    This form of the exponent loses the fewest digits where a splat is long and thin.
-    """
-    p, q, r = (part[..., None, None] for part in factors.unbind(-1))
-    s = du / p
-    return s, dv / r - (q / r) * s
-
-
 def _weigh(
     tiles: _Tiles, chosen: Tensor, k: Tensor, means: Tensor, factors: Tensor, opacities: Tensor, logs: Tensor | None
 ) -> _Weights:
     """Footprints, opacities and transmittances of one chunk: tiles ``chosen`` (t,) and their splats (t, k)."""
-    s, y = _whiten(*tiles.offsets(chosen, means[k]), factors[:, k])
+    u, v = means[k][..., None, None].unbind(-3)
+    du = _nearest(tiles.u[chosen][:, None], u, tiles.period)
+    dv = tiles.v[chosen][:, None] - v
+    p, q, r = (part[..., None, None] for part in factors[:, k].unbind(-1))
+    # With (s, y) = L^-1 (du, dv) the exponent loses the fewest digits where a splat is long and thin.
+    s = du / p
+    y = dv / r - (q / r) * s
     exponent = torch.addcmul(-0.5 * s * s, y, y, value=-0.5)
     footprint = exponent.exp_().flatten(-2)
     alpha = footprint * opacities[:, k, None]
@@ -245,14 +215,9 @@ class _Composite(torch.autograd.Function):
 
 def _filled(means, factors, signal, opacities, logs):
     """The splats and, behind them, one that does nothing: it fills the tiles' lists up."""
-    pad = torch.nn.functional.pad
-    return (
-        pad(means, (0, 0, 0, 1)),
-        pad(factors, (0, 0, 0, 1), value=1.0),
-        pad(signal, (0, 0, 0, 1)),
-        pad(opacities, (0, 1)),
-        None if logs is None else pad(logs, (0, 1)),
-    )
+    pad, row = torch.nn.functional.pad, (0, 0, 0, 1)
+    logs = None if logs is None else pad(logs, (0, 1))
+    return pad(means, row), pad(factors, row, value=1.0), pad(signal, row), pad(opacities, (0, 1)), logs
 
 
 def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:

@@ -53,6 +53,7 @@ class Task(ABC):
     dtype: torch.dtype = torch.float32
     is_noisy: bool = False
     directions: Grid | None = None
+    frequencies: Tensor
 
     @property
     @abstractmethod

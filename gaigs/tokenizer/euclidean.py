@@ -1,6 +1,7 @@
 """Fourier features of positions: metric structure, no scene token."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -12,19 +13,17 @@ from gaigs.registry import register
 from gaigs.scene import Scene
 
 MAX_OCTAVE = 30
-"""Bound of octaves, up and down: float32 resolves no places in waves of a nanometre or a million km."""
+"""Bound of octaves: float32 resolves no positions in waves of a nanometre or a million km."""
 
 BAND_FREQUENCIES = math.pi * 2.0 ** torch.arange(-1, 3)
-"""Angular frequencies of the carrier's features over its position in the band, -1 to 1: periods from twice the band to
-a quarter of it."""
+"""Of features of the carrier's position in the band, -1 to 1: periods from twice the band to a quarter."""
 
 
 @register("tokenizer", "euclidean")
 class EuclideanTokenizer(nn.Module):
     """Fourier features of the Gaussians, and of the transmitter through a two-layer network.
 
-    The transmitter's network runs once for each transmitter, not for each Gaussian, so its width costs little. For
-    data with several carriers its input also has the carrier's position in the band.
+    For data with several carriers the network's input also has the carrier's position in the band.
 
     Args:
         scene: The middles of the transmitters' box and of the receivers are the origins of positions.
@@ -33,50 +32,45 @@ class EuclideanTokenizer(nn.Module):
         hidden: Width of the transmitter network's hidden layer.
         width: Width of E(P_TX). With None for both there is no network, and E(P_TX) are the features themselves.
 
-    Raises:
-        ValueError: A range of octaves is empty or too wide, a width is out of range, or only one width is None.
-
     Source: GAI-GS, "Multi-view Tokenizer"; Tancik et al., Fourier Features, 2020.
     """
 
     scene_width = 0
+    receivers_middle: Tensor
+    transmitters_middle: Tensor
+    gaussian_frequencies: Tensor
+    transmitter_frequencies: Tensor
 
     def __init__(
         self,
         scene: Scene,
-        gaussian_octaves: tuple[int, int] = (-3, 2),
-        transmitter_octaves: tuple[int, int] | None = None,
+        gaussian_octaves: Sequence[int] = (-3, 2),
+        transmitter_octaves: Sequence[int] | None = None,
         hidden: int | None = 256,
         width: int | None = 64,
     ):
         super().__init__()
-        if (hidden is None) != (width is None):
+        given = [count for count in (hidden, width) if count is not None]
+        if len(given) == 1 or min(given, default=1) < 1:
             raise ValueError(
-                f"tokenizer options hidden and width must both be given, or both be null for no network, got {hidden} "
-                f"and {width}"
+                f"tokenizer options hidden and width must both be given, at least 1, or be null, got {hidden}, {width}"
             )
-        for option, count in (("hidden", hidden), ("width", width)):
-            if count is not None and count < 1:
-                raise ValueError(f"tokenizer option {option} must be at least 1, got {count}")
         self.scene = scene
         self.register_buffer("receivers_middle", scene.positions(scene.lower).mean(0))
         self.register_buffer("transmitters_middle", (scene.lower + scene.upper) / 2)
-        self.register_buffer("gaussian_frequencies", octaves("tokenizer option gaussian_octaves", *gaussian_octaves))
         transmitter_octaves = transmitter_octaves or learnable_octaves(scene)
-        self.register_buffer(
-            "transmitter_frequencies", octaves("tokenizer option transmitter_octaves", *transmitter_octaves)
-        )
+        for name, limits in (("gaussian", gaussian_octaves), ("transmitter", transmitter_octaves)):
+            self.register_buffer(f"{name}_frequencies", octaves(f"tokenizer option {name}_octaves", *limits))
         self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
         features = 3 * (1 + 2 * len(self.transmitter_frequencies))
         if scene.has_band:
             features += 1 + 2 * len(BAND_FREQUENCIES)
         self.transmitter_width = features if width is None else width
-        self.network = nn.Identity()
-        if width is not None:
+        self.network: nn.Module = nn.Identity()
+        if hidden is not None and width is not None:
             self.network = nn.Sequential(nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, width))
 
     def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
-        """E(P_x) and E(P_TX); opacities have no influence."""
         means = placed.means[0] if len(placed.means) == 1 else placed.means
         gaussians = fourier_features(means - self.receivers_middle, self.gaussian_frequencies)
         features = fourier_features(query.transmitters - self.transmitters_middle, self.transmitter_frequencies)
@@ -87,7 +81,7 @@ class EuclideanTokenizer(nn.Module):
 
 
 def learnable_octaves(scene: Scene) -> tuple[int, int]:
-    """Lowest and highest octave of the transmitter's features that the training transmitters can teach.
+    """Lowest and highest octave of the transmitter's features that suit the training transmitters.
 
     Periods range from twice the box's longest edge down to 16 distances between neighbouring transmitters: the network
     multiplies frequencies, so its input must be well below their sampling limit. For noisy labels they are at least
@@ -101,17 +95,11 @@ def learnable_octaves(scene: Scene) -> tuple[int, int]:
     return min(highest, math.floor(-math.log2(2 * edge))), highest
 
 
-def octaves(option: str, lowest: int, highest: int) -> Float[Tensor, " octaves"]:
-    """Angular frequencies 2 pi 2^k [rad/m] for k from lowest to highest.
-
-    Raises:
-        ValueError: The range is empty, or exceeds ``MAX_OCTAVE``.
-    """
-    if not -MAX_OCTAVE <= lowest <= highest <= MAX_OCTAVE:
-        raise ValueError(
-            f"{option} must be [lowest, highest] within {-MAX_OCTAVE}..{MAX_OCTAVE}, got [{lowest}, {highest}]"
-        )
-    return 2 * math.pi * 2.0 ** torch.arange(lowest, highest + 1)
+def octaves(option: str, *limits: int) -> Float[Tensor, " octaves"]:
+    """Angular frequencies 2 pi 2^k [rad/m] for k from the lowest to the highest limit."""
+    if len(limits) != 2 or not -MAX_OCTAVE <= limits[0] <= limits[1] <= MAX_OCTAVE:
+        raise ValueError(f"{option} must be [lowest, highest] within {-MAX_OCTAVE}..{MAX_OCTAVE}, got {list(limits)}")
+    return 2 * math.pi * 2.0 ** torch.arange(limits[0], limits[1] + 1)
 
 
 def fourier_features(

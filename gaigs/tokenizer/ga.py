@@ -20,9 +20,8 @@ class GATokenizer(nn.Module):
     """CLS of a Geometric Algebra Transformer (GATr) over CLS, the transmitter and anchors; no position embeddings.
 
     Tokens are [CLS, TX, anchors]: CLS is a learnable point; anchors are the centres of the most opaque Gaussians,
-    chosen at every call, the same for all transmitters, without a gradient. Each is a multivector with two scalars for
-    its type; for data with several carriers a third scalar has the carrier's position in the band. The linear read-out
-    makes CLS depend on the room's axes, as the field does.
+    chosen at every call, without a gradient. Each is a multivector with two scalars for its type; for data with several
+    carriers a third scalar has the carrier's position in the band.
 
     Positions are relative to the middle of the box around transmitters and receivers, and divided by half its longest
     edge, so that they are of order one and motions remain motions.
@@ -34,19 +33,18 @@ class GATokenizer(nn.Module):
         multivectors: Multivector channels within the blocks, even and a multiple of ``heads``; 16 as released.
         scalars: Scalar channels within the blocks, a multiple of ``heads``; 4 as released.
         heads: Attention heads of a block; ours.
-        width: Numbers of the scene token; 16 as released.
+        width: Width of the scene token; 16 as released.
         algebra: ``projective``, G(3,0,1) with rotations, translations and mirrors (GATr's); or ``spacetime``,
             G(3,1,0) with rotations, boosts and mirrors about the middle (the paper's preliminaries), whose points are
             events at time zero.
-
-    Raises:
-        ValueError: An option is out of range, or the box is a single point.
 
     Source: GAI-GS, "Multi-view Tokenizer"; Brehmer et al., Geometric Algebra Transformer, 2023.
     """
 
     gaussian_width = 0
     transmitter_width = 0
+    middle: Tensor
+    scale: Tensor
 
     def __init__(
         self,
@@ -62,20 +60,15 @@ class GATokenizer(nn.Module):
         super().__init__()
         if algebra not in ALGEBRAS:
             raise ValueError(f"tokenizer option algebra must be one of {', '.join(ALGEBRAS)}, got {algebra!r}")
-        counts = {
-            "anchors": anchors, "blocks": blocks, "multivectors": multivectors, "scalars": scalars, "heads": heads,
-            "width": width,
-        }  # fmt: skip
-        for option, count in counts.items():
+        counts = {"anchors": anchors, "blocks": blocks, "scalars": scalars, "heads": heads, "width": width}
+        for option, count in (counts | {"multivectors": multivectors}).items():
             if count < 1:
                 raise ValueError(f"tokenizer option {option} must be at least 1, got {count}")
         corners = torch.cat((scene.lower[None], scene.upper[None], scene.positions(scene.lower)))
         lower, upper = corners.amin(0), corners.amax(0)
         scale = (upper - lower).max() / 2
         if not scale > 0:
-            raise ValueError(
-                f"transmitters and receivers must not all be at one point, got {lower.tolist()}; check the positions"
-            )
+            raise ValueError(f"transmitters and receivers must not all be at one point, got {lower.tolist()}")
         self.register_buffer("middle", (lower + upper) / 2)
         self.register_buffer("scale", scale)
         self.anchors = anchors
@@ -90,25 +83,19 @@ class GATokenizer(nn.Module):
         self.read_out = nn.Linear(self.algebra.size + 2, width)
 
     def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
-        """CLS for every query.
-
-        Args:
-            placed: Gaussian centres, world frame [m].
-            opacities: Their opacities; only their order matters.
-            query: Transmitters, and their frequencies where the data have several.
-        """
+        """CLS for every query; of the opacities only the order matters."""
         means, transmitters = placed.means.detach(), query.transmitters
         b, m = len(query), min(self.anchors, means.shape[1])
         anchors = means[:, opacities.topk(m).indices]
         tx, anchors = ((positions - self.middle) / self.scale for positions in (transmitters, anchors))
-        tokens = [self.cls.expand(b, 1, 3), tx[:, None]]
+        parts = [self.cls.expand(b, 1, 3), tx[:, None]]
         *blocks, final = self.blocks
         # With a single block anchors stay the same for all queries: their outputs are not read.
         alike = len(anchors) == 1 and not blocks and not self.scene.has_band
         if not alike:
-            tokens.append(anchors.expand(b, m, 3))
-        tokens = torch.cat(tokens, 1)
-        groups = tuple(tokens.shape[:2])
+            parts.append(anchors.expand(b, m, 3))
+        tokens = torch.cat(parts, 1)
+        groups = (b, tokens.shape[1])
         types = torch.cat((self.types[:2], self.types[2:].expand(m, 2)))
         types = types[: groups[1]].expand(*groups, 2).flatten(0, 1)
         tokens = tokens.flatten(0, 1)

@@ -16,7 +16,6 @@ class MultiviewTokenizer(nn.Module):
     """The scene token of ``ga`` beside the position embeddings of ``euclidean``.
 
     Args:
-        scene: Passed to both.
         ga: Tokenizer of the scene token: its name, configuration or the object.
         euclidean: Tokenizer of the position embeddings, likewise.
 
@@ -34,6 +33,5 @@ class MultiviewTokenizer(nn.Module):
         self.transmitter_width = self.euclidean.transmitter_width
 
     def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
-        """CLS of ``ga``; E(P_x) and E(P_TX) of ``euclidean``."""
         _, gaussians, transmitters = self.euclidean(placed, opacities, query)
         return Tokens(self.ga(placed, opacities, query).scene, gaussians, transmitters)

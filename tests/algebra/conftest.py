@@ -1,5 +1,3 @@
-"""What every layer's test uses: random versors and the check that a function commutes with them."""
-
 import pytest
 import torch
 
@@ -10,7 +8,7 @@ def random_versor(algebra, count, generator):
     while count:
         vector = algebra.grade(torch.randn(algebra.size, generator=generator, dtype=torch.float64), 1)
         square = algebra.inner(vector, vector)
-        if square.abs() > 0.5 * vector.square().sum():  # nearly null vectors make boosts beyond what float64 can tell
+        if square.abs() > 0.5 * vector.square().sum():  # nearly null vectors make boosts beyond float64
             versor = algebra.product(versor, vector / square.abs().sqrt())
             count -= 1
     return versor

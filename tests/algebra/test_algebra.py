@@ -4,8 +4,6 @@ import numba
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gaigs.algebra import PROJECTIVE, SPACETIME, Algebra
 
@@ -30,7 +28,7 @@ def pair(signature):
 
 
 def reference(layout, function, *multivectors):
-    """What the clifford package makes of a batch."""
+    """Results of the clifford package for a batch."""
     rows = zip(*(x.numpy() for x in multivectors), strict=True)
     return torch.from_numpy(
         np.stack([function(*(layout.MultiVector(value=row.copy()) for row in values)).value for values in rows])
@@ -49,7 +47,7 @@ def test_components_stand_in_the_order_of_the_reference(pair):
     ]
 
 
-def test_component_names():
+def test_blades_have_the_usual_names():
     assert PROJECTIVE.blades == tuple("1 e0 e1 e2 e3 e01 e02 e03 e12 e13 e23 e012 e013 e023 e123 e0123".split())
     assert SPACETIME.blades[:6] == ("1", "e1", "e2", "e3", "e4", "e12")
     assert PROJECTIVE.blades[PROJECTIVE.homogeneous] == "e123"
@@ -58,11 +56,7 @@ def test_component_names():
 @signatures
 @pytest.mark.parametrize(
     ("name", "function"),
-    [
-        ("product", lambda x, y: x * y),
-        ("wedge", lambda x, y: x ^ y),
-        ("join", lambda x, y: x.vee(y)),
-    ],
+    [("product", lambda x, y: x * y), ("wedge", lambda x, y: x ^ y), ("join", lambda x, y: x.vee(y))],
 )
 def test_products_agree_with_clifford(pair, name, function):
     algebra, layout, x, y = pair
@@ -70,34 +64,13 @@ def test_products_agree_with_clifford(pair, name, function):
 
 
 @signatures
-@pytest.mark.parametrize(
-    ("name", "function"),
-    [
-        ("reverse", lambda x: ~x),
-        ("involute", lambda x: x.gradeInvol()),
-        ("dual", lambda x: x.right_complement()),
-        ("undual", lambda x: x.left_complement()),
-    ],
-)
-def test_involutions_and_duals_agree_with_clifford(pair, name, function):
-    algebra, layout, x, _ = pair
-    torch.testing.assert_close(getattr(algebra, name)(x), reference(layout, function, x))
-
-
-@signatures
-def test_inner_and_grades_agree_with_clifford(pair):
+def test_inner_products_involutions_and_grades_agree_with_clifford(pair):
     algebra, layout, x, y = pair
     torch.testing.assert_close(algebra.inner(x, y), reference(layout, lambda x, y: (~x * y)(0), x, y)[:, 0])
+    torch.testing.assert_close(algebra.reverse(x), reference(layout, lambda x: ~x, x))
+    torch.testing.assert_close(algebra.involute(x), reference(layout, lambda x: x.gradeInvol(), x))
     for grade in range(algebra.dimension + 1):
         torch.testing.assert_close(algebra.grade(x, grade), reference(layout, lambda x, g=grade: x(g), x))
-
-
-@signatures
-def test_product_and_join_are_both(pair):
-    algebra, _, x, y = pair
-    product, join = algebra.product_and_join(x, y)
-    torch.testing.assert_close(product, algebra.product(x, y))
-    torch.testing.assert_close(join, algebra.join(x, y))
 
 
 @signatures
@@ -111,29 +84,6 @@ def test_sandwich_agrees_with_clifford(pair, make_versor, count):
         return u * (x.gradeInvol() if count % 2 else x) * ~u / float((u * ~u).value[0])
 
     torch.testing.assert_close(algebra.sandwich(versor, x), reference(layout, sandwich, x))
-
-
-def multivectors(size=16):
-    return st.lists(st.floats(-4, 4, width=32), min_size=size, max_size=size).map(
-        lambda values: torch.tensor(values, dtype=torch.float64)
-    )
-
-
-algebras = st.sampled_from([PROJECTIVE, SPACETIME, Algebra(2, 0, 2)])
-
-
-@given(algebras, multivectors(), multivectors(), multivectors())
-def test_laws(algebra, x, y, z):
-    product, wedge = algebra.product, algebra.wedge
-    close = lambda a, b: torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
-    close(product(product(x, y), z), product(x, product(y, z)))
-    close(product(x, y + z), product(x, y) + product(x, z))
-    close(algebra.reverse(product(x, y)), product(algebra.reverse(y), algebra.reverse(x)))
-    close(algebra.involute(product(x, y)), product(algebra.involute(x), algebra.involute(y)))
-    close(algebra.undual(algebra.dual(x)), x)
-    v, w = algebra.grade(x, 1), algebra.grade(y, 1)
-    inner = algebra.inner(v, w) * torch.eye(algebra.size, dtype=torch.float64)[0]
-    close(product(v, w), inner + wedge(v, w))
 
 
 @pytest.mark.parametrize(("p", "q", "r"), [(1, 0, 0), (0, 2, 0), (0, 0, 1), (1, 1, 2), (4, 1, 0)])
@@ -163,15 +113,9 @@ def test_tables_first_used_in_inference_mode_serve_training_later():
     assert x.grad.any()
 
 
-@pytest.mark.parametrize("signature", [(0, 0, 0), (3, -1, 0)])
-def test_impossible_signatures_are_refused(signature):
-    with pytest.raises(ValueError, match="at least one basis vector and no negative count"):
-        Algebra(*signature)
-
-
-def test_impossible_arguments_are_refused():
-    x = torch.ones(16)
-    with pytest.raises(ValueError, match="has grades 0 to 4, got 5"):
-        PROJECTIVE.grade(x, 5)
+def test_impossible_signatures_and_versors_without_inverse_are_refused():
+    for signature in ((0, 0, 0), (3, -1, 0)):
+        with pytest.raises(ValueError, match="must have a basis vector and no negative count"):
+            Algebra(*signature)
     with pytest.raises(ValueError, match="not null"):
-        PROJECTIVE.sandwich(torch.eye(16)[1], x)
+        PROJECTIVE.sandwich(torch.eye(16)[1], torch.ones(16))

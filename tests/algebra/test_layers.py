@@ -1,7 +1,5 @@
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gaigs.algebra import PROJECTIVE, SPACETIME, Algebra
 from gaigs.algebra.embedding import embed_point
@@ -80,14 +78,6 @@ def test_linear_has_every_equivariant_map(algebra, make_versor):
     assert torch.linalg.matrix_rank(torch.stack(outputs)) == len(layer.weight)
 
 
-def test_joins_need_the_reference_to_be_equivariant(check_equivariance):
-    layer = GeometricBilinear(PROJECTIVE, C, S).double()
-    multivectors, scalars = torch.randn(B, TOKENS, C, 16).double(), torch.randn(B, TOKENS, S).double()
-    reference = reference_of(multivectors)
-    with pytest.raises(AssertionError, match="not close"):
-        check_equivariance(PROJECTIVE, lambda x: layer(x, scalars, reference), multivectors)
-
-
 def test_bilinear_joins_points_to_lines():
     layer = GeometricBilinear(PROJECTIVE, 2, 1)
     points = embed_point(torch.randn(1, 1, 2, 3))
@@ -116,29 +106,12 @@ def test_norm_gives_unit_size(algebra, tokens):
     torch.testing.assert_close(scalars.mean(-1), torch.zeros(B, TOKENS).double())
 
 
-@given(st.integers(0, 10**6), st.floats(1e-30, 1e6))
-def test_norm_amplifies_no_more_than_its_floor_allows(seed, scale):
-    x = scale * torch.randn(1, 3, 16, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+@pytest.mark.parametrize("scale", [1e-30, 1e-2, 1.0, 1e6])
+def test_norm_amplifies_no_more_than_its_floor_allows(scale):
+    x = scale * torch.randn(100, 3, 16, dtype=torch.float64)
     for algebra in (PROJECTIVE, SPACETIME):
-        normed, _ = equivariant_norm(algebra, x, torch.zeros(1, 2))
+        normed, _ = equivariant_norm(algebra, x, torch.zeros(100, 2))
         assert (normed.abs() <= x.abs() * NORM_FLOOR**-0.5 * (1 + 1e-12)).all()
-
-
-def test_the_check_finds_what_is_not_equivariant(check_equivariance):
-    multivectors = torch.randn(B, TOKENS, C, 16).double()
-    with pytest.raises(AssertionError, match="not close"):
-        check_equivariance(PROJECTIVE, lambda x: (torch.nn.functional.gelu(x), torch.zeros(1)), multivectors)
-
-
-@algebras
-def test_block_ignores_the_order_of_tokens(algebra, tokens):
-    block = GATrBlock(algebra, C, 2, heads=2).double()
-    order = torch.tensor([3, 1, 4, 0, 2])
-    multivectors, scalars = tokens[0], tokens[1][..., :2]
-    result = block(multivectors, scalars, reference_of(multivectors))
-    permuted = block(multivectors[:, order], scalars[:, order], reference_of(multivectors))
-    torch.testing.assert_close(permuted[0], result[0][:, order])
-    torch.testing.assert_close(permuted[1], result[1][:, order])
 
 
 @pytest.mark.parametrize("algebra", [PROJECTIVE, SPACETIME], ids=str)
@@ -150,17 +123,14 @@ def test_block_has_the_right_gradients(algebra):
 
 
 def test_channels_that_cannot_be_shared_are_refused():
-    with pytest.raises(ValueError, match="make both multiples of 3"):
+    with pytest.raises(ValueError, match="must be multiples of 3 heads, got 6, 4"):
         GeometricAttention(PROJECTIVE, 6, 4, heads=3)
     with pytest.raises(ValueError, match="must be even, got 3"):
         GeometricBilinear(PROJECTIVE, 3, 2)
 
 
-# --- by hand ---
-
-
 def plain_linear(layer, multivectors, scalars):
-    """The sum over the maps, a matrix of components for each: a grade alone, or e0 times a grade."""
+    """The sum over the maps, each a matrix of components: a grade alone, or e0 times a grade."""
     algebra, eye = layer.algebra, torch.eye(layer.algebra.size, dtype=torch.float64)
     grades = algebra.table("grades", eye)
     matrices = [torch.diag(grade) for grade in grades]
@@ -204,14 +174,11 @@ def test_a_linear_map_in_mixed_precision_is_that_of_its_weights():
     assert torch.autograd.grad(found[1].sum(), scalars)[0].dtype == torch.float32
 
 
-# --- the first token of each group ---
-
-
 @algebras
 @pytest.mark.parametrize("groups", [(3, 2), (1, 4), (2, 1), (0, 2)], ids=str)
 @pytest.mark.parametrize("alike", [0, 1, 5])
-def test_the_first_token_sees_what_it_would_among_all(algebra, groups, alike):
-    """Each group by itself, with the tokens that are alike beside it, through the whole attention."""
+def test_the_first_token_of_a_group_sees_its_group_and_the_common_tokens(algebra, groups, alike):
+    """Against the whole attention over each group with the common tokens."""
     block = GATrBlock(algebra, C, 4, heads=2).double()
     b, size = groups
     multivectors = torch.randn(b * size + alike, C, algebra.size).double().requires_grad_()
@@ -219,8 +186,9 @@ def test_the_first_token_sees_what_it_would_among_all(algebra, groups, alike):
     expected = [[], []]
     for i in range(b):
         own = [torch.cat((x[i * size : (i + 1) * size], x[b * size :])) for x in (multivectors, scalars)]
-        for parts, attended in zip(expected, block.attend(*own), strict=True):
-            parts.append(attended[:1])
+        attended = block.attention(*equivariant_norm(algebra, *own))
+        for parts, token, change in zip(expected, own, attended, strict=True):
+            parts.append((token + change)[:1])
     found = block.look(multivectors, scalars, groups)
     assert [part.shape for part in found] == [(b, 1, C, algebra.size), (b, 1, 4)]
     if not b:

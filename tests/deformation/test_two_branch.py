@@ -1,4 +1,4 @@
-"""The scene mapping network: heads that are left out, one linear layer in parts, and where residuals start."""
+"""The scene mapping network: heads, parameters, initial residuals, and the linear layer in parts."""
 
 from itertools import chain, combinations
 
@@ -12,13 +12,7 @@ from gaigs.query import Query
 B, N, CHANNELS, WIDTH = 3, 7, 2, 8
 WIDTHS = (5, 4, 6)
 SUBSETS = [list(subset) for subset in chain.from_iterable(combinations(HEADS, size) for size in range(6))]
-SHAPES = {
-    "rotation": (B, N, 4),
-    "scale": (B, N, 3),
-    "signal": (B, N, CHANNELS, 1),
-    "opacity": (B, N),
-    "attenuation": (B, N),
-}
+SHAPES = dict(zip(HEADS, ((B, N, 4), (B, N, 3), (B, N, CHANNELS, 1), (B, N), (B, N)), strict=True))
 
 
 def make_tokens(widths=WIDTHS, b=B, n=N, scale=1.0):
@@ -33,7 +27,7 @@ def make_network(heads, widths=WIDTHS):
 
 
 def residuals_of(network, tokens):
-    """The network's residuals; it looks at tokens alone."""
+    """The network's residuals, which depend on the tokens only."""
     b, n = len(tokens.scene), tokens.gaussians.shape[-2]
     query = Query(torch.full((b, 3), torch.nan), torch.zeros(b, dtype=torch.long))
     return network(tokens, Placed(torch.full((1, n, 3), torch.nan)), query)
@@ -44,9 +38,6 @@ def seed():
     torch.manual_seed(0)
 
 
-# --- heads ---
-
-
 @pytest.mark.parametrize("heads", SUBSETS, ids="-".join)
 def test_a_head_left_out_does_not_exist_and_costs_nothing(heads):
     network = make_network(heads)
@@ -54,7 +45,7 @@ def test_a_head_left_out_does_not_exist_and_costs_nothing(heads):
     assert {name for name, residual in residuals.items() if residual is not None} == set(heads)
     for name in heads:
         assert residuals[name].shape == SHAPES[name]
-    # What no head reads would get no gradient; what starts at 0 lets none through.
+    # Zero heads would hide earlier layers.
     for head in network.heads.values():
         torch.nn.init.normal_(head.weight)
     parameters = dict(network.named_parameters())
@@ -105,12 +96,9 @@ def test_the_attenuation_lies_in_0_1_however_large_the_activations(dtype, scale)
         assert max(extremes) == pytest.approx(1)
 
 
-# --- the linear layer on the concatenation that never exists ---
-
-
 @pytest.mark.parametrize("hidden", [0, 3])
 @pytest.mark.parametrize("widths", [WIDTHS, (5, 0, 0), (0, 4, 0), (0, 4, 6), (5, 0, 6), (0, 0, 0)])
-def test_it_is_one_linear_layer_on_the_concatenation(widths, hidden):
+def test_the_layer_is_one_linear_layer_on_the_concatenation(widths, hidden):
     layer, tokens = TokenLinear(widths, WIDTH, hidden), make_tokens(widths)
     inner = torch.randn(B, N, hidden) if hidden else None
     scene, gaussians, transmitters = tokens.scene[:, None], tokens.gaussians[None], tokens.transmitters[:, None]
@@ -121,16 +109,15 @@ def test_it_is_one_linear_layer_on_the_concatenation(widths, hidden):
     torch.testing.assert_close(layer(tokens, inner), whole)
 
 
-def test_it_starts_as_one_linear_layer_on_the_concatenation_does():
-    layer = TokenLinear((30, 300, 70), 200, hidden=100)
-    whole = torch.nn.Linear(500, 200)
+def test_initial_weights_are_those_of_one_linear_layer():
+    layer, whole = TokenLinear((30, 300, 70), 200, hidden=100), torch.nn.Linear(500, 200)
     for parameter in layer.parameters():
         assert parameter.abs().max() <= whole.weight.abs().max() * 1.01
         assert parameter.std().item() == pytest.approx(whole.weight.std().item(), rel=0.15)
 
 
 @pytest.mark.parametrize("hidden", [0, 3])
-def test_gaussians_that_stand_elsewhere_for_each_query_have_tokens_of_their_own(hidden):
+def test_tokens_of_gaussians_may_differ_between_queries(hidden):
     layer, tokens = TokenLinear(WIDTHS, WIDTH, hidden), make_tokens()
     own = tokens._replace(gaussians=torch.randn(B, N, WIDTHS[1]))
     inner = torch.randn(B, N, hidden) if hidden else None

@@ -1,4 +1,4 @@
-"""What the hard cases share: components as they are configured, and float32 held against float64."""
+"""Configured components, and checks of float32 against float64, for the hard cases."""
 
 import copy
 import sys
@@ -22,7 +22,6 @@ DTYPES = (torch.float32, torch.float64)
 
 
 def build(kind, name, *overrides, **context):
-    """A component of that name, the same at each call."""
     torch.manual_seed(0)
     return registry(kind).build(test_contracts.configured(kind, name, *overrides), **context)
 
@@ -38,7 +37,7 @@ def build_rasterizer(name):
 
 
 def widen(part, dtype):
-    """Floating tensors, queries and tuples of them in another precision; anything else as it is."""
+    """Tensors, queries, modules and tuples in another precision."""
     if isinstance(part, torch.Tensor) and (part.is_floating_point() or part.is_complex()):
         return part.to(dtype.to_complex() if part.is_complex() else dtype)
     if isinstance(part, Query):
@@ -53,23 +52,15 @@ def widen(part, dtype):
 
 
 def flat(values):
-    """Tensors of nested tuples, one after the other."""
     if isinstance(values, tuple | list):
         return [tensor for value in values for tensor in flat(value)]
     return [values]
 
 
 def require_same(ask, module, *leaves, tolerance=TOLERANCE, within=None):
-    """Asks a module in float32 and in float64, and gives what float64 answers.
+    """Values of ``ask(module, *leaves)`` in float64: float32's are the same, all are finite, gradients too.
 
-    Values are finite, keep their precision and agree; gradients by the leaves and parameters are finite in both.
-
-    Args:
-        ask: Function of the module and of the leaves.
-        module: Or None.
-        leaves: Tensors that gradients are taken by.
-        tolerance: Of the largest value of each tensor, or of 1.
-        within: How far apart values may be at least, where digits are lost before they are asked for.
+    Values may differ by ``tolerance`` of the largest value of a tensor or of 1, or by ``within`` if that is more.
     """
     answers = []
     for dtype in DTYPES:
@@ -88,7 +79,7 @@ def require_same(ask, module, *leaves, tolerance=TOLERANCE, within=None):
 
 
 def require_finite(values, leaves):
-    """Values and the gradients of their means by what they depend on."""
+    """Requires finite values and finite gradients by the leaves."""
     values = [value for value in flat(values) if value is not None and value.numel()]
     assert all(value.isfinite().all() for value in values)
     real = [torch.view_as_real(value) if value.is_complex() else value for value in values if value.requires_grad]

@@ -1,4 +1,4 @@
-"""Paths at an array, and faint waves: silence, footprints beyond digits, no splat, one."""
+"""Faint waves, and paths at an array: silence, extreme footprints, zero or one path."""
 
 import pytest
 import torch
@@ -16,7 +16,6 @@ FAINT = [0.0, 1e-45, 1e-42, 1e-39, 1.2e-38, 1e-30, 1.0, 1e30]
 @pytest.mark.parametrize("amplitude", FAINT)
 @pytest.mark.parametrize("count", [1, 3, 8, 17])
 def test_faint_waves_have_gradients(dtype, amplitude, count):
-    """Of any count: torch works on some entries at a time, and on the rest in another way."""
     amplitudes = torch.full((count,), amplitude, dtype=dtype).requires_grad_()
     phases = torch.arange(count, dtype=dtype).requires_grad_()
     waves = polar(amplitudes, phases)
@@ -30,7 +29,7 @@ def test_faint_waves_have_gradients(dtype, amplitude, count):
         torch.testing.assert_close(turned, torch.ones_like(turned))
 
 
-def test_what_is_broken_shows_in_waves():
+def test_nan_shows_in_waves():
     broken = torch.tensor([torch.nan, 1.0])
     assert polar(broken, torch.zeros(2))[0].isnan()
     assert magnitudes(torch.complex(broken, torch.zeros(2)))[0].isnan()
@@ -55,7 +54,7 @@ CASES += [("narrow", "loud", 1), ("narrow", "loud", 0)]
 @pytest.mark.parametrize(("splats", "waves", "n"), CASES)
 @pytest.mark.parametrize("coherence", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("bandwidth", [None, 0.0, 1e9])
-def test_what_an_array_hears(splats, waves, n, coherence, bandwidth):
+def test_paths_at_an_array(splats, waves, n, coherence, bandwidth):
     array = Array.planar(3, 3, 0.03)
     receiver = Receiver("here", Pose(torch.zeros(3), torch.eye(3)), array)
     size = WAVES[waves]

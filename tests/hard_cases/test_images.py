@@ -1,4 +1,4 @@
-"""Placements where planes and transmitters are as awkward as they can be; plug-ins are among them."""
+"""Placements, also of plug-ins, with planes and transmitters in degenerate positions."""
 
 from dataclasses import replace
 
@@ -47,11 +47,11 @@ CASES = [(planes, "somewhere") for planes in PLANES]
 CASES += [(planes, places) for planes in ("parallel", "all through the receiver") for places in PLACES]
 CASES += [("as they start", places) for places in PLACES if places != "somewhere"]
 DIGITS = 2e-6
-"""Of the longest way that an image takes: five roundings at each of some mirrors."""
+"""Rounding of an image, of its longest path."""
 
 
 def laid(placement, planes):
-    """The placement with planes there, each given by its normal and by where it cuts that [m]; all of them in use."""
+    """The placement with these planes, each a normal and an offset [m]; all in use."""
     if planes and hasattr(placement, "place"):
         for number, (normal, offset) in enumerate(planes):
             placement.place(number, torch.tensor(normal), offset)
@@ -67,8 +67,7 @@ def ask_placed(gaussians):
         placed = module(own, query)
         if placed.gains is None:
             return placed
-        # Whoever stands on a plane by float32's digits may rightly be on either side of it: gains are finite there, and
-        # no more is asked.
+        # Within float32's digits a point may be on either side of a plane: only finite gains are required there.
         assert placed.gains.isfinite().all()
         heard_at = module.scene.positions(transmitters)[receivers]
         heights = torch.stack([(ends @ module.normals.T - module.offsets).abs() for ends in (transmitters, heard_at)])
@@ -81,8 +80,7 @@ def ask_placed(gaussians):
 @pytest.mark.parametrize("name", registry("placement").names())
 @pytest.mark.parametrize("task", LINKS)
 @pytest.mark.parametrize(("planes", "places"), CASES)
-def test_placed(name, task, planes, places):
-    """Values as of float64; where planes are 1e6 m away only to that many of its digits, and phases not at all."""
+def test_placed_gaussians_are_those_of_float64(name, task, planes, places):
     scene = LINKS[task].scene
     options = ["placement.planes=6", "placement.order=2", "placement.obstacles=3"] if name == "mirrored" else []
     placement = laid(build("placement", name, *options, scene=scene, channels=2), PLANES[planes])
@@ -95,16 +93,15 @@ def test_placed(name, task, planes, places):
 @pytest.mark.parametrize("order", [1, 2, 3])
 @pytest.mark.parametrize("planes", [name for name in PLANES if name != "as they start"])
 @pytest.mark.parametrize("places", PLACES)
-def test_ways_of_words(order, planes, places):
-    """Folded paths are as long as the straight line to the image wherever they exist, and stay near elsewhere."""
-    words = all_sequences(len(PLANES[planes]), order)
+def test_folded_paths_are_as_long_as_straight_lines_to_images(order, planes, places):
+    sequences = all_sequences(len(PLANES[planes]), order)
     normals = functional.normalize(torch.tensor([normal for normal, _ in PLANES[planes]]), dim=1)
     offsets = torch.tensor([offset for _, offset in PLANES[planes]])
 
     def ask(_, transmitters, normals, offsets):
-        seen = images(transmitters, words, normals, offsets)
+        seen = images(transmitters, sequences, normals, offsets)
         receivers = receiver.to(transmitters).expand_as(transmitters)
-        return seen, receivers, fold(seen, receivers, words, normals, offsets)
+        return seen, receivers, fold(seen, receivers, sequences, normals, offsets)
 
     far = 1e6 if planes == "a million metres away" else 0.0
     results = []
@@ -120,9 +117,9 @@ def test_ways_of_words(order, planes, places):
         # A line is bent between its ends, and its far end then moves from one image to the next.
         reach = max((image - receivers[:, None]).norm(dim=-1).max().item() for image in seen)
         assert legs.max() <= 1.001 * (1 + 2 * order) * reach
-        ways = torch.zeros_like(straight).index_add(1, folded.path, legs)
+        totals = torch.zeros_like(straight).index_add(1, folded.path, legs)
         bound = 1e-3 if dtype == torch.float32 else 1e-6
-        assert (ways - straight)[folded.exists].abs().max() <= bound * max(1.0, straight.max().item())
+        assert (totals - straight)[folded.exists].abs().max() <= bound * max(1.0, straight.max().item())
         results.append((seen[-1], folded.exists))
     (single, _), (double, _) = results
     assert (single - double).abs().max() <= DIGITS * order * max(50.0, far, double.abs().max().item())
@@ -130,7 +127,6 @@ def test_ways_of_words(order, planes, places):
 
 @pytest.mark.parametrize("planes", PLANES)
 def test_phases_of_many_mirrors_are_those_of_float64(planes):
-    """Where phases count, a path's length is known to a fraction of the wavelength."""
     if planes == "a million metres away":
         pytest.skip("float32 has no such digits")
     scene = LINKS["spectrum"].scene
@@ -141,23 +137,17 @@ def test_phases_of_many_mirrors_are_those_of_float64(planes):
     require_same(ask_placed(None), placement, PLACES["somewhere"], tolerance=5e-3)
 
 
-FAR = torch.tensor([4096.0, -8192.0, 512.0])
-
-
-def far_placement():
-    """The planes of a room far from the world's origin, as they start."""
-    receivers = [replace(one, pose=replace(one.pose, position=one.pose.position + FAR)) for one in SCENE.receivers]
-    far = replace(SCENE, receivers=tuple(receivers), lower=SCENE.lower + FAR, upper=SCENE.upper + FAR)
-    return build("placement", "mirrored", scene=far, channels=2).requires_grad_(False)
-
-
-def test_planes_of_a_room_lie_alike_wherever_the_origin_is():
-    """The walls that a training starts from stand beyond the box, and a step of training turns them about the room."""
-    here, there = build("placement", "mirrored", scene=SCENE, channels=2).requires_grad_(False), far_placement()
+def test_initial_planes_and_their_turns_do_not_depend_on_the_origin():
+    far = torch.tensor([4096.0, -8192.0, 512.0])
+    receivers = [replace(one, pose=replace(one.pose, position=one.pose.position + far)) for one in SCENE.receivers]
+    moved = replace(SCENE, receivers=tuple(receivers), lower=SCENE.lower + far, upper=SCENE.upper + far)
+    here, there = (
+        build("placement", "mirrored", scene=own, channels=2).requires_grad_(False) for own in (SCENE, moved)
+    )
     turn = 0.01 * torch.randn(here.shifts.shape, generator=torch.Generator().manual_seed(0))
     for shifts in (0 * turn, turn):
         here.shifts.copy_(shifts)
         there.shifts.copy_(shifts)
         torch.testing.assert_close(there.normals, here.normals)
-        apart = (there.offsets - there.normals @ FAR) - here.offsets
+        apart = (there.offsets - there.normals @ far) - here.offsets
         assert apart[:BOX].abs().max() < 4 * TILT * here.diagonal

@@ -1,4 +1,4 @@
-"""Whole models, plug-ins among them, asked about transmitters where no transmitter should be."""
+"""Models, also of plug-ins, for transmitters at impossible places."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ OWN = {
     "gaigs": ("gaussians.count=30", "deformation.width=16"),
     "mirrored": ("placement=mirrored", "deformation=none", "~projection", "~rasterizer"),
 }
-"""What a model needs beside its name, or what makes it quick."""
+"""Further options of a model."""
 
 CARRIER = 5e9
 WITHOUT_SETTINGS = {"kriging": "is made of a trained model", "ray_tracing": "needs a mesh of the room"}
@@ -27,18 +27,9 @@ FAR = torch.tensor([2.0**20, -(2.0**19), 2.0**18])
 
 def places_of(links):
     receiver, own = links.receivers[0].pose.position, links.query.transmitters
-    return torch.stack(
-        (
-            receiver,
-            receiver + torch.tensor([1e-6, 0, 0]),
-            receiver - torch.tensor([0, 0, 1e-3]),
-            own[0],
-            own[0] + 1e-6,
-            own.amin(0),
-            own.amax(0) + 100,
-            receiver + 99_000,
-        )
-    )
+    beside, below = receiver + torch.tensor([1e-6, 0, 0]), receiver - torch.tensor([0, 0, 1e-3])
+    places = receiver, beside, below, own[0], own[0] + 1e-6, own.amin(0), own.amax(0) + 100, receiver + 99_000
+    return torch.stack(places)
 
 
 def links_of(task, carrier, shift=0.0):
@@ -59,7 +50,7 @@ def build(name, links):
 
 
 def ask(model, links, places):
-    """Finite values in both precisions, where it has parameters with finite gradients."""
+    """Requires finite values and gradients in both precisions."""
     n = len(places)
     frequencies = None if links.query.frequencies is None else torch.full((n,), CARRIER)
     batch = replace(links.batch(links.split.test[:1]), labels=None)
@@ -73,8 +64,8 @@ def ask(model, links, places):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_models(name):
-    """For each task of ``gaigs`` and ``mirrored``, for the first task that another model takes."""
+def test_values_and_gradients_are_finite(name):
+    """For each task of ``gaigs`` and ``mirrored``, else for the first task that the model takes."""
     refusals = []
     for task in TASKS:
         links = links_of(task, CARRIER if name == "mirrored" else None)
@@ -99,7 +90,6 @@ def test_models_a_million_metres_from_the_origin(name, task):
 @pytest.mark.parametrize("push", [-1.5, 1.5])
 @pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
 def test_opacities_that_a_residual_pushes_outside_stay_in_their_range(push, dtype):
-    """However far outside, they count as 0 or 1."""
     links = links_of("spectrum", None)
     model = widen(build("gaigs", links), dtype)
     batch = links.batch(links.split.test)

@@ -1,4 +1,4 @@
-"""Channels at the elements against spherical waves from very far away, which are plane where they arrive."""
+"""Channels at the elements against spherical waves from far away, and against free space."""
 
 import cmath
 import math
@@ -49,7 +49,7 @@ def fitted(links, of_paths=False):
 
 
 def bright(pooling, row, column, amplitudes):
-    """A map that is dark but for one direction; a complex amplitude for each subcarrier."""
+    """A map with one bright direction and a complex amplitude for each subcarrier."""
     image = torch.zeros(1, pooling.channels, *pooling.grid.shape)
     for s, amplitude in enumerate(amplitudes):
         image[0, s, row, column], image[0, len(amplitudes) + s, row, column] = amplitude.real, amplitude.imag
@@ -67,7 +67,7 @@ def test_a_bright_direction_is_a_plane_wave_from_there(pattern, conjugated, rece
     query = Query(torch.tensor([[1.0, 2.0, 0.5]]), torch.tensor([receiver]))
     (found,) = pooling(bright(pooling, row, column, amplitudes), query)
 
-    # What comes from a source very far away in that direction, over what would come to the array's middle.
+    # The wave of a far source in that direction, over the wave at the array's middle.
     pose, array = POSES[receiver], links.receivers[receiver].array
     ray = pooling.grid.vectors()[row, column].double()
     places = array.elements.double() @ pose.rotation.double().T
@@ -81,13 +81,12 @@ def test_a_bright_direction_is_a_plane_wave_from_there(pattern, conjugated, rece
     expected = unit * element * torch.tensor(amplitudes) * arriving
     torch.testing.assert_close(found, expected.to(found.dtype), rtol=0, atol=1e-4 * unit.abs().max().item())
     if element:
-        assert (arriving[0] - arriving[1]).abs().min() > 0.1  # elements do tell the direction
+        assert (arriving[0] - arriving[1]).abs().min() > 0.1
 
 
 @pytest.mark.parametrize("conjugated", [False, True])
 @pytest.mark.parametrize("receiver", [0, 1])
 def test_the_direct_path_is_one_map_from_everywhere(conjugated, receiver):
-    """A transmitter in the same direction, near or far: the map that explains the one explains the other."""
     links = make(conjugated=conjugated)
     pooling, pose = fitted(links), POSES[receiver]
     ray = pooling.grid.vectors()[4, 3]
@@ -120,31 +119,25 @@ def test_without_a_common_clock_the_amplitude_is_left_and_the_arrays_sign(conjug
     torch.testing.assert_close(pooling(image, query), expected, rtol=0, atol=1e-4 * scale)
 
 
-def test_no_test_label_is_looked_at():
+def test_the_fit_reads_no_test_label():
     links = make()
     labels = links.labels.clone()
     labels[links.split.test] = torch.nan
     assert fitted(replace(links, labels=labels)).strength == fitted(links).strength
 
 
-@pytest.mark.parametrize("pattern", ["isotropic", "cosine"])
-def test_the_zone_is_what_the_elements_hear(pattern):
-    low, high = ElementSum(make(pattern).scene, [ROWS, COLUMNS]).zone
-    assert (low, high) == (0 if pattern == "cosine" else -math.pi / 2, math.pi / 2)
-
-
 def test_other_labels_and_arrays_are_refused():
-    with pytest.raises(ValueError, match="pooling 'element_sum' gives complex channels, not labels of task 'rssi'"):
-        ElementSum(example_links("rssi").scene, [4, 8])
     links = make()
     receivers = links.receivers[0], replace(links.receivers[1], array=Array.single())
-    with pytest.raises(ValueError, match="labels have 4 elements, and the array of gateway1 1; give the data's"):
-        ElementSum(replace(links, receivers=receivers).scene, [4, 8])
-    with pytest.raises(ValueError, match=r"pooling\.grid must be \[rows, columns\], two whole numbers, got \[4\]"):
-        ElementSum(links.scene, [4])
-
-
-# --- paths ---
+    cases = [
+        (example_links("rssi").scene, [4, 8], "pooling 'element_sum' gives complex channels"),
+        (replace(links, receivers=receivers).scene, [4, 8], "gateway1"),
+        (links.scene, [4], r"pooling\.grid must be \[rows, columns\], got \[4\]"),
+    ]
+    for scene, grid, message in cases:
+        with pytest.raises(ValueError, match=message):
+            ElementSum(scene, grid)
+    assert ElementSum(make("cosine").scene, [4, 8]).zone == (0, math.pi / 2)
 
 
 def direct_fields(links, index):
@@ -162,7 +155,7 @@ def direct_fields(links, index):
 @pytest.mark.parametrize("random_phases", [False, True])
 @pytest.mark.parametrize("gain", [1.0, 3e4])
 def test_a_single_path_is_heard_as_free_space(conjugated, random_phases, gain):
-    """Links some hundred metres long, on which waves are plane."""
+    """On links of some hundred metres, where waves are plane."""
     links = make(conjugated=conjugated, gain=gain, random_phases=random_phases)
     pooling = fitted(links, of_paths=True)
     far = replace(links, query=replace(links.query, transmitters=100 * links.query.transmitters + 100))
@@ -170,21 +163,7 @@ def test_a_single_path_is_heard_as_free_space(conjugated, random_phases, gain):
     heard = pooling.read(direct_fields(far, index), far.query[index])
     sign = 1 if conjugated else -1
     expected = gain * direct_waves(far.scene, far.query[index], FREQUENCIES, sign)
-    if random_phases:  # which are told between elements and subcarriers alone
+    if random_phases:
         expected = expected / direct_waves(far.scene, far.query[index], FREQUENCIES, sign, at_elements=False).sgn()
     scale = expected.abs().amax((1, 2), keepdim=True)
     assert ((heard - expected).abs() / scale).max() < 2e-3
-
-
-def test_noise_is_heard_for_what_it_is():
-    """Twice the fields are twice the channels, of which each is that of its element and subcarrier alone."""
-    links = make()
-    pooling = fitted(links, of_paths=True)
-    query = links.query[torch.tensor([0, 2])]
-    fields = torch.randn(2, 4, 3, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
-    channels = pooling.read(fields, query)
-    torch.testing.assert_close(pooling.read(2 * fields, query), 2 * channels)
-    assert channels.dtype == torch.complex64
-    ratios = channels / fields
-    friis = speed_of_light / (4 * math.pi * FREQUENCIES)  # of free space, over 1 / distance
-    torch.testing.assert_close(ratios.abs(), friis.float().expand(2, 4, 3), rtol=1e-4, atol=0)

@@ -1,5 +1,3 @@
-"""The paper's Mercator plane: its formula, its edge, and that small round Gaussians stay round."""
-
 import math
 
 import numpy as np
@@ -31,12 +29,9 @@ def test_the_plane_is_as_high_as_it_is_wide(limit):
     assert plane.period == 2 * math.pi
 
 
-def test_at_the_default_limit_alpha_is_one():
-    assert Mercator(0.01).alpha == pytest.approx(1, abs=1e-12)
-
-
 def test_a_small_round_gaussian_stays_round_anywhere():
-    """And it grows as 1 / cos(elevation), up to the limit."""
+    """At the default limit, where alpha is 1; its width grows as 1 / cos(elevation) up to the limit."""
+    assert Mercator(0.01).alpha == pytest.approx(1, abs=1e-12)
     azimuths, elevations = torch.meshgrid(
         torch.linspace(-math.pi, math.pi, 13, dtype=torch.float64),
         torch.tensor([-90, -89.9, -70, -1, 0, 30, 60, 85, 85.1, 87, 89.99, 90], dtype=torch.float64).deg2rad(),

@@ -1,4 +1,4 @@
-"""All projections: the receiver's frame, footprints against samples, the seam, the pole, and what is not drawn."""
+"""All projections: the receiver's frame, footprints against samples, the seam, the pole, gradients."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ with_a_seam = pytest.mark.parametrize("kind", [Mercator, Equirectangular])
 
 
 def ball(n, radius, dtype=torch.float32):
-    """Covariances of round Gaussians."""
+    """Semi-axes of round Gaussians."""
     return (radius * torch.eye(3, dtype=dtype)).expand(1, n, 3, 3)
 
 
@@ -29,7 +29,7 @@ def direction(azimuth, elevation, dtype=torch.float32):
 
 
 def draw(projection, means, semi_axes, pose=HERE, grid=None):
-    """The map of Gaussians that all send 1 at opacity 0.5."""
+    """The map of Gaussians of signal 1 and opacity 0.5."""
     grid = grid or Grid.degrees()
     n = len(means)
     plane = projection.plane(grid)
@@ -52,7 +52,7 @@ def test_a_gaussian_peaks_at_the_pixel_of_its_direction_in_the_receivers_frame(k
 
 @every
 @pytest.mark.parametrize("sets", [1, 3])
-def test_gaussians_that_stand_elsewhere_for_each_transmitter_are_projected_one_by_one(kind, sets):
+def test_means_may_differ_between_transmitters(kind, sets):
     generator = torch.Generator().manual_seed(0)
     means = torch.randn(3, 5, 3, generator=generator)
     means[1, 2] = 0  # on the receiver
@@ -97,20 +97,6 @@ def test_a_pixels_variance_is_added(kind):
 
 
 @with_a_seam
-def test_a_turn_about_the_vertical_rolls_the_map(kind):
-    generator = torch.Generator().manual_seed(0)
-    azimuths, elevations = torch.rand(2, 15, generator=generator) * torch.tensor([[math.tau], [1.5]])
-    columns = 175
-    grid = Grid.degrees(range(2, 91, 4))
-    images = [
-        draw(kind(PIXEL), 3 * from_spherical(azimuths + turn, elevations), ball(15, 0.3), grid=grid)
-        for turn in (0, math.radians(columns))
-    ]
-    assert images[0][:, 0].max() > 0.1  # somebody stands at the seam
-    torch.testing.assert_close(images[1], images[0].roll(columns, 1), rtol=0, atol=2e-4)
-
-
-@with_a_seam
 def test_a_gaussian_at_the_seam_is_seen_on_both_sides(kind):
     image = draw(kind(PIXEL), 3 * direction(0, 20)[None], ball(1, 0.2))
     torch.testing.assert_close(image[:, 1:20], image[:, -19:].flip(1), rtol=0, atol=1e-4)
@@ -118,7 +104,7 @@ def test_a_gaussian_at_the_seam_is_seen_on_both_sides(kind):
 
 
 @every
-def test_around_the_zenith_a_gaussian_at_the_pole_is_seen_in_all_directions(kind):
+def test_a_gaussian_at_the_pole_is_seen_at_all_azimuths(kind):
     image = draw(kind(PIXEL), torch.tensor([[0.0, 0.0, 3.0]]), ball(1, 0.8))
     assert image[84:].min() > 0.2
     assert image[84:].max() <= 0.5
@@ -146,34 +132,10 @@ def test_gradients_of_a_projected_gaussian_are_those_of_finite_differences(kind)
     assert torch.autograd.gradcheck(project, (means, half))
 
 
-@every
-@pytest.mark.parametrize("pixel", [0, -0.1, math.nan])
-def test_a_pixel_of_no_width_is_refused(kind, pixel):
-    with pytest.raises(ValueError, match=f"wider than 0 rad, got {pixel}"):
-        kind(pixel)
-
-
-@with_a_seam
-@pytest.mark.parametrize("limit", [0, 90, -5, 180, math.nan])
-def test_a_limit_at_the_pole_or_beyond_is_refused(kind, limit):
-    with pytest.raises(ValueError, match=f"between 0 and 90 degrees, got {limit}"):
-        kind(PIXEL, limit)
-
-
-# --- lists of rays ---
-
-
-@every
-def test_a_map_of_rays_is_that_of_the_pixels(kind):
-    generator = torch.Generator().manual_seed(0)
-    grid = Grid.degrees(range(2, 91, 8), range(0, 360, 15))
-    n, projection = 30, kind(grid.pitch)
-    means = 3 * torch.randn(n, 3, generator=generator)
-    splats = projection.project(means, ball(n, 0.5), HERE)
-    others = torch.randn(2, n, 3, generator=generator), torch.rand(2, n, generator=generator), None
-    whole, left = TorchRasterizer()(splats, *others, projection.plane(grid))
-    chosen = torch.randperm(12 * 24, generator=generator)[:40]
-    image, passed = TorchRasterizer()(splats, *others, projection.plane(grid.flatten()[chosen]))
-    assert image.shape == (2, 3, 1, 40)
-    torch.testing.assert_close(image[:, :, 0], whole.flatten(2)[:, :, chosen], rtol=0, atol=1e-5)
-    torch.testing.assert_close(passed[:, 0], left.flatten(1)[:, chosen], rtol=0, atol=1e-5)
+def test_pixels_of_no_width_and_limits_at_the_pole_are_refused():
+    for pixel in (0.0, math.nan):
+        with pytest.raises(ValueError, match=f"wider than 0 rad, got {pixel}"):
+            DirectionCosine(pixel)
+    for limit in (0.0, 90.0, math.nan):
+        with pytest.raises(ValueError, match=f"between 0 and 90 degrees, got {limit}"):
+            Mercator(PIXEL, limit)

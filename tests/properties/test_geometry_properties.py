@@ -1,20 +1,22 @@
-"""Rotations, semi-axes and angles of arbitrary quaternions and points."""
+"""Rotations, semi-axes, angles and mirror images of arbitrary quaternions, points and planes."""
 
 import math
 
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import normals, points, poses, quaternions, tensors
+from strategies import coordinates, normals, points, quaternions, tensors
 
+from gaigs.algebra import PROJECTIVE
+from gaigs.algebra.embedding import embed_point, embed_reflection, extract_point
 from gaigs.geometry import (
     from_spherical,
     quaternions_to_rotations,
     semi_axes,
-    spherical_harmonics,
     to_spherical,
     unit_quaternions,
 )
+from gaigs.placement.mirrored.reflections import reflect
 
 lengths = st.sampled_from([1e-30, 1e-6, 1.0, 1e6, 1e30])
 dtypes = st.sampled_from([torch.float32, torch.float64])
@@ -60,16 +62,10 @@ def test_angles_lead_back_to_the_point(direction, distance):
     torch.testing.assert_close(length * from_spherical(azimuth, elevation), point, rtol=0, atol=1e-9 * distance)
 
 
-@given(poses(), points)
-def test_a_pose_takes_back_what_it_gives(pose, point):
-    torch.testing.assert_close(pose.world(pose.local(point)), point, rtol=0, atol=1e-10)
-    torch.testing.assert_close(pose.local(point).norm(), (point - pose.position).norm(), rtol=1e-9, atol=1e-12)
-
-
-@given(normals(), st.integers(0, 5))
-def test_harmonics_of_a_degree_have_the_same_size_everywhere(direction, degree):
-    """Unsöld's theorem: the squares of one degree add up to (2 n + 1) / 4 pi in each direction."""
-    values = spherical_harmonics(direction, degree).square()
-    for n in range(degree + 1):
-        total = values[n**2 : (n + 1) ** 2].sum().item()
-        assert abs(total - (2 * n + 1) / (4 * math.pi)) < 1e-10
+@given(normals(), coordinates, points)
+def test_a_reflection_undoes_itself_and_is_the_sandwich_with_the_plane(normal, offset, point):
+    offset = torch.tensor(offset, dtype=torch.float64)
+    once = reflect(point, normal, offset)
+    torch.testing.assert_close(reflect(once, normal, offset), point, rtol=0, atol=1e-10)
+    versor = embed_reflection(normal, offset)
+    torch.testing.assert_close(extract_point(PROJECTIVE.sandwich(versor, embed_point(point))), once, rtol=0, atol=1e-9)

@@ -1,5 +1,3 @@
-"""``gaigs.rasterize``: maps of plain tensors."""
-
 import functools
 
 import pytest
@@ -19,9 +17,6 @@ def cloud(n=5, b=None, dtype=torch.float64):
 
 
 POSE = gaigs.Pose.from_xyzw([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-FINE = gaigs.registries["projection"].build("mercator", pixel=0.1)
-"""An object of a pixel of its own."""
-
 COARSE = gaigs.Grid.degrees(elevations=range(5, 90, 10), azimuths=range(0, 360, 20))
 
 
@@ -54,7 +49,7 @@ def test_a_batch_is_its_maps_one_by_one(batched):
 
 def test_rays_are_pixels_of_the_grid():
     inputs = cloud()
-    grid, _ = gaigs.rasterize(**inputs, receiver=POSE, grid=COARSE, projection=FINE, rasterizer="torch")
+    grid, _ = gaigs.rasterize(**inputs, receiver=POSE, grid=COARSE, pixel=0.1, rasterizer="torch")
     rays, left = gaigs.rasterize(**inputs, receiver=POSE, grid=COARSE.flatten(), pixel=0.1, rasterizer="torch")
     assert left.shape == (9 * 18,)
     torch.testing.assert_close(rays, grid.flatten(1))
@@ -63,16 +58,13 @@ def test_rays_are_pixels_of_the_grid():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"quats": torch.ones(4, 4)}, r"quats must be \(5, 4\) or \('b', 5, 4\), got \(4, 4\)"),
+        ({"quats": torch.ones(4, 4)}, r"quats must have 5 rows of 4, got \(4, 4\)"),
         ({"opacities": torch.ones(5)}, "opacities must be real numbers of means' torch.float64, got torch.float32"),
         ({"signal": torch.ones(2, 5, 1).double(), "means": torch.ones(3, 5, 3).double()}, "one number of transmitters"),
         ({"grid": COARSE.flatten()}, "pixel must be given for rays"),
         ({"grid": gaigs.Grid(torch.arange(1.0, 90.0), torch.arange(360.0))}, "Grid.degrees takes degrees"),
         ({"rasterizer": "torhc"}, r"unknown rasterizer 'torhc' \(did you mean 'torch'\?\)"),
-        (
-            {"projection": "direction_cosine", "grid": gaigs.Grid.degrees(range(-40, 50, 10))},
-            "the grid reaches below the array's plane, which direction_cosine folds",
-        ),
+        ({"projection": "direction_cosine", "grid": gaigs.Grid.degrees(range(-40, 50, 10))}, "below the array's plane"),
     ],
 )
 def test_tensors_that_do_not_fit_are_refused(changes, message):
@@ -90,5 +82,5 @@ def test_the_beamformer_is_the_sum_over_elements_and_has_a_gradient_in_its_nulls
     silent = torch.zeros(1, 6, 1, dtype=torch.complex128, requires_grad=True)
     bartlett(silent, COARSE, array, 1e9).sum().backward()
     assert torch.equal(silent.grad, torch.zeros_like(silent))
-    with pytest.raises(ValueError, match=r"of the array's 6 elements, got \(2, 5, 3\)"):
+    with pytest.raises(ValueError, match=r"of 6 elements, got torch.complex128 \(2, 5, 3\)"):
         bartlett(waves[:, :5], COARSE, array, 1e9)

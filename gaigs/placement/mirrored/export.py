@@ -1,4 +1,4 @@
-"""The room that mirrored Gaussians have learnt: planes, obstacles and paths for tables, figures and other programs."""
+"""The learnt room of mirrored Gaussians: tables, figures and files of planes, obstacles and paths."""
 
 import math
 from pathlib import Path
@@ -23,21 +23,17 @@ NEPER = 20 / math.log(10)
 """One neper of a field [dB]."""
 
 SEEN = 0.01
-"""Share of a link's power from which a bounce tells how far the room reaches."""
+"""Share of a link's power from which a bounce counts as a point of its plane."""
 
 TOLERANCE = 0.02
-"""Distance that places may lie behind a wall [diagonals]: places and walls are known to some centimetres."""
+"""Distance that places may lie behind a wall [diagonals], since places and walls are uncertain."""
 
 
 class Planes(NamedTuple):
-    """All learnt planes; float64.
+    """All learnt planes: unit normals out of the room, offsets from the world's origin [m]; float64.
 
-    Attributes:
-        normals: Unit normals, out of the room.
-        offsets: Offsets along them, from the world's origin [m].
-        losses: Loss of a reflection at normal incidence, in the plane's middle [dB].
-        middles: Points where the planes reflect best [m].
-        extents: Standard deviations of their windows along the world's axes [m].
+    ``losses`` are the least losses of a reflection at normal incidence [dB], ``middles`` the points with them [m],
+    ``extents`` the standard deviations of the reflecting areas along the world's axes [m].
     """
 
     normals: Float[ndarray, "w 3"]
@@ -48,13 +44,10 @@ class Planes(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """Powers and courses of the kept paths of some links.
+    """Powers and bounces of the kept paths of some links.
 
-    Attributes:
-        sequences: Planes of each kept path.
-        powers: Received powers, free space included; 0 where there is no path.
-        bounces: Points on the planes of each sequence; NaN in place of a plane [m].
-        transmitters, receivers: Ends of the links [m].
+    ``powers`` include free space, 0 for no path; ``bounces`` are points on the planes of each sequence, NaN for a
+    missing plane [m].
     """
 
     sequences: Int[ndarray, "n order"]
@@ -71,7 +64,6 @@ class Survey(NamedTuple):
 
     @property
     def ends(self) -> Float[ndarray, "k 3"]:
-        """Transmitters and receivers [m]."""
         return np.concatenate((self.transmitters, self.receivers))
 
 
@@ -85,17 +77,13 @@ def all_over(scene: Scene) -> Query:
     """Links evenly spread over the training transmitters' box, the receivers and the carriers."""
     number = torch.arange(256)
     shares = torch.quasirandom.SobolEngine(3).draw(len(number)).to(scene.lower)
-    known = scene.frequencies
-    return Query(
-        scene.lower + (scene.upper - scene.lower) * shares,
-        number % len(scene.receivers),
-        known[number % len(known)] if len(known) else None,
-    )
+    carriers = scene.frequencies[number % len(scene.frequencies)] if len(scene.frequencies) else None
+    return Query(scene.lower + (scene.upper - scene.lower) * shares, number % len(scene.receivers), carriers)
 
 
 @torch.no_grad()
 def survey(placement: Mirrored, query: Query) -> Survey:
-    """Powers and courses of the kept paths of some links, before a deformation or a rasterizer changes them."""
+    """Powers and bounces of the kept paths of some links, without a deformation."""
     device = placement.sequences.device
     sequences, normals, offsets = placement.sequences[placement.kept], placement.normals, placement.offsets
     positions = placement.scene.positions(normals)
@@ -114,20 +102,10 @@ def survey(placement: Mirrored, query: Query) -> Survey:
     return Survey(*(part.cpu().numpy() for part in parts))
 
 
-# --- tables ---
-
-
 def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
-    """Tables of planes and paths for ``metrics.json``.
+    """Tables of planes, strongest first, and of paths by their number of bounces, for ``metrics.json``.
 
-    Args:
-        placement: The planes and paths.
-        query: Links over which shares of the received power are means.
-
-    Returns:
-        ``planes``, the strongest first: number, unit normal out of the room, offset along it from the world's origin
-        [m], loss of a reflection at normal incidence [dB], and share of the power and number of the kept paths by way
-        of it. ``paths``, by their number of bounces: number kept, and share.
+    Shares are those of the kept paths in the received power, means over the links of the query.
     """
     found = survey(placement, query)
     all_planes = _planes(placement, found)
@@ -138,21 +116,17 @@ def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
             "normal": [round(part, 4) for part in all_planes.normals[number].tolist()],
             "offset_m": round(all_planes.offsets[number].item(), 4),
             "loss_db": round(all_planes.losses[number].item(), 2),
-            "share": round(shares[number], 5),
+            "share": round(share, 5),
             "paths": int((found.sequences == number).any(1).sum()),
         }
-        for number in shares
+        for number, share in shares.items()
     ]
     counts = (found.sequences >= 0).sum(1)
     means = found.shares.mean(0)
-    paths = [
-        {
-            "bounces": bounces,
-            "kept": int((counts == bounces).sum()),
-            "share": round(means[counts == bounces].sum().item(), 5),
-        }
-        for bounces in range(found.sequences.shape[1] + 1)
-    ]
+    paths = []
+    for bounces in range(found.sequences.shape[1] + 1):
+        own = counts == bounces
+        paths.append({"bounces": bounces, "kept": int(own.sum()), "share": round(means[own].sum().item(), 5)})
     return {"planes": planes, "paths": paths}
 
 
@@ -163,7 +137,7 @@ def _planes(placement: Mirrored, found: Survey) -> Planes:
     gains = reflected.abs().log() + placement.plane_gains
     parts = placement.normals, placement.offsets, gains, placement.middles, placement.log_extents.exp()
     normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
-    # A window's middle need not lie on its plane: the point of the plane with the least loss, and that loss [Np].
+    # The middle of the reflecting area need not lie on the plane: take the plane's point with the least loss.
     steep = extents**2 * normals
     spread = (steep * normals).sum(1)
     apart = offsets - (normals * middles).sum(1)
@@ -175,23 +149,19 @@ def _planes(placement: Mirrored, found: Survey) -> Planes:
 
 
 def _plane_shares(found: Survey) -> dict[int, float]:
-    """Share of the power by way of each used plane, the largest first."""
+    """Share of each used plane's paths in the power, largest first."""
     means = found.shares.mean(0)
     numbers = np.unique(found.sequences[found.sequences >= 0]).tolist()
     shares = {number: means[(found.sequences == number).any(1)].sum().item() for number in numbers}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-# --- shapes ---
-
-
 def outlines(placement: Mirrored, found: Survey) -> list[LearntPlane]:
-    """The planes as convex polygons, the strongest first.
+    """The planes as convex polygons, strongest first.
 
-    A wall has all transmitters and receivers on one side. It reaches to the other walls, to the edge of its window, or
-    to the box around the surveyed points, whichever is nearest. A plane that cuts through the room, as furniture does,
-    is the rectangle in which paths bounce off it, within walls and box. Planes that no path meets, or that lie outside
-    the box, are left out.
+    A wall has all transmitters and receivers on one side. It reaches to the other walls, to the edge of its reflecting
+    area, or to the box around the surveyed points, whichever is nearest. Any other plane, such as furniture, is the
+    rectangle around its bounces, within walls and box. Planes without paths, or outside the box, are left out.
     """
     normals, offsets, _, middles, extents = _planes(placement, found)
     shares = _plane_shares(found)
@@ -208,21 +178,28 @@ def outlines(placement: Mirrored, found: Survey) -> list[LearntPlane]:
         link, path, step = np.nonzero((found.sequences == number) & (weights > 0)[..., None])
         if not len(link):
             continue
-        basis = _basis(normal)
+        # Two unit vectors of the plane, right-handed with its normal; the first is level.
+        level = np.cross((0.0, 0.0, 1.0), normal)
+        length = np.linalg.norm(level)
+        level = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
+        basis = np.stack((level, np.cross(normal, level)), 1)
         # Walls that face the same way, such as one behind another, do not cut each other.
         sides = box + [(normals[k], offsets[k]) for k in walls if k != number and normals[k] @ normal < 0.9]
         if number in walls:
             middle = (lower + upper) / 2
             middle = middle - (middle @ normal - offset) * normal
-            corners = _rectangle(middle, basis, np.full(2, -2 * diagonal), np.full(2, 2 * diagonal))
+            low, high = np.full(2, -2 * diagonal), np.full(2, 2 * diagonal)
             edge = 2 * extents[number]  # there it reflects 17 dB less than in its middle
             sides += _sides(middles[number] - edge, middles[number] + edge)
         else:
             own = weights[link, path]
             points = found.bounces[link, path, step][own >= SEEN * own.max()]
-            flat = (points - offset * normal) @ basis
-            rim = TOLERANCE * diagonal
-            corners = _rectangle(offset * normal, basis, flat.min(0) - rim, flat.max(0) + rim)
+            middle = offset * normal
+            flat = (points - middle) @ basis
+            low, high = flat.min(0) - TOLERANCE * diagonal, flat.max(0) + TOLERANCE * diagonal
+        # Counterclockwise against the normal.
+        flat = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+        corners = middle + flat @ basis.T
         for side in sides:
             corners = _cut(corners, *side)
         if len(corners):
@@ -230,27 +207,13 @@ def outlines(placement: Mirrored, found: Survey) -> list[LearntPlane]:
     return drawn
 
 
-def _sides(lower: Float[ndarray, "3"], upper: Float[ndarray, "3"]) -> list[tuple[Float[ndarray, "3"], float]]:
+def _sides(lower: Float[ndarray, "3"], upper: Float[ndarray, "3"]) -> list[tuple[Float[ndarray, "3"], np.floating]]:
     """A box as six planes: normals outwards, and offsets [m]."""
     axes = np.eye(3)
     return [*zip(axes, upper, strict=True), *zip(-axes, -lower, strict=True)]
 
 
-def _basis(normal: Float[ndarray, "3"]) -> Float[ndarray, "3 2"]:
-    """Two unit vectors of a plane, which with its normal are right-handed; the first is level."""
-    level = np.cross((0.0, 0.0, 1.0), normal)
-    length = np.linalg.norm(level)
-    level = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])  # of floor and ceiling any is level
-    return np.stack((level, np.cross(normal, level)), 1)
-
-
-def _rectangle(origin, basis, low, high) -> Float[ndarray, "4 3"]:
-    """Corners, counterclockwise against the normal."""
-    flat = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
-    return origin + flat @ basis.T
-
-
-def _cut(corners: Float[ndarray, "c 3"], normal: Float[ndarray, "3"], offset: float) -> Float[ndarray, "k 3"]:
+def _cut(corners: Float[ndarray, "c 3"], normal: Float[ndarray, "3"], offset: np.floating) -> Float[ndarray, "k 3"]:
     """The part of a convex polygon with normal . x <= offset.
 
     Source: Sutherland and Hodgman, Reentrant polygon clipping, 1974.
@@ -280,38 +243,36 @@ def learnt_room(placement: Mirrored, links: Links) -> LearntRoom:
         blobs = placement.obstacles
         parts = blobs.centres, blobs.widths, NEPER * blobs.densities
         matter = Matter(*(part.cpu().double().numpy() for part in parts))
-    return LearntRoom(outlines(placement, found), matter, strongest(survey(placement, test[first])))
+    heard = survey(placement, test[first])
+    powers = heard.powers / heard.powers.max(initial=np.finfo(float).tiny)
+    paths = []  # at most 20, within 30 dB of the strongest
+    for link, path in zip(*np.unravel_index(np.argsort(-powers, axis=None)[:20], powers.shape), strict=True):
+        if powers[link, path] >= 1e-3:
+            bounces = heard.bounces[link, path][heard.sequences[path] >= 0]
+            points = np.concatenate((heard.transmitters[link, None], bounces, heard.receivers[link, None]))
+            paths.append(LearntPath(points, 10 * math.log10(powers[link, path])))
+    return LearntRoom(outlines(placement, found), matter, paths)
 
 
-def strongest(found: Survey) -> list[LearntPath]:
-    """The strongest paths of all links, at most 20, and within 30 dB of the strongest."""
-    powers = found.powers / found.powers.max(initial=np.finfo(float).tiny)
-    order = np.argsort(-powers, axis=None)[:20]
-    paths = []
-    for link, path in zip(*np.unravel_index(order, powers.shape), strict=True):
-        if powers[link, path] < 1e-3:
-            break
-        bounces = found.bounces[link, path][found.sequences[path] >= 0]
-        points = np.concatenate((found.transmitters[link, None], bounces, found.receivers[link, None]))
-        paths.append(LearntPath(points, 10 * math.log10(powers[link, path])))
-    return paths
-
-
-# --- files ---
-
-
+@torch.no_grad()
 def export(placement: Mirrored, query: Query, folder: Path) -> None:
-    """Writes ``planes.obj``, and ``obstacles.ply`` where there are obstacles.
-
-    Args:
-        placement: The planes and obstacles.
-        query: Links whose paths tell how far planes reach.
-        folder: Folder of the files.
-    """
-    found = survey(placement, query)
-    write_text(folder / "planes.obj", wavefront_obj(placement, found))
-    if placement.obstacles is not None:
-        save_obstacles(placement, folder / "obstacles.ply")
+    """Writes ``planes.obj``, the planes as far as the query's paths reach, and ``obstacles.ply`` for any obstacles."""
+    write_text(folder / "planes.obj", wavefront_obj(placement, survey(placement, query)))
+    blobs = placement.obstacles
+    if blobs is None:
+        return
+    # Grey, and as opaque as the share of power lost through the middle of an obstacle of its mean width.
+    depths = blobs.densities * math.sqrt(2 * math.pi) * blobs.widths.log().mean(1).exp()
+    parts = {
+        "means": blobs.centres,
+        "quats": torch.tensor([1.0, 0, 0, 0]).expand(len(blobs), 4),
+        "log_scales": blobs.log_widths,
+        # log((1 - t) / t) with t = exp(-2 depth), without a difference of nearly equal numbers.
+        "opacity_logits": 2 * depths + torch.log(-torch.expm1(-2 * depths)),
+        "signal": torch.zeros(len(blobs), 3, 1),
+    }
+    comment = "gaigs: obstacles; places in metres; opacity: share of power lost through the middle"
+    write_ply(folder / "obstacles.ply", parts, comment)
 
 
 def wavefront_obj(placement: Mirrored, found: Survey) -> str:
@@ -319,7 +280,7 @@ def wavefront_obj(placement: Mirrored, found: Survey) -> str:
     planes = _planes(placement, found)
     lines = [
         "# Planes learnt by gaigs; coordinates in metres, z up, the world frame of the data.",
-        "# loss: of a reflection at normal incidence; share: of the received power that comes by way of the plane.",
+        "# loss: of a reflection at normal incidence; share: of the plane's paths in the received power.",
     ]
     count = 0
     for plane in outlines(placement, found):
@@ -334,23 +295,3 @@ def wavefront_obj(placement: Mirrored, found: Survey) -> str:
         ]
         count += len(plane.corners)
     return "\n".join(lines) + "\n"
-
-
-@torch.no_grad()
-def save_obstacles(placement: Mirrored, path: Path) -> None:
-    """Writes the obstacles as a .ply for viewers of 3-D Gaussian splatting.
-
-    They are grey, and as opaque as the share of power lost through the middle of an obstacle of its mean width.
-    """
-    blobs = placement.obstacles
-    depths = blobs.densities * math.sqrt(2 * math.pi) * blobs.widths.log().mean(1).exp()
-    # log((1 - t) / t) with t = exp(-2 depth), without the difference that would lose all digits of a faint one.
-    logits = 2 * depths + torch.log(-torch.expm1(-2 * depths))
-    parts = {
-        "means": blobs.centres,
-        "quats": torch.tensor([1.0, 0, 0, 0]).expand(len(blobs), 4),
-        "log_scales": blobs.log_widths,
-        "opacity_logits": logits,
-        "signal": torch.zeros(len(blobs), 3, 1),
-    }
-    write_ply(path, parts, "gaigs: obstacles; places in metres; opacity: share of power lost through the middle")

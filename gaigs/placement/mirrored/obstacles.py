@@ -1,4 +1,4 @@
-"""Obstacles: Gaussians of matter in the room that attenuate every path through them, as in tomography."""
+"""Obstacles: Gaussians of matter in the room that attenuate paths."""
 
 import math
 
@@ -15,12 +15,13 @@ class Obstacles(nn.Module):
 
         depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B / sqrt(2 A)))
 
-    Args:
-        count: Number of Gaussians.
-        lower, upper: Corners of the box that holds transmitters and receivers [m].
+    ``lower`` and ``upper`` are corners of the box around transmitters and receivers [m].
 
-    Source: the integral of a Gaussian along a line; Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
+    Source: Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
     """
+
+    origin: Tensor
+    unit: Tensor
 
     def __init__(self, count: int, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]):
         super().__init__()
@@ -30,7 +31,7 @@ class Obstacles(nn.Module):
         self.register_buffer("origin", (low + high) / 2)
         self.register_buffer("unit", torch.tensor(diagonal * 0.12))  # so that learning rates suit rooms of any size
         self.places = nn.Parameter((torch.rand(count, 3) - 0.5) * (high - low) / self.unit)
-        # The size of furniture, and so thin that a path through one is attenuated by a fraction of a decibel.
+        # As large as furniture; a path through one is attenuated by a fraction of a decibel.
         self.log_widths = nn.Parameter(torch.full((count, 3), math.log(0.05 * diagonal)))
         self.log_densities = nn.Parameter(torch.full((count,), math.log(0.8 / diagonal)))
 
@@ -39,7 +40,6 @@ class Obstacles(nn.Module):
 
     @property
     def centres(self) -> Float[Tensor, "k 3"]:
-        """World frame [m]."""
         return self.origin + self.unit * self.places
 
     @property
@@ -58,7 +58,7 @@ class Obstacles(nn.Module):
 
 
 class _Depth(torch.autograd.Function):
-    """The depth with its gradient in closed form, in half the time of the recorded one.
+    """The depth with its gradient in closed form, in half of autograd's time.
 
     With r = sqrt(1 / (2 A)), g = exp(-(C - B²/A) / 2), E = erf((A + B) r) - erf(B r), depth = rho l sqrt(pi) r g E, and
     d E = 2 / sqrt(pi) (e1 d((A + B) r) - e0 d(B r)) with e1 = exp(-((A + B) r)²), e0 = exp(-(B r)²).
@@ -91,13 +91,13 @@ class _Depth(torch.autograd.Function):
         d_c = -0.5 * each
         widths = (-2 * log_widths).exp()  # inverse squares
         ray = end - start
-        # A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w: sums are products of matrices. The narrow
-        # one stands on the left, which takes a CPU a third to a sixth of the time.
+        # A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w: sums are products of matrices. With the
+        # narrow one on the left they take a CPU a third to a sixth of the time.
         narrow = torch.cat((widths, centres * widths), 1).T @ torch.cat((d_a, d_b, d_c)).T
         rows, columns = narrow.unflatten(1, (3, -1)).movedim(0, -1).split(3, -1)
         d_ray = 2 * ray * rows[0] + start * rows[1] - columns[1]
         d_offset = ray * rows[1] + 2 * (start * rows[2] - columns[2])
-        unit = ray / length.clamp_min(1e-30)[:, None]  # a leg of no length has no direction, and its ray is 0
+        unit = ray / length.clamp_min(1e-30)[:, None]  # 0 for a leg of length 0
         d_length = (each.sum(-1) / length.clamp_min(1e-30))[:, None] * unit
         d_end = d_ray + d_length
         d_start = d_offset - d_end

@@ -1,4 +1,4 @@
-"""The placement of mirrored Gaussians: reflection paths by way of learnt planes."""
+"""The placement of mirrored Gaussians: reflection paths at learnt planes."""
 
 import logging
 import math
@@ -30,13 +30,13 @@ BOX = 6
 """Planes at the start: one beyond each face of the box that holds transmitters and receivers."""
 
 TILT = 0.05
-"""Standard deviation of the random tilt of the first planes: exactly parallel planes would have equal gradients."""
+"""Standard deviation of the random tilt of the first planes: parallel planes would have equal gradients."""
 
 PERMITTIVITY, CONDUCTIVITY = 4.0, 0.3
 """Real and imaginary part of the planes' relative permittivity at the start: between wood and concrete."""
 
 UNIT = 0.12
-"""Unit of the parameters of plane offsets [diagonals of the box], so that learning rates suit rooms of any size."""
+"""Unit of the parameters of plane offsets [diagonals of the box]: learning rates suit rooms of any size."""
 
 
 @register("placement", "mirrored")
@@ -55,9 +55,7 @@ class Mirrored(Placement):
     tau_k of the obstacles along the folded path. Polarisation is vertical: TE at upright planes, TM at level ones,
     weighted by n_z² in between. A path that does not meet its planes in their order does not exist.
 
-    Paths add as powers until ``enable_phases``: powers locate planes to some centimetres, and phases need a fraction of
-    the wavelength. Channels start from free space, the direct path without obstacles and spread, until
-    ``enable_reflections``.
+    Paths add as powers until ``enable_phases``. Channels start from free space until ``enable_reflections``.
 
     Args:
         scene: Its box and receivers give the first planes.
@@ -65,12 +63,9 @@ class Mirrored(Placement):
         planes: Largest number of planes; six at the start, the search finds the others.
         order: Largest number of reflections of a path.
         obstacles: Number of Gaussians of matter in the room; 0 for none.
-        walls: File of walls to start from: a floor plan ``.csv`` of consecutive vertices x,y [m], or a Wavefront
-            ``.obj`` [m], of which the largest planes are taken; None: the box's faces. A checkpoint does not need it.
-        fixed: True if planes stay where they start.
-
-    Raises:
-        ValueError: An option is out of range.
+        walls: File whose largest planes are the first ones: a floor plan ``.csv`` of consecutive vertices x,y [m], or a
+            Wavefront ``.obj`` [m]. None: the box's faces. A checkpoint does not need the file.
+        fixed: True if planes stay at the start.
 
     Source: ours; Allen and Berkley, Image method for efficiently simulating small-room acoustics, 1979, for images;
     Roelfs and De Keninck, Graded Symmetry Groups: Plane and Simple, 2023, for reflections as versors.
@@ -81,6 +76,15 @@ class Mirrored(Placement):
     model = "mirrored"
     learning_rates: Mapping[str, float] = {"planes": 1e-2, "paths": 2e-2, "obstacles": 2.5e-2}
     penalty_weights: Mapping[str, float] = {"obstacles": 4e-4}  # matter only where paths are attenuated
+    pivot: Tensor
+    origin: Tensor
+    step: Tensor
+    sequences: Tensor
+    kept: Tensor
+    most: Tensor
+    coherent: Tensor
+    is_bare: Tensor
+    planned: Tensor
 
     def __init__(
         self,
@@ -117,7 +121,7 @@ class Mirrored(Placement):
         self.register_buffer("step", torch.ones(()))
         sequences = all_sequences(planes, order)
         self.register_buffer("sequences", sequences, persistent=False)
-        self.register_buffer("kept", ((sequences < BOX).all(1)))
+        self.register_buffer("kept", (sequences < BOX).all(1))
         self.register_buffer("most", self.kept.sum())
         self.register_buffer("coherent", torch.tensor(False))
         self.register_buffer("is_bare", torch.tensor(False), persistent=is_complex)
@@ -148,12 +152,7 @@ class Mirrored(Placement):
         self.holds, self.held = False, None
 
     def fit(self, links: Links) -> None:
-        """Starts from the user's walls, where there are any.
-
-        Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: It holds no planes.
-        """
+        """Starts from the user's walls, if there are any."""
         if self.walls is None:
             return
         planes = read_planes(Path(self.walls), *self.box).to(self.origin)
@@ -164,8 +163,6 @@ class Mirrored(Placement):
         for plane, (*normal, offset) in enumerate(planes):
             self.place(plane, torch.stack(normal), offset.item())
         self.kept.copy_(self.sequences_of(torch.arange(len(planes), device=self.kept.device)))
-
-    # --- the room ---
 
     @property
     def normals(self) -> Float[Tensor, "w 3"]:
@@ -180,13 +177,12 @@ class Mirrored(Placement):
 
     @property
     def used(self) -> Int[Tensor, " k"]:
-        """Planes that a kept path meets."""
+        """Planes of the kept paths."""
         found = self.sequences[self.kept].unique()
         return found[found >= 0]
 
     @torch.no_grad()
     def place(self, plane: int, normal: Float[Tensor, "3"], offset: float) -> None:
-        """Moves a plane to a normal and an offset [m]."""
         self.origin[plane] = torch.cat((functional.normalize(normal, dim=0), normal.new_tensor([offset])))
         self.shifts[plane] = 0
 
@@ -205,11 +201,7 @@ class Mirrored(Placement):
 
     @torch.no_grad()
     def start_from_free_space(self, gains: Complex[Tensor, " receivers"]) -> None:
-        """Leaves the direct path alone, without obstacles and spread.
-
-        Args:
-            gains: Gain of each receiver over the pooling's unit, not 0.
-        """
+        """Keeps only the direct path, without obstacles and spread; gains are over the pooling's unit, not 0."""
         self.planned.copy_(self.kept)
         self.kept.copy_(self.sequences_of(self.used[:0]))
         self.is_bare.fill_(True)
@@ -218,20 +210,18 @@ class Mirrored(Placement):
 
     @torch.no_grad()
     def enable_reflections(self) -> None:
-        """Ends ``start_from_free_space``: planes reflect, obstacles attenuate, paths spread."""
+        """Ends ``start_from_free_space``."""
         self.kept.copy_(self.planned)
         self.is_bare.fill_(False)
 
     @contextmanager
     def holding(self) -> Iterator[None]:
-        """Keeps the strengths of the first query within the context, while images follow the planes: for searches."""
+        """Keeps the first query's strengths within the context, while images follow the planes."""
         self.holds = True
         try:
             yield
         finally:
             self.holds, self.held = False, None
-
-    # --- the Gaussians of a query ---
 
     def forward(self, gaussians: Gaussians | None, query: Query) -> Placed:
         """Gaussians at the images of each transmitter, followed by the free ones."""
@@ -256,7 +246,7 @@ class Mirrored(Placement):
             gains = gains * torch.polar(torch.ones_like(phases), phases)
             coherences = (-self.log_blurs[self.kept].exp().square() / 2).exp()
         if distributed.is_available() and distributed.is_initialized():
-            # Each of several processes waits for the gradients of all parameters, also of unused ones.
+            # Each process waits for the gradients of all parameters, also of unused ones.
             gains = gains + 0 * sum(parameter.sum() for parameter in self.parameters() if parameter.requires_grad)
         signal = lengths.new_zeros(len(sequences), self.channels, 1)
         signal[:, 0] = 1
@@ -268,7 +258,7 @@ class Mirrored(Placement):
         return placed if gaussians is None else _beside(placed, gaussians)
 
     def strengths(self, query: Query, folded: Folded) -> Complex[Tensor, "b n"]:
-        """Field of each kept path over free space, after reflections and obstacles; 0 where there is no path."""
+        """Field of each kept path over free space, after reflections and obstacles; 0 for no path."""
         left = self.path_gains[self.kept] + self.receiver_gains[query.receivers, None]
         if self.obstacles is not None and not self.is_bare:
             left = left.index_add(1, folded.path, -self.obstacles(folded.start, folded.end))
@@ -302,7 +292,7 @@ class Mirrored(Placement):
         return gains
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Positions of planes; what is learnt of each plane, path and receiver; obstacles."""
+        """Positions of planes; other parameters of planes, paths and receivers; obstacles."""
         obstacles = [] if self.obstacles is None else [*self.obstacles.parameters()]
         apart = {id(parameter) for parameter in (self.shifts, *obstacles)}
         groups = {} if self.fixed else {"planes": [self.shifts]}

@@ -1,4 +1,4 @@
-"""Reflection paths: sequences of planes, their images, and the way of each path through the room."""
+"""Reflection paths: sequences of planes, images, and bounces of each path."""
 
 import itertools
 from typing import NamedTuple
@@ -10,13 +10,13 @@ from torch.nn import functional
 
 
 class Bounces(NamedTuple):
-    """Points where the paths of some length or more meet a plane.
+    """One bounce of each sequence of a least length, from sequence ``first`` on.
 
     Attributes:
-        first: Number of the first of these sequences.
-        planes: Plane of each (w,).
-        points: Points on it (b, w, 3) [m].
-        cosines: Cosines of the angles of incidence (b, w).
+        first: Number of the first such sequence.
+        planes: Plane of each.
+        points: Points on it [m].
+        cosines: Cosines of the angles of incidence.
     """
 
     first: int
@@ -29,8 +29,8 @@ class Folded(NamedTuple):
     """Paths through the room; a leg is a straight piece from one bounce to the next.
 
     Attributes:
-        start, end: Ends of all legs (b, s, 3) [m].
-        path: Number of the sequence of each leg (s,).
+        start, end: Ends of all legs [m].
+        path: Number of the sequence of each leg.
         bounces: The last bounce of each sequence, the last but one, and so on.
         exists: True if a path meets its planes in their order, from inside the room (b, n).
     """
@@ -43,9 +43,9 @@ class Folded(NamedTuple):
 
 
 def all_sequences(planes: int, order: int) -> Int[Tensor, "n order"]:
-    """All sequences of at most ``order`` planes, no plane twice in a row; by length, shorter ones with -1 in front.
+    """All sequences of at most ``order`` planes as a wave meets them, no plane twice in a row; shorter ones first.
 
-    The wave from the transmitter meets the first plane of a sequence first.
+    Shorter ones have -1 in front.
     """
     found = []
     for length in range(order + 1):
@@ -56,7 +56,7 @@ def all_sequences(planes: int, order: int) -> Int[Tensor, "n order"]:
 
 
 def reflect(
-    points: Float[Tensor, "*batch 3"], normals: Float[Tensor, "*batch 3"], offsets: Float[Tensor, "*batch"]
+    points: Float[Tensor, "*#batch 3"], normals: Float[Tensor, "*#batch 3"], offsets: Float[Tensor, "*#batch"]
 ) -> Float[Tensor, "*batch 3"]:
     """Images of points [m] in planes n . x = d: the closed form of the sandwich product with a plane's vector."""
     return points - 2 * ((points * normals).sum(-1) - offsets)[..., None] * normals
@@ -65,14 +65,7 @@ def reflect(
 def images(
     points: Float[Tensor, "b 3"], sequences: Int[Tensor, "n order"], normals: Float[Tensor, "w 3"], offsets: Tensor
 ) -> list[Float[Tensor, "b n 3"]]:
-    """Images of transmitters in the first 0, 1, ..., order planes of each sequence [m].
-
-    Args:
-        points: Transmitters [m].
-        sequences: Sorted by length, as of ``all_sequences``.
-        normals: Unit normals of the planes.
-        offsets: Offsets of the planes (w,) [m].
-    """
+    """Images of transmitters [m] in the first 0, 1, ..., order planes of each sequence of ``all_sequences``."""
     found = [points[:, None].expand(-1, len(sequences), -1)]
     for column in sequences.unbind(1):
         first = int((column < 0).sum())
@@ -89,15 +82,10 @@ def fold(
     normals: Float[Tensor, "w 3"],
     offsets: Float[Tensor, " w"],
 ) -> Folded:
-    """Folds straight lines from the receivers to the last images back into the room, at one plane after the other.
+    """Folds straight lines from the receivers to the last of ``images`` back into the room, plane by plane.
 
     A line that does not cross its plane is bent at the end nearer to it; such a path does not exist. Nor does a path
     with an end on the plane, so no path meets two coincident planes in a row.
-
-    Args:
-        seen: Images, as of ``images``.
-        receivers: Position of each query's receiver [m].
-        sequences, normals, offsets: As for ``images``.
     """
     here = receivers[:, None].expand(-1, len(sequences), -1)
     numbers = torch.arange(len(sequences), device=here.device)

@@ -22,10 +22,10 @@ Loss = Callable[[Batch], float]
 
 
 def find_planes(model, train: Batch, validation: Batch | None, loss: Loss) -> str:
-    """Adds one plane after the other, where its reflection lowers the loss most, as long as it lowers the loss.
+    """Adds one plane after the other, each where it lowers the loss most, as long as the loss falls.
 
-    Where powers add, so do lags: those of one more reflection are added to what the model hears already, for hundreds
-    of planes at a time.
+    Where powers add, so do lags: those of one more reflection are added to the model's own, for hundreds of planes at a
+    time.
 
     Args:
         model: ``gaigs.model.mirrored.MirroredSplatting``.
@@ -56,7 +56,7 @@ def find_planes(model, train: Batch, validation: Batch | None, loss: Loss) -> st
 
 
 def thinned(batch: Batch, rows: int = 12) -> Batch:
-    """A batch with about ``rows`` of its labels' rows, and as dense columns: a search takes hundreds of looks."""
+    """A batch with about ``rows`` of its labels' rows, and columns in proportion."""
     labels, directions = batch.labels, batch.directions
     if isinstance(directions, Grid):
         every = slice(None, None, max(1, directions.shape[0] // rows))
@@ -107,7 +107,7 @@ def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
 
 
 def _heard(model, batch: Batch) -> list[tuple[int, Int[Tensor, " k"], Complex[Tensor, "k l"]]]:
-    """Each receiver, its links, and their present lags."""
+    """Each receiver, its links, and the model's lags of them."""
     query = batch.query
     excited = model.excite(query)
     heard = []
@@ -166,7 +166,6 @@ def move_planes(placement: Mirrored, batch: Batch, wavelength: float, least: flo
     """Moves each used plane along its normal to the least loss, the strongest plane first.
 
     Args:
-        placement: Its planes are moved.
         batch: Links to look at.
         wavelength: Of the carrier [m].
         least: Least distance searched on either side [m].
@@ -182,7 +181,7 @@ def move_planes(placement: Mirrored, batch: Batch, wavelength: float, least: flo
 def choose_bandwidth(placement: Mirrored, wavelength: float, batch: Batch, loss: Loss) -> None:
     """Takes the bandwidth with which moving the two strongest planes lowers the loss most.
 
-    Without a bandwidth no plane is right, and without planes no bandwidth is: so both are tried together.
+    Plane offsets and bandwidth depend on each other, so both are tried together.
     """
     used = by_strength(placement, batch)
     origin, losses = placement.origin.clone(), {}
@@ -198,7 +197,7 @@ def choose_bandwidth(placement: Mirrored, wavelength: float, batch: Batch, loss:
 
 
 def _move(placement: Mirrored, plane: int, reach: float, wavelength: float, batch: Batch, loss: Loss) -> float:
-    """Moves a plane along its normal to the least loss; by how much [m]."""
+    """Moves a plane along its normal to the least loss; returns the move [m]."""
     origin = placement.origin[plane]
     start = origin[3].item()
     step = wavelength / 10  # a reflected path changes by twice of it
@@ -219,17 +218,13 @@ def _move(placement: Mirrored, plane: int, reach: float, wavelength: float, batc
 
 
 def prune(placement: Mirrored, batches: list[Batch], loss: Loss) -> str:
-    """Drops planes, then paths, weakest first, without which the loss is next to no higher on any batch.
-
-    Returns:
-        A sentence for the log.
-    """
+    """Drops planes, then paths, weakest first, that hardly lower any batch's loss; returns a sentence for the log."""
     planes, paths = len(placement.used), int(placement.kept.sum())
     before = [loss(batch) for batch in batches]
 
     def is_good(kept: Bool[Tensor, " n"]) -> bool:
         placement.kept.copy_(kept)
-        # A tenth of what a plane must bring to be added.
+        # A tenth of the gain that adds a plane.
         return all(loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True))
 
     best = placement.kept.clone()

@@ -11,7 +11,7 @@ from gaigs.io.meshes import read_obj
 from gaigs.io.tables import read_walls
 
 SHORTEST = 1e-3
-"""Length below which walls and edges of faces have no direction [m]."""
+"""Least length of a wall and of the edges of a face [m]."""
 
 
 def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> Float[Tensor, "k 4"]:
@@ -21,10 +21,6 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
         file: ``.csv`` with consecutive vertices x,y of a floor plan [m], whose walls are upright, or ``.obj`` with the
             faces of a mesh [m].
         lower, upper: Corners of the box of transmitters and receivers, with floor and ceiling of a floor plan.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is of another kind, damaged, or holds no plane.
     """
     if not file.is_file():
         raise FileNotFoundError(f"no walls at {file}; set placement.walls to a .csv or .obj, or to null")

@@ -37,7 +37,7 @@ static inline uint all_bits(masks bits) {
 /* Packs 32 splats of one set at their places in depth order:
  *   geometry    (sets, words 32, GEOMETRY)
  *   appearance  (words 32, transmitters, APPEARANCE)
- * and says which spans meet the box outside of which a splat does nothing:
+ * and marks the spans that meet the box of the splat, outside which it does nothing:
  *   hits        (sets, spans of u and of v, words), a bit a splat */
 kernel void prepare(sizes_t sizes, global const int *order, global const float *means, global const float *factors,
                     global const uchar *visible, global const float *signal, global const float *opacities,

@@ -5,7 +5,7 @@
  */
 
 /* Entries from one checkpoint to the next. There the transmittance is kept for the way back, and a tile's upper and
- * lower rows end where what remains behind, at most the row's largest transmittance times the loudest signal, changes
+ * lower rows end where the remainder behind, at most the row's largest transmittance times the loudest signal, changes
  * no pixel of theirs by more than NEGLIGIBLE of the tile's largest value. In doubt (NaN) they go on. */
 #define CHUNK 32
 #define NEGLIGIBLE 5e-7f

@@ -1,4 +1,4 @@
-/* What all kernels share: sizes, the geometry of a splat, and its footprint.
+/* Shared by all kernels: sizes, the geometry of a splat, and its footprint.
  *
  * With the factor L = [p, 0; q, r] of a splat's covariance C = L L' the footprint exp(-x' C^-1 x / 2) is 2^-(s^2 + y^2), where
  * (s, y) = sqrt(log2(e) / 2) L^-1 x depends on x = (du, dv) as s = across du and y = along dv - shear du. Of all forms
@@ -26,7 +26,7 @@ typedef float8 __attribute__((aligned(4))) loose_lanes; /* in memory where nothi
 typedef int8 __attribute__((aligned(4))) loose_masks;
 
 #define MASKED(mask, value) as_float8((mask) & as_int8(value))
-/* NaN in `a` stays. So it does in all comparisons of these kernels: what is broken must show. */
+/* NaN in `a` stays, as in all comparisons of these kernels: it must show in the map. */
 #define LEAST(a, b) ((b) < (a) ? (b) : (a))
 #define MOST(a, b) ((b) > (a) ? (b) : (a))
 /* The place of the lowest of 64 bits: a float's exponent, beside its sign. */

@@ -10,7 +10,7 @@
  * from the checkpoint of each chunk.
  */
 
-/* What a tile hands back to an entry: moments of the gradient, then each transmitter's gradient of the appearance. */
+/* A tile's result for an entry: moments of the gradient, then each transmitter's gradient of the appearance. */
 #define MOMENTS 5
 #define PARTIALS (MOMENTS + TRANSMITTERS * APPEARANCE)
 
@@ -174,7 +174,7 @@ kernel void backward(sizes_t sizes, global const float *u, global const float *v
 }
 
 /* Adds up the partial sums of one block of splats over tiles, in the tiles' order and as far as they were composited,
- * and turns them into gradients of what the host handed over.
+ * and turns them into gradients of the host's inputs.
  *
  * With z = (s, y) = h L^-1 x and h^2 = log2(e) / 2,
  *

@@ -1,4 +1,4 @@
-"""Mirrored Gaussians with the planes and materials of the simulated room, against the simulator."""
+"""Mirrored Gaussians with the planes and materials of the simulated room against the simulator."""
 
 import math
 from dataclasses import replace
@@ -68,7 +68,7 @@ def simulated(query, order, pattern):
 
 @pytest.mark.parametrize(("order", "pattern"), [(0, "isotropic"), (1, "cosine"), (3, "isotropic"), (2, "cosine")])
 def test_with_the_rooms_walls_it_is_the_simulator(order, pattern):
-    """Each path of the simulator is one of its Gaussians, with the same field; the other Gaussians are silent."""
+    """Each path of the simulator is a Gaussian with the same field; other Gaussians are silent."""
     query = ask()
     placement = walled(make(order, pattern=pattern)).double()
     query = replace(query, transmitters=query.transmitters.double())
@@ -103,16 +103,14 @@ def test_phases_follow_path_lengths_once_they_count():
     expected = quiet.gains * torch.polar(torch.ones_like(turns), -2 * math.pi * turns)
     expected[:, 3] *= torch.polar(torch.tensor(1.0), torch.tensor(1.0))
     scale = expected.abs().max().item()
-    # float32 places a path of some ten metres to a millionth of a metre, a ten thousandth of a turn.
     torch.testing.assert_close(placed.gains.to(expected), expected, rtol=0, atol=2e-3 * scale)
-    # A path's phase is known but for a normal error: exp(-variance / 2) of its field is left.
+    # A normal phase error leaves exp(-variance / 2) of the field.
     assert placed.coherences[4].item() == pytest.approx(math.exp(-0.5))
     assert placed.coherences[0].item() == pytest.approx(math.exp(-(0.3**2) / 2))
     torch.testing.assert_close(placed.means, quiet.means)
 
 
-def test_phases_are_learnt_as_they_turn():
-    """The derivative of a phase by a plane's offset is 2 pi over the wavelength times that of the length."""
+def test_gradients_of_phases_are_those_of_lengths_in_wavelengths():
     placement = walled(make(1))
     placement.enable_phases(speed_of_light / FREQUENCY)
     query = ask(1)
@@ -129,20 +127,18 @@ def test_phases_are_learnt_as_they_turn():
         assert slopes.item() == pytest.approx(-2 * math.pi * FREQUENCY / speed_of_light, rel=1e-2)
 
 
-def test_it_starts_with_a_plane_beyond_each_face_of_the_box():
+def test_initial_planes_lie_beyond_the_faces_of_the_box():
     placement = make(planes=9)
     assert placement.used.tolist() == [0, 1, 2, 3, 4, 5]
-    assert len(placement(None, ask(1)).means[0]) == 1 + 6 + 30
     corners = torch.stack((torch.minimum(LOWER, POSE.position), torch.maximum(UPPER, POSE.position)))
     for plane in range(6):
         axis, sign = plane % 3, 1 if plane < 3 else -1
         assert placement.normals[plane, axis] * sign > 0.95
-        # Along its normal it lies beyond the box by a few per cent of the diagonal.
         beyond = placement.offsets[plane] - sign * corners[0 if sign < 0 else 1, axis]
         assert 0 < beyond < 0.1 * placement.diagonal
 
 
-def test_a_plane_can_be_put_elsewhere_and_its_paths_be_dropped():
+def test_a_plane_moves_and_its_paths_are_dropped():
     placement = make(planes=7)
     with torch.no_grad():
         placement.shifts.normal_()
@@ -156,7 +152,7 @@ def test_a_plane_can_be_put_elsewhere_and_its_paths_be_dropped():
     assert placement(None, ask(3)).means.shape == (3, 5, 3)
 
 
-def test_phases_move_no_plane_and_makes_steps_small():
+def test_enabling_phases_moves_no_plane_and_makes_steps_small():
     placement = make()
     with torch.no_grad():
         placement.shifts.normal_()
@@ -207,7 +203,7 @@ def test_obstacles_attenuate_paths_along_their_legs():
     assert bare.penalties() == {}
 
 
-def test_a_small_plane_mirrors_near_its_middle_alone():
+def test_a_small_plane_reflects_near_its_middle():
     query, whole, small = ask(), walled(make(1)), walled(make(1))
     with torch.no_grad():
         small.middles[4] = torch.tensor([3.0, 2.0, 0.0])
@@ -252,18 +248,12 @@ def test_it_keeps_the_contract_of_placements(sharp, carrier):
     check_placement(placement, links.scene)
 
 
-def test_the_band_is_learnt_from_the_datas_or_from_the_rooms_size():
+def test_the_initial_band_is_that_of_the_data_or_of_the_rooms_size():
     assert make().log_bandwidth.exp().item() == pytest.approx(5e8)
     assert make(bandwidth=None).log_bandwidth.exp().item() == pytest.approx(speed_of_light / make().diagonal)
     for placement in (make(bandwidth=0.0), make(task=Csi(16, torch.tensor([FREQUENCY])))):
         assert placement.log_bandwidth is None
         assert placement(None, ask(1)).bandwidth is None
-
-
-def test_each_group_has_a_learning_rate():
-    assert list(make().parameter_groups()) == ["planes", "paths"]
-    assert make(obstacles=3).parameter_groups().keys() == Mirrored.learning_rates.keys()
-    assert make(obstacles=3).penalties().keys() == Mirrored.penalty_weights.keys()
 
 
 @pytest.mark.parametrize(

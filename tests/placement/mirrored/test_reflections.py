@@ -1,4 +1,4 @@
-"""Sequences of planes against homogeneous matrices, mirror images of a box room, and legs measured one by one."""
+"""Sequences of planes against homogeneous matrices, images of a box room, legs of each path."""
 
 import itertools
 
@@ -71,14 +71,13 @@ def test_images_are_products_of_mirrors(order):
 
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
 def test_the_images_of_a_box_room_are_those_of_its_copies(order):
-    """Each copy is reached by one sequence that exists; sequences that do not are detours around a corner."""
     _, seen, _, paths = folded(order)
-    expected = mirror(places(20)[:, None], cells(order), SIZE)
+    copies = cells(order).expand(20, -1, -1)
+    expected = mirror(places(20)[:, None].expand(copies.shape), copies, SIZE)
     for found, exists, true in zip(seen[-1], paths.exists, expected, strict=True):
         distances = (found[exists][:, None] - true).norm(dim=-1)
         assert exists.sum() == len(true)
-        assert distances.amin(0).max() < 1e-9
-        assert distances.amin(1).max() < 1e-9
+        assert max(distances.amin(0).max(), distances.amin(1).max()) < 1e-9
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])
@@ -105,14 +104,14 @@ def test_legs_run_from_the_transmitter_over_the_planes_to_the_receiver(order):
 def test_planes_mirror_at_the_angle_of_incidence():
     sequences, _, receivers, paths = folded(2)
     normals, _ = BOX
-    assert [bounce.first for bounce in paths.bounces] == [1, 7]  # the direct path has none
+    assert [bounce.first for bounce in paths.bounces] == [1, 7]
     last = paths.bounces[0]
     assert torch.equal(last.planes, sequences[1:, -1])
     arriving = receivers[:, None] - last.points
     expected = ((arriving * normals[last.planes]).sum(-1) / arriving.norm(dim=-1)).abs()
     exists = paths.exists[:, 1:]
     torch.testing.assert_close(last.cosines[exists], expected[exists])
-    # One bounce before, the wave leaves for the next point under the angle under which it came from the transmitter.
+    # At the bounce before, the wave comes from the transmitter and leaves for the next point at the same angle.
     first = paths.bounces[1]
     coming = places(20)[:, None] - first.points
     leaving = last.points[:, 6:] - first.points
@@ -120,20 +119,6 @@ def test_planes_mirror_at_the_angle_of_incidence():
         expected = ((ray * normals[first.planes]).sum(-1) / ray.norm(dim=-1)).abs()
         exists = paths.exists[:, 7:]
         torch.testing.assert_close(first.cosines[exists], expected[exists])
-
-
-def test_of_two_walls_that_meet_at_right_angles_one_order_exists():
-    sequences, _, _, paths = folded(2, count=200)
-    order = {tuple(sequence): k for k, sequence in enumerate(sequences.tolist())}
-    for a, b in itertools.combinations(range(6), 2):
-        there, back = paths.exists[:, order[a, b]], paths.exists[:, order[b, a]]
-        if a % 3 == b % 3:
-            assert there.all()  # opposite walls
-            assert back.all()
-        else:
-            assert (there ^ back).all()
-            assert there.any()
-            assert back.any()
 
 
 def test_a_plane_behind_both_ends_mirrors_nothing():

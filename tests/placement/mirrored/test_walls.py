@@ -1,4 +1,4 @@
-"""Planes of known walls, against the floor plans and cuboids of the files."""
+"""Planes of known walls against the floor plans and cuboids of the files."""
 
 import math
 
@@ -56,7 +56,7 @@ def test_floor_and_ceiling_come_before_a_fifth_wall(tmp_path):
 
 
 def test_pieces_of_one_wall_are_one_plane_and_count_together(tmp_path):
-    """Two pieces of 2 m about a niche are longer than a wall of 3 m, whichever way they run."""
+    """Two pieces of 2 m beside a niche are longer than a wall of 3 m."""
     plan = "0,0\n2,0\n2,-0.5\n3,-0.5\n3,0\n5,0\n5,3\n"
     planes = read_planes(write(tmp_path, "plan.csv", plan), LOWER, UPPER)
     assert outward(planes, [2.5, 1.0, 1.0])[:2] == [(0, -1, 0, 0), (1, 0, 0, 5)]
@@ -64,20 +64,6 @@ def test_pieces_of_one_wall_are_one_plane_and_count_together(tmp_path):
     assert len(back_and_forth) == 3
     apart = read_planes(write(tmp_path, "apart.csv", "0,0\n4,0\n4,0.1\n0,0.1\n"), LOWER, UPPER)
     assert sorted(row[3] for row in outward(apart, [2.0, 0.05, 1.0]) if row[2] == 0 and row[0] == 0) == [0.0, 0.1]
-
-
-def test_a_repeated_vertex_is_no_wall(tmp_path):
-    once = read_planes(write(tmp_path, "once.csv", PLAN), LOWER, UPPER)
-    twice = read_planes(write(tmp_path, "twice.csv", PLAN.replace("4,0\n", "4,0\n4,0\n")), LOWER, UPPER)
-    assert torch.equal(once, twice)
-
-
-def test_a_mesh_has_its_cuboids_faces_by_area(tmp_path):
-    planes = read_planes(write(tmp_path, "room.obj", wavefront_obj(EMPTY)), LOWER, UPPER)
-    found = outward(planes, [3.5, 2.5, 1.5])
-    assert {*found[:2]} == {(0, 0, 1, 3), (0, 0, -1, 0)}  # 35 m²
-    assert {*found[2:4]} == {(0, 1, 0, 5), (0, -1, 0, 0)}  # 21 m²
-    assert {*found[4:]} == {(1, 0, 0, 7), (-1, 0, 0, 0)}  # 15 m²
 
 
 def test_furniture_adds_its_faces_to_the_walls_it_stands_at(tmp_path):
@@ -100,15 +86,14 @@ def test_furniture_adds_its_faces_to_the_walls_it_stands_at(tmp_path):
     [
         ("walls.stl", "solid", r"must be a \.csv or \.obj, got walls\.stl"),
         ("walls.csv", "0,0\n1,zero\n", "line 2"),
-        ("walls.csv", "0,0\n", "two wall vertices or more, got 1"),
-        ("walls.csv", "", "empty"),
-        ("walls.obj", "v 0 0 0\nv 1 0 zero\n", "line 2: expected numbers x y z, got 'v 1 0 zero'"),
-        ("walls.obj", "v 0 0 0\nv 1 0 0\nf 1 2 3\n", "line 3: expected a face of three vertices or more of the 2"),
+        ("walls.csv", "0,0\n", "two wall vertices"),
+        ("walls.obj", "v 0 0 0\nv 1 0 zero\n", "line 2"),
+        ("walls.obj", "v 0 0 0\nv 1 0 0\nf 1 2 3\n", "line 3"),
         ("walls.obj", "v 0 0 0\nv 1 0 0\nv 1 1 0\n", "must have a wall longer than 0.001 m"),
         ("walls.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "must have a wall longer than 0.001 m"),
     ],
 )
-def test_defects_are_refused(tmp_path, name, text, message):
+def test_damaged_files_are_refused(tmp_path, name, text, message):
     with pytest.raises(ValueError, match=message):
         read_planes(write(tmp_path, name, text), LOWER, UPPER)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.csv; set placement\.walls"):
@@ -134,7 +119,7 @@ def test_a_placement_starts_from_the_walls(tmp_path, links):
     torch.testing.assert_close(placement.normals[:6], expected[:, :3])
     torch.testing.assert_close(placement.offsets[:6], expected[:, 3])
     assert placement.used.tolist() == [*range(6)]
-    assert int(placement.kept.sum()) == 7  # the direct path, and one by way of each wall
+    assert int(placement.kept.sum()) == 7  # the direct path and one of each wall
     assert placement.shifts.requires_grad
     assert not torch.allclose(started(links, None).offsets[:6], expected[:, 3])
 
@@ -148,13 +133,8 @@ def test_of_more_walls_than_planes_the_largest_are_taken(tmp_path, links, caplog
     assert placement.used.tolist() == [*range(6)]
 
 
-def test_of_fewer_walls_no_other_plane_is_used(tmp_path, links):
-    file = write(tmp_path, "floor.obj", "v 0 0 -1\nv 2 0 -1\nv 2 1 -1\nf 1 2 3\n")
-    assert started(links, file).used.tolist() == [0]
-
-
 @pytest.mark.parametrize("fixed", [True, False])
-def test_fixed_walls_stay_while_all_else_is_learnt(tmp_path, links, fixed):
+def test_training_moves_walls_unless_they_are_fixed(tmp_path, links, fixed):
     placement = started(links, write(tmp_path, "room.obj", wavefront_obj(EMPTY)), fixed=fixed)
     before = placement.normals.clone(), placement.offsets.clone(), placement.plane_gains.clone()
     groups = placement.parameter_groups()
