@@ -1,12 +1,14 @@
 """Configurations: the files that Hydra joins, the check of the result, and the message of an error in it."""
 
+import contextlib
 import hashlib
 import logging
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra import initialize_config_dir
@@ -19,14 +21,9 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    MissingMandatoryValue,
-    OmegaConfBaseException,
-)
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
-from gaigs.registry import KINDS, check_type, find_holders, registry, storable, suggest
+from gaigs.registry import KINDS, check_type, find_holders, listed, registry, storable, suggest
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +45,9 @@ KEYS = {
 CHOSEN = (*KINDS, "gaussians", "density", "trainer")
 """Keys that choose one file or component."""
 
+READ_BY_LINKS = ("data", "split", "task")
+"""Keys that ``gaigs.links`` reads."""
+
 CONSTRUCTED = tuple(kind for kind in KINDS if kind not in ("task", "training", "benchmark"))
 """Kinds whose components need no configuration file: the options are read from their constructors."""
 
@@ -60,10 +60,9 @@ def conf_dir() -> Path:
 
 
 def plugin_conf_dirs() -> list[Path]:
-    """The conf folders of plug-ins, which hold ``<kind>/<name>.yaml``; no plug-in is imported.
+    """``plugins/conf``, ``plugins/<folder>/conf``, and ``<package>/conf`` of each package with an entry point of gaigs.
 
-    They are ``plugins/conf``, ``plugins/<folder>/conf``, and ``<package>/conf`` of each package with an entry point of
-    gaigs.
+    They hold ``<kind>/<name>.yaml``; no plug-in is imported.
     """
     folders = [*Path.cwd().glob("plugins/conf"), *sorted(Path.cwd().glob("plugins/[!_.]*/conf"))]
     for holder in (holder for kind in KINDS for holder in find_holders(kind)[0]):
@@ -117,42 +116,45 @@ class Constructors(ConfigSource):
         return sorted(set(files))
 
 
-def differences(there: dict, here: dict) -> dict[str, tuple]:
-    """The values of two configurations at the keys in which they differ, joined by dots and sorted."""
-    there, here = _flat(there), _flat(here)
-    keys = sorted((there.keys() | here.keys()) - set(HARMLESS))
-    return {key: (there.get(key), here.get(key)) for key in keys if there.get(key) != here.get(key)}
+def differences(there: Mapping, here: Mapping, prefix: str = "") -> dict[str, tuple]:
+    """The values of two configurations at the keys in which they differ, joined by dots and sorted.
+
+    Of a part with another name, the key ``name`` is the only one.
+    """
+    found: dict[str, tuple] = {}
+    for key in sorted(there.keys() | here.keys()):
+        path, a, b = f"{prefix}{key}", there.get(key), here.get(key)
+        if path in HARMLESS or a == b:
+            continue
+        if not isinstance(a, dict) or not isinstance(b, dict):
+            found[path] = a, b
+        elif a.get("name") != b.get("name"):
+            found[f"{path}.name"] = a.get("name"), b.get("name")
+        else:
+            found |= differences(a, b, f"{path}.")
+    return found
 
 
 def check(config: dict) -> None:
-    """Checks the keys of a configuration and their values.
-
-    Raises:
-        TypeError: A value has the wrong type.
-        ValueError: A key is unknown or missing, or a value out of range.
-    """
+    """Checks the keys of a configuration and their values; raises a ``TypeError`` or a ``ValueError``."""
     if unknown := [key for key in config if key not in KEYS]:
-        listed = ", ".join(sorted(KEYS))
-        raise ValueError(f"the configuration has no key {suggest(unknown[0], KEYS)}; there are: {listed}")
+        raise ValueError(f"the configuration has no key {suggest(unknown[0], KEYS)}; it has: {listed(sorted(KEYS))}")
     if missing := sorted(KEYS.keys() - {*MAY_BE_NULL} - config.keys()):
         raise ValueError(f"the configuration needs the key {missing[0]!r}; conf/config.yaml has them all")
     for key, annotation in KEYS.items():
         check_type(key, config.get(key), annotation)
-    if config.get("benchmark") is not None and config["command"] != "benchmark":
-        raise ValueError(
-            f"benchmark={config['benchmark'].get('name')} needs command=benchmark, got command={config['command']}; "
-            "add command=benchmark, or leave out the benchmark"
-        )
-    if config.get("benchmark") is None and config["command"] == "benchmark":
-        raise ValueError("command=benchmark needs a benchmark; add benchmark=accuracy, budgets, rasterizer or step")
+    benchmark = config.get("benchmark")
+    if (benchmark is not None) != (config["command"] == "benchmark"):
+        name = "null" if benchmark is None else benchmark.get("name")
+        raise ValueError(f"command=benchmark needs benchmark=..., and vice versa; got {config['command']} and {name}")
     for kind in KINDS[: KINDS.index("benchmark")]:
         if config.get(kind) is not None:
             check_type(f"{kind}.name", config[kind].get("name"), str)
-    task_keys = {"name": str, "trend": dict | None, "baselines": list[dict | str]}
+    task = {"name": str, "trend": dict | None, "baselines": list[dict | str]}
     for key, value in config["task"].items():
-        if key not in task_keys:
-            raise ValueError(f"task has no key {suggest(key, task_keys)}; it has: {', '.join(task_keys)}")
-        check_type(f"task.{key}", value, task_keys[key])
+        if key not in task:
+            raise ValueError(f"task has no key {suggest(key, task)}; it has: {', '.join(task)}")
+        check_type(f"task.{key}", value, task[key])
     if not 0 <= config["seed"] < 2**32:
         raise ValueError(f"seed must be in 0..{2**32 - 1}, got {config['seed']}")
     if config["save_every"] < 0:
@@ -188,16 +190,14 @@ def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str]
     choices, values = _choices(options)
     running = GlobalHydra.instance()
     before = running.hydra
-    is_ours = before is not None and any(
-        str(conf_dir()) in str(element.path) for element in running.config_loader().get_search_path().get_path()
-    )
+    paths = [] if before is None else running.config_loader().get_search_path().get_path()
     try:
-        if is_ours:  # within a run of the command line, where Hydra allows no second instance
+        with contextlib.ExitStack() as stack:
+            # Within a run of the command line Hydra allows no second instance.
+            if not any(str(conf_dir()) in str(element.path) for element in paths):
+                running.clear()
+                stack.enter_context(initialize_config_dir(str(conf_dir()), version_base="1.3"))
             config = hydra.compose("config", [*overrides, *choices])
-        else:
-            running.clear()
-            with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-                config = hydra.compose("config", [*overrides, *choices])
     except Exception as error:
         message = explain(error)
         if message is None:
@@ -227,15 +227,14 @@ def preset(model: str, task: str) -> list[str]:
 
 
 def resolve(config: DictConfig) -> dict:
-    """A composed configuration in plain dictionaries, unchecked; a baseline's name becomes its configuration.
-
-    Raises:
-        ValueError: A mandatory value or the key of a reference is missing.
-    """
+    """A composed configuration in plain dictionaries, unchecked; a baseline's name becomes its configuration."""
     try:
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
-        raise ValueError(f"{error.full_key} must be given, as it has no default; add {error.full_key}=...") from None
+        key = error.full_key
+        if key == "model.trend" and config.model.name == "kriging":
+            raise ValueError("model 'kriging' is made from a trained model; set kriging=true, with any model") from None
+        raise ValueError(f"{key} must be given, as it has no default; add {key}=...") from None
     except OmegaConfBaseException as error:
         raise ValueError(f"the configuration is not complete: {' '.join(str(error).split())}") from error
     if isinstance(plain.get("baselines"), list):
@@ -263,55 +262,45 @@ def _choices(options: Mapping) -> tuple[list[str], dict]:
 
 
 def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
-    """The full key of an option: the name itself if it has dots or is a top-level key, else the part's key.
-
-    Raises:
-        ValueError: No part has such a key, or several have.
-    """
+    """The full key of an option: the name itself if it has dots or is a top-level key, else the part's key."""
     is_new, name = name.startswith("+"), name.removeprefix("+")
-    plain = OmegaConf.to_container(config)
-    if sections and name.partition(".")[0] not in sections:
-        places = [f"{section}.{name}" for section in sections if name in plain[section]]
-        if len(places) > 1:
-            raise ValueError(f"{name} is an option of {' and '.join(sections)}; say which: {', '.join(places)}")
-        if not places:
-            has = sorted({key for section in sections for key in plain[section]} - {"name"})
-            parts = " and ".join(f"{section} {plain[section]['name']!r}" for section in sections)
-            raise ValueError(f"there is no option {suggest(name, has)} of {parts}; there are: {', '.join(has)}")
-        return places[0]
-    if name in CHOSEN:
+    plain: Any = OmegaConf.to_container(config)
+    if not sections and name in CHOSEN:
         return name
-    if "." in name or name in plain:
+    if name.partition(".")[0] in sections or (not sections and ("." in name or name in plain)):
         place, _, last = name.rpartition(".")
-        parent = plain
-        for part in filter(None, place.split(".")):
-            parent = parent.get(part) if isinstance(parent, dict) else None
-        has = parent if isinstance(parent, dict) else {}
-        is_open = isinstance(parent, dict) and OmegaConf.is_struct(OmegaConf.select(config, place)) is False
+        parent = OmegaConf.select(config, place) if place else config
+        has = sorted(map(str, parent)) if isinstance(parent, DictConfig) else []
+        is_open = isinstance(parent, DictConfig) and OmegaConf.is_struct(parent) is False
         if not (is_new or last in has or is_open):
-            raise ValueError(f"{place} has no key {suggest(last, has)}; it has: {_listed(sorted(has)) or 'none'}")
+            raise ValueError(f"{place} has no key {suggest(last, has)}; it has: {listed(has)}")
         return name
-    found = {key for key in _options(plain, "") if key.rpartition(".")[2] == name}
-    found = found & {f"model.{name}"} or found  # a model's own option wins over those of its parts
-    if len(found) == 1:
-        return found.pop()
+    keys = {key: key.rpartition(".")[2] for key in _options(plain, sections or plain.keys() - {*READ_BY_LINKS})}
+    found = sorted(key for key, last in keys.items() if last == name)
+    if not sections and f"model.{name}" in found:  # a model's own option wins over those of its parts
+        return f"model.{name}"
+    if len(found) > 1:
+        raise ValueError(f"{name} is an option of several parts; say which: {', '.join(found)}")
     if found:
-        raise ValueError(f"{name} is an option of several parts; say which: {', '.join(sorted(found))}")
-    known = {key.rpartition(".")[2] for key in _options(plain, "")} | plain.keys()
-    for section in ("data", "split", "task"):
+        return found[0]
+    for section in () if sections else READ_BY_LINKS:
         if name in plain[section]:
             raise ValueError(f"{name} is an option of {section}, which gaigs.links reads; say {section}.{name}")
-    raise ValueError(f"there is no option {suggest(name, known)}; python -m gaigs --help lists all")
+    has = sorted({*keys.values()} - {"name"})
+    if not sections:
+        raise ValueError(f"there is no option {suggest(name, {*has, *plain})}; python -m gaigs --help lists all")
+    parts = " and ".join(f"{section} {plain[section]['name']!r}" for section in sections)
+    raise ValueError(f"there is no option {suggest(name, has)} of {parts}; there are: {', '.join(has)}")
 
 
-def _options(config: Mapping, prefix: str) -> Iterator[str]:
-    """Keys of all options of parts; a reference ${...} to another part is left out."""
-    for key, value in config.items():
-        is_part = isinstance(value, Mapping) and (not prefix or "name" in value)
-        if is_part and key not in ("data", "split", "task"):
-            yield from _options(value, f"{prefix}{key}.")
+def _options(config: Mapping, parts: Iterable[str], prefix: str = "") -> Iterator[str]:
+    """Full keys of all options of some parts; a reference ${...} to another part is left out."""
+    for part in parts:
+        value = config[part]
+        if isinstance(value, Mapping) and (not prefix or "name" in value):
+            yield from _options(value, value.keys(), f"{prefix}{part}.")
         elif prefix and not str(value).startswith("${"):
-            yield f"{prefix}{key}"
+            yield f"{prefix}{part}"
 
 
 def explain(error: Exception) -> str | None:
@@ -321,35 +310,35 @@ def explain(error: Exception) -> str | None:
     of_system = isinstance(error, MemoryError) or getattr(error, "errno", None) is not None
     if not is_known and (of_system or not is_composing):
         return None
-    cause = error.__cause__
+    cause, words = error.__cause__, " ".join(str(error).split())
     match error, cause:
         case _, ConfigAttributeError(full_key=str(key)) | ConfigKeyError(full_key=str(key)):
             place, _, word = key.rpartition(".")
             has = [str(name) for name in cause.parent_node]
-            told = f"{place or 'the configuration'} has no key {suggest(word, has)}; it has: {_listed(sorted(has))}"
-            return f"{told}\nall parts of a sweep must have its keys; sweep this part alone" if is_multirun() else told
+            part = f"{place} {cause.parent_node['name']!r}" if "name" in has else place or "the configuration"
+            hint = f"\nin a sweep write ++{key}=... for a key that only the swept {place} has" if is_multirun() else ""
+            return f"{part} has no key {suggest(word, has)}; it has: {listed(sorted(has))}{hint}"
         case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:
             kind, _, name = file.rpartition("/")
-            packages = OmegaConf.load(conf_dir() / "published.yaml").packages if kind == "model" else {}
-            if name in packages:
-                package, folder = packages[name], packages[name].removeprefix("gaigs-").replace("-", "_")
-                return (
-                    f"model {name!r} is in the package {package}, which is not installed\n"
-                    f"pip install {package}, or in a copy of the repository pip install plugins/{folder}"
-                )
-            return f"there is no {kind} {suggest(name, names)}; there are: {_listed(names)}"
+            package = OmegaConf.load(conf_dir() / "published.yaml").packages.get(name) if kind == "model" else None
+            if package is None:
+                return f"there is no {kind} {suggest(name, names)}; there are: {listed(names)}"
+            folder = package.removeprefix("gaigs-").replace("-", "_")
+            return (
+                f"model {name!r} is in the package {package}, which is not installed\n"
+                f"pip install {package}, or in a copy of the repository pip install plugins/{folder}"
+            )
         case HydraException(), _ if str(error).startswith("gaigs: "):  # the message of a job
             reason = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
             return f"{str(error).removeprefix('gaigs: ')}{reason}"
         case HydraException(), _:
-            words = " ".join(f"{error} {cause or ''}".split())
-            return f"Hydra cannot read it: {words}"
-        case _ if not str(error).startswith("Config group"):
-            about = "; its files choose each other in a circle" if isinstance(error, RecursionError) else ""
-            told = f"Hydra cannot join command line and configuration files ({' '.join(str(error).split())}){about}"
-            return _unreadable() or told
-        case _:  # null or a number as a file's name
+            return " ".join(f"Hydra cannot read it: {words} {cause or ''}".split())
+        case ImportError(), _:  # of a plug-in whose constructor has the options
+            return words
+        case _ if words.startswith("Config group"):  # null or a number as a file's name
             return f"a part is chosen by the name of its file ({error}); ~density leaves it out"
+    about = "; its files choose each other in a circle" if isinstance(error, RecursionError) else ""
+    return _unreadable() or f"Hydra cannot join command line and configuration files ({words}){about}"
 
 
 def _unreadable() -> str | None:
@@ -357,29 +346,16 @@ def _unreadable() -> str | None:
     for file in (file for folder in (conf_dir(), *plugin_conf_dirs()) for file in sorted(folder.rglob("*.yaml"))):
         try:
             OmegaConf.load(file)
-        except UnicodeDecodeError:
-            return f"cannot parse {file}: not UTF-8"
         except Exception as error:  # any error of the YAML parser
+            cause = "not UTF-8" if isinstance(error, UnicodeDecodeError) else " ".join(str(error).split())
             if getattr(error, "errno", None) is None:
-                return f"cannot parse {file}: {' '.join(str(error).split())}"
+                return f"cannot parse {file}: {cause}"
     return None
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names) or "none"
 
 
 def is_multirun() -> bool:
     """True if the command line asks for a sweep."""
     return any(word in ("-m", "--multirun") for word in sys.argv)
-
-
-def _flat(config: dict, prefix: str = "") -> dict:
-    """Nested keys joined by dots."""
-    flat = {}
-    for key, value in config.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat
 
 
 def run_folder(overrides: str) -> str:
@@ -388,13 +364,12 @@ def run_folder(overrides: str) -> str:
     if name == overrides and len(name.encode()) <= 200:
         return name
     digest = hashlib.sha256(overrides.encode()).hexdigest()[:12]
-    return name.encode()[:187].decode(errors="ignore") + "-" + digest
+    return f"{name.encode()[:187].decode(errors='ignore')}-{digest}"
 
 
 def installed(*names: str) -> str:
     """The installed models of a list, joined by commas for a sweep; the log names the others."""
-    holders, _ = find_holders("model")
-    known = {holder.name for holder in holders}
+    known = registry("model").names()
     if missing := [name for name in names if name not in known]:
         log.warning("left out, as not installed: model=%s", ",".join(missing))
     return ",".join(name for name in names if name in known)

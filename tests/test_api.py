@@ -164,7 +164,7 @@ def test_options_are_found_by_name_and_parts_are_chosen():
     assert gaigs.compose(gaussians=None, density=None)["model"]["gaussians"] is None
     assert gaigs.compose(**{"training.jitter": np.float64(0.5)})["training"]["jitter"] == 0.5
     assert gaigs.links("synthetic_rssi", transmitters=20, split={"name": "random", "seed": 4}).split.name.endswith("4")
-    with pytest.raises(ValueError, match=r"seed is an option of data and split; say which: data.seed, split.seed"):
+    with pytest.raises(ValueError, match=r"seed is an option of several parts; say which: data.seed, split.seed"):
         gaigs.links("synthetic_rssi", seed=4)
 
 

@@ -1,7 +1,7 @@
-"""Every option of every registered component, with values that no option has: each is refused, by its name.
+"""Every option of every registered component with unsuitable values: each is refused by its name.
 
-Numbers at the edge may suit an option, as 0 does a penalty: then what the component gives is finite. Nothing is
-trained; a component is swept over as soon as it is registered, in this repository or in its ``plugins``.
+Numbers at the edge may suit an option, as 0 does a penalty: then the component's result is finite. Nothing is trained.
+A registered component is swept without further entries here, in this repository or in its ``plugins``.
 """
 
 import ast
@@ -35,21 +35,13 @@ GIVEN |= {"adversarial": ["model=dcgan"], "adaptive": ["model=gaigs"]}
 
 PARTS = ("placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling")
 PLACES = {"density": "training.density", "gaussians": "model.gaussians"}
-"""Of options that belong to no component: where they stand."""
+"""Places of options that belong to no component."""
 
 SWEPT = ("data", "split", *PARTS, "loss", "model", "training")
 EDGES = (-1, -0.5, 0, 1e30, 10**30)
 OTHERS = (None, "", "abc", True, [], {}, math.nan, math.inf, ["abc"], {"x": 1}, *EDGES)
-SUITS = {
-    bool: (True,),
-    int: (),
-    float: (),
-    str: ("", "abc"),
-    list: ([],),
-    dict: ({}, {"x": 1}),
-    type(None): OTHERS,  # what else it may be, its file does not say
-}
-"""Of those the ones that an option may have, by the type of what its file has."""
+SUITS = {bool: (True,), int: (), float: (), str: ("", "abc"), list: ([],), dict: ({}, {"x": 1}), type(None): OTHERS}
+"""Those of ``OTHERS`` that an option may have, by the type of its value in the file; null leaves the type open."""
 
 
 @contextlib.contextmanager
@@ -106,7 +98,7 @@ def untrained(task, config):
 
 
 def build(kind, task, config):
-    """Builds what a run builds of that kind; gives what it predicts, to be finite."""
+    """Builds the components of a run up to that kind; returns their result, to be finite."""
     links = links_of(task)
     if kind == "data":  # not read: tests/data has what readers make of numbers
         name, given = config["data"]["name"], {key: value for key, value in config["data"].items() if key != "name"}
@@ -167,7 +159,7 @@ def with_value(config, key, value):
 
 
 @pytest.mark.parametrize(("kind", "name"), names())
-def test_what_suits_no_option_is_refused_by_name(kind, name):
+def test_unsuitable_values_are_refused_by_name(kind, name):
     found = chosen(kind, name)
     if found is None:
         assert [*compositions(kind, name)], "no configuration chooses it"
@@ -180,9 +172,9 @@ def test_what_suits_no_option_is_refused_by_name(kind, name):
             try:
                 given = build(kind, task, with_value(config, key, value))
             except (ValueError, TypeError, FileNotFoundError) as error:
-                told = str(error)
-                if key.rpartition(".")[2] not in told or told.count("\n") > 1:
-                    wrong.append((key, value, told))
+                message = str(error)
+                if key.rpartition(".")[2] not in message or message.count("\n") > 1:
+                    wrong.append((key, value, message))
             except Exception as error:
                 wrong.append((key, value, repr(error)))
             else:
@@ -202,10 +194,10 @@ def test_half_the_digits_are_enough_or_refused(name):
         pytest.skip("needs its files, or another package")
     if not [*untrained(found[0], repr(found[1]["model"])).parameters()]:
         pytest.skip("is not trained")
-    told = ""
+    message = ""
     with torch.autocast("cpu", torch.bfloat16):
         try:
             assert build("model", *found).isfinite()
         except ValueError as error:
-            told = str(error)
-    assert not told or "set trainer.precision to 32-true or 64-true" in told
+            message = str(error)
+    assert not message or "set trainer.precision to 32-true or 64-true" in message

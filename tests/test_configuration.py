@@ -1,4 +1,4 @@
-"""What the configuration files choose together, and what they ask of the place they are used in."""
+"""Choices of configuration files together, and resolvers that depend on installed packages."""
 
 import functools
 import logging
@@ -10,7 +10,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gaigs.configuration import conf_dir, installed, known, launcher
+from gaigs.configuration import compose as compose_run
+from gaigs.configuration import conf_dir, differences, installed, known, launcher
 from gaigs.registry import registry
 
 ROOT = Path(__file__).parents[1]
@@ -56,11 +57,12 @@ def test_the_command_line_wins_over_a_model_and_a_model_over_the_task(configure)
     assert (config["kriging"], config["threads"], config["trainer"]["max_steps"]) == (False, 2, 5)
 
 
-def test_an_experiment_wins_over_a_model(configure):
-    config = configure("+experiment=rssi", "model=mirrored")
-    assert config["trainer"]["max_steps"] == configure("+experiment=rssi")["trainer"]["max_steps"] == 600
+def test_an_experiment_wins_over_a_model_and_a_variant_leaves_its_deformation(configure):
+    config = configure("+experiment=rssi", "model=mirrored", "+variant=paper")
+    assert config["trainer"]["max_steps"] == 600
     assert config["model"]["gaussians"] is None
     assert config["deformation"]["name"] == "none"
+    assert "heads" in config["deformation"], "which 'none' refuses, so that no run begins"
 
 
 # --- the width of the deformation network ---
@@ -80,23 +82,16 @@ def test_variants_of_the_paper_are_as_wide_as_they_were_measured(configure, task
     assert configure(f"data={DATA[task]}", "+variant=static", "+experiment=claims")["deformation"] == {"name": "none"}
 
 
-def test_a_variant_leaves_the_deformation_of_another_model(configure):  # which has no heads, so that no run begins
-    deformation = configure("model=mirrored", "+variant=paper")["deformation"]
-    assert (deformation["name"], *deformation) == ("none", "name", "heads", "width")
-
-
 # --- all systems ---
 
 
 @pytest.mark.parametrize("task", DATA)
 @pytest.mark.parametrize("model", ["gaigs", "mirrored", "knn"])
-def test_systems_have_one_budget_whatever_they_choose(configure, task, model):
+def test_systems_have_one_budget_with_every_model(configure, task, model):
     config = configure(f"+experiment=systems_{task}", f"model={model}")
-    assert config["task"]["name"] == task
-    assert config["model"]["name"] == model
-    assert config["data"]["name"] == DATA[task]
-    trainer = configure("trainer.max_steps=-1")["trainer"]
-    assert config["trainer"] == trainer | {"max_time": "00:00:03:00", "val_check_interval": "00:00:00:15"}
+    assert (config["task"]["name"], config["model"]["name"], config["data"]["name"]) == (task, model, DATA[task])
+    budget = {"max_time": "00:00:03:00", "val_check_interval": "00:00:00:15"}
+    assert config["trainer"] == configure("trainer.max_steps=-1")["trainer"] | budget
 
 
 @pytest.mark.parametrize("task", DATA)
@@ -113,27 +108,31 @@ def test_systems_are_swept_over_as_far_as_they_are_installed(configure, task, mo
     assert settings.callbacks.report["_target_"] == "gaigs.report.at_end.AtEnd"
 
 
-def test_a_choice_by_task_is_made_where_there_is_one():
+def test_the_packages_of_published_systems_are_those_of_the_plugins():
+    known = OmegaConf.load(conf_dir() / "published.yaml").packages
+    projects = [
+        tomllib.loads(file.read_text())["project"] for file in Path(__file__).parents[1].glob("plugins/*/*.toml")
+    ]
+    held = {name: p["name"] for p in projects for name in p["entry-points"].get("gaigs.model", {})}
+    assert known == held
+
+
+def test_a_choice_by_task_exists_or_is_replaced():
     assert known("pooling", "path_rssi", "spectrum") == "path_rssi"
     assert known("pooling", "path_delay", "path_rssi") == "path_rssi"
 
 
-def test_what_is_not_installed_is_left_out_and_told(caplog):
+def test_models_that_are_not_installed_are_left_out_with_a_warning(caplog):
     with caplog.at_level(logging.WARNING):
         assert installed("knn", "yagi", "gaigs", "loop") == "knn,gaigs"
     assert [record.getMessage() for record in caplog.records] == ["left out, as not installed: model=yagi,loop"]
-    caplog.clear()
-    assert installed("gaigs") == "gaigs"
-    assert not caplog.records
 
 
-def test_two_jobs_at_a_time_where_that_is_installed(configure, monkeypatch):
+def test_two_jobs_run_at_a_time_if_joblib_is_installed(configure, monkeypatch):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs gaigs[parallel]")
     settings = lambda *more: configure.__wrapped__("+experiment=systems_rssi", *more, with_hydra=True).hydra.launcher
     assert settings()["n_jobs"] == 2
     assert settings()["_target_"].endswith("JoblibLauncher")
-    assert settings("hydra/launcher=basic")["_target_"].endswith("BasicLauncher")
-    assert settings("hydra.launcher.n_jobs=4")["n_jobs"] == 4
 
     def lacks(name):
         raise metadata.PackageNotFoundError(name)
@@ -143,10 +142,21 @@ def test_two_jobs_at_a_time_where_that_is_installed(configure, monkeypatch):
     assert settings()["_target_"].endswith("BasicLauncher")
 
 
-def test_the_packages_of_published_systems_are_those_of_the_plugins():
-    known = OmegaConf.load(conf_dir() / "published.yaml").packages
-    projects = [
-        tomllib.loads(file.read_text())["project"] for file in Path(__file__).parents[1].glob("plugins/*/*.toml")
-    ]
-    held = {name: p["name"] for p in projects for name in p["entry-points"].get("gaigs.model", {})}
-    assert known == held
+@pytest.mark.parametrize(
+    ("there", "here", "expected"),
+    [
+        ({"a": {"b": 1, "c": 2}}, {"a": {"b": 3, "c": 2}, "d": 4}, {"a.b": (1, 3), "d": (None, 4)}),
+        ({"part": {"name": "x", "k": 1}}, {"part": {"name": "y", "l": 1}}, {"part.name": ("x", "y")}),
+        ({"threads": 1, "trainer": {"enable_progress_bar": True}}, {"threads": 2, "trainer": {}}, {}),
+    ],
+)
+def test_differences_name_the_part_and_leave_out_harmless_keys(there, here, expected):
+    assert differences(there, here) == expected
+
+
+def test_a_plugin_that_cannot_be_imported_is_named_when_it_is_composed(tmp_path, monkeypatch):
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins/broken.py").write_text("import nothing\n@register('model', 'broken')\nclass Broken: ...\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"model 'broken' of plugins.broken\.py cannot be loaded: ModuleNotFoundError"):
+        compose_run(model="broken")

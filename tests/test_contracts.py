@@ -3,7 +3,6 @@
 Packages in ``plugins`` have tests of their own, in ``tests/plugins``.
 """
 
-import copy
 import functools
 import math
 from dataclasses import replace
@@ -46,33 +45,22 @@ SMALL = {
     "synthetic_rssi": ["data.transmitters=40", "data.order=1"],
     "synthetic_csi": ["data.transmitters=12", "data.order=1", "data.subcarriers=3"],
     "gaigs": ["gaussians.count=60", "deformation.width=16"],
-    "sionna": ["data.transmitters=6"],
-    "sionna_rssi": ["data.transmitters=6"],
+    **dict.fromkeys(("sionna", "sionna_rssi"), ("data.transmitters=6",)),
     "sionna_csi": ["data.transmitters=6", "data.subcarriers=3"],
-}
-"""What makes a component quick to check."""
+    "blocks": ["split.edge=1.0"], "runs": ["split.length=2"], "sparse": ["split.train=7"],
+}  # fmt: skip
+"""Options that make a component quick to check, or that have no default."""
 
-GIVEN = {"blocks": ["split.edge=1.0"], "runs": ["split.length=2"], "sparse": ["split.train=7"]}
-"""Options that a configuration file leaves open."""
-
-TASKS = ("spectrum", "rssi", "csi")
 SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
 """The data set that brings a task."""
 
 MADE_FOR = {
-    "loss": {"l1_ssim": ["spectrum"], "absolute": ["spectrum", "rssi"], "squared": ["spectrum", "rssi"]}
-    | {"huber": ["spectrum", "rssi"], "relative_error": ["csi"], "log_relative_error": ["csi"]},
-    "model": {"path_loss": ["rssi"], "friis": ["csi"], "kriging": []},  # kriging is made of a trained model alone
-    "pooling": {
-        "array_response": ["spectrum"],
-        "path_spectrum": ["spectrum"],
-        "path_rssi": ["rssi"],
-        "path_csi": ["csi"],
-        "spectrum": ["spectrum"],
-        "mean_power": ["rssi"],
-        "softmax_attention": ["rssi"],
-        "element_sum": ["csi"],
-    },
+    "loss": {"l1_ssim": ["spectrum"], "relative_error": ["csi"], "log_relative_error": ["csi"]}
+    | dict.fromkeys(("absolute", "squared", "huber"), ("spectrum", "rssi")),
+    "model": {"path_loss": ["rssi"], "friis": ["csi"], "kriging": []},  # kriging is made from a trained model
+    "pooling": dict.fromkeys(("array_response", "path_spectrum", "spectrum"), ("spectrum",))
+    | dict.fromkeys(("path_rssi", "mean_power", "softmax_attention"), ("rssi",))
+    | dict.fromkeys(("path_csi", "element_sum"), ("csi",)),
 }
 """The tasks of a component that does not take all of them."""
 
@@ -98,19 +86,15 @@ def seed():
 
 
 @functools.cache
-def _composed(*overrides):
+def composed(*overrides):
+    """The configuration of a command line; composed once."""
     with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
         return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
 
 
-def composed(*overrides):
-    """The whole configuration of a command line; composed once."""
-    return copy.deepcopy(_composed(*overrides))
-
-
 def configured(kind, name, *overrides):
     """The configuration of a name: that of the command line, or for built-in parts the name with overrides alone."""
-    overrides = [*SMALL.get(name, []), *GIVEN.get(name, []), *overrides]
+    overrides = [*SMALL.get(name, []), *overrides]
     if kind in ("model", "training") or name not in built_in(kind):
         return composed(f"{kind}={name}", *overrides)[kind]
     dots = OmegaConf.to_container(OmegaConf.from_dotlist(overrides))
@@ -125,11 +109,15 @@ def scenes():
 
 def on_its_tasks(kind):
     """Parametrises over the names of a kind, each with the tasks that it is made for."""
-    pairs = [(name, task) for name in built_in(kind) for task in MADE_FOR[kind].get(name, TASKS)]
+    pairs = [(name, task) for name in built_in(kind) for task in MADE_FOR[kind].get(name, SIMULATED)]
     return pytest.mark.parametrize(("name", "task"), pairs)
 
 
-# --- what is known of a room ---
+def unsuitable(kind):
+    return [(name, task) for name, tasks in MADE_FOR[kind].items() for task in SIMULATED if task not in tasks]
+
+
+# --- tasks, data and splits ---
 
 
 @every("task")
@@ -228,7 +216,7 @@ def test_deformation(name, device):
 
 
 @on_every_device
-def test_deformation_of_all_that_a_gaussian_has(device):
+def test_deformation_with_all_heads(device):
     heads = "[rotation,scale,signal,opacity,attenuation]"
     config = configured("deformation", "two_branch", f"deformation.heads={heads}", "deformation.width=8")
     check_deformation(functools.partial(registry("deformation").build, config), example_links().scene, device)
@@ -268,7 +256,7 @@ def test_learnt_pooling(device):
     check_pooling(build, example_links("rssi"), device)
 
 
-# --- what is trained, and how ---
+# --- losses, models and trainings ---
 
 
 @on_its_tasks("loss")
@@ -292,20 +280,14 @@ def test_model(name, task, device):
 @on_every_device
 def test_training(device):
     options = configured("model", "gaigs", f"data={SIMULATED['spectrum']}")
-    options.pop("name")
+    options = {key: value for key, value in options.items() if key != "name"}
     build = functools.partial(registry("training").build, configured("training", "descent"))
     check_training(build, lambda scene: GaussianSplatting(scene, **options), example_links(), device)
 
 
 @pytest.mark.parametrize(
     ("kind", "name", "task"),
-    [
-        (kind, name, task)
-        for kind in ("loss", "model")
-        for name, tasks in MADE_FOR[kind].items()
-        for task in TASKS
-        if task not in tasks
-    ],
+    [(kind, *pair) for kind in ("loss", "model") for pair in unsuitable(kind)],
 )
 def test_a_task_that_a_component_is_not_made_for_is_refused(kind, name, task):
     links = example_links(task)
@@ -313,10 +295,10 @@ def test_a_task_that_a_component_is_not_made_for_is_refused(kind, name, task):
         registry(kind).build({"name": name}, scene=links.scene, task=links.task)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", SIMULATED)
 def test_a_task_brings_a_pooling_a_loss_and_baselines_that_suit_it(task):
     config, scene = composed(f"data={SIMULATED[task]}"), example_links(task).scene
-    assert MADE_FOR["pooling"][config["pooling"]["name"]] == [task]
+    assert MADE_FOR["pooling"][config["pooling"]["name"]] == (task,)
     registry("loss").build(config["loss"], task=scene.task)
     assert {"mean", "knn"} <= {model["name"] for model in config["baselines"]}
     for model in config["baselines"]:

@@ -141,7 +141,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ("tokenizer.widht=3", "tokenizer has no key 'widht' (did you mean 'width'?); it has: gaussian_octaves, hidden"),
+        ("tokenizer.widht=3", "tokenizer 'euclidean' has no key 'widht' (did you mean 'width'?); it has: "),
         ("sede=3", "the configuration has no key 'sede' (did you mean 'seed'?); it has: baselines, command"),
         ("tokenizer=gaa", "there is no tokenizer 'gaa' (did you mean 'ga'?); there are: euclidean, "),
         ("model=gsrf", "model 'gsrf' is in the package gaigs-gsrf, which is not installed\npip install gaigs-gsrf"),
@@ -160,11 +160,11 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("+thread=3", "the configuration has no key 'thread' (did you mean 'threads'?)"),
         ("command=trian", "command must be train, benchmark, agreement or devices, got 'trian'"),
         ("~command", "the configuration needs the key 'command'"),
-        ("benchmark=step", "benchmark=step needs command=benchmark, got command=train"),
+        ("benchmark=step", "command=benchmark needs benchmark=..., and vice versa; got train and step"),
         ("data=nerf2_spectrum", "data.root must be given, as it has no default; add data.root=..."),
         ("data=nerf2_spectrum data.root=nowhere", "nowhere must be the folder of a data set"),
-        ("-m model=knn,mean model.k=3", "; it has: deformation, gaussians, name, placement, pooling, projection, "
-            "rasterizer, tokenizer, trend\nall parts of a sweep must have its keys; sweep this part alone"),
+        ("-m model=knn,mean model.k=3", "in a sweep write ++model.k=... for a key that only the swept model has"),
+        ("model=kriging", "model 'kriging' is made from a trained model; set kriging=true, with any model"),
     ],
 )  # fmt: skip
 def test_a_wrong_word_gives_one_message(overrides, message, run):

@@ -38,7 +38,7 @@ class Place:
             self.write(f"site/{package}/{name}.py", text)
 
     def python(self, script, gaigs=ROOT):
-        """What a script prints as JSON."""
+        """The JSON that a script prints."""
         path = os.pathsep.join((str(self.root / "site"), str(gaigs)))
         done = subprocess.run(
             [sys.executable, "-c", f"import json, sys\nfrom gaigs.registry import registry\n{script}"],

@@ -15,6 +15,7 @@ import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, NoneType, UnionType
+from typing import Any
 
 from gaigs.registry.holders import GIVEN, MISSING, Holder, find_holders, is_plain, sources
 from gaigs.registry.holders import digests as digests
@@ -25,16 +26,12 @@ KINDS = (
 )  # fmt: skip
 """Kinds of components; each is a folder of gaigs and of conf."""
 
-PLAIN = {
-    int: (numbers.Integral, "a whole number"),
-    float: (numbers.Real, "a number"),
-    str: (str, "a string"),
-    Path: (str | Path, "a path"),
-    bool: (bool, "true or false"),
-    NoneType: (NoneType, "null"),
+PLAIN: dict[Any, tuple[Any, str]] = {
+    int: (numbers.Integral, "a whole number"), float: (numbers.Real, "a number"), str: (str, "a string"),
+    Path: (str | Path, "a path"), bool: (bool, "true or false"), NoneType: (NoneType, "null"),
     **dict.fromkeys((list, tuple, Sequence), (list | tuple, "a list")),
     **dict.fromkeys((dict, Mapping), (Mapping, "a mapping")),
-}
+}  # fmt: skip
 """Annotations that options are checked against: accepted types, and the words of errors. A bool is no number."""
 
 LARGEST = 2**63 - 1
@@ -64,13 +61,7 @@ class Registry:
         return sorted({holder.name for holder in holders} | self._registered.keys())
 
     def register(self, name: str) -> Callable:
-        """The decorator of ``gaigs.register`` for this kind.
-
-        Raises:
-            TypeError: The name is not a string, or the component not callable.
-            ValueError: Another component has the name.
-        """
-        check_type(f"the name of a {self.kind} to register", name, str)
+        """The decorator of ``gaigs.register`` for this kind."""
 
         def decorate(component):
             if not callable(component):
@@ -106,30 +97,23 @@ class Registry:
             return component
         names = self.names()
         causes = "".join(f"; cannot read {cause}" for cause in unreadable)
-        raise ValueError(f"unknown {self.kind} {suggest(name, names)}; there are: {_listed(names)}{causes}")
+        raise ValueError(f"unknown {self.kind} {suggest(name, names)}; there are: {listed(names)}{causes}")
 
     def options(self, name: str) -> dict:
         """The options of a component with their defaults; ``???`` stands for a mandatory one.
 
-        Options whose default a configuration cannot hold are left out, and so are inherited ones of files.
+        Options whose default a configuration cannot hold are left out.
         """
-        holders, _ = find_holders(self.kind, name)
-        if holders:
-            return holders[0].options(self.kind)
-        options = {}
-        for key, parameter in _signature(self._registered[name]).parameters.items():
-            is_own = parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
-            default = MISSING if parameter.default is parameter.empty else parameter.default
-            if is_own and key not in GIVEN.get(self.kind, ()) and is_plain(default):
-                options[key] = default
-        return options
+        named = _named(self.get(name))
+        defaults = {key: MISSING if p.default is p.empty else p.default for key, p in named.items()}
+        given = GIVEN.get(self.kind, ())
+        return {key: value for key, value in defaults.items() if key not in given and is_plain(value)}
 
     def build(self, config: str | Mapping | object, **context):
         """Makes the component of a configuration.
 
         Args:
-            config: The name, or a mapping with the key ``name`` and the component's options. A component that is built
-                already is returned.
+            config: The name, or a mapping with the key ``name`` and options; a component itself is returned.
             context: Arguments of the caller, e.g. ``scene``; passed if the component has a parameter of that name.
 
         Raises:
@@ -140,12 +124,10 @@ class Registry:
         if is_built(config):
             return config
         if not isinstance(config, str | Mapping):
-            raise TypeError(f"a {self.kind} configuration must be a mapping with the key 'name', got {config!r}")
+            raise TypeError(f"a {self.kind} must be a mapping with the key 'name', got {config!r}")
         options = {"name": config} if isinstance(config, str) else dict(config)
         if "name" not in options:
-            raise ValueError(
-                f"a {self.kind} configuration needs the key 'name', got {options}; there are: {_listed(self.names())}"
-            )
+            raise ValueError(f"a {self.kind} needs the key 'name', got {options}; there are: {listed(self.names())}")
         name = options.pop("name")
         check_type(f"{self.kind}.name", name, str)
         return call(f"{self.kind} {name!r}", self.get(name), options, **context)
@@ -185,7 +167,7 @@ def registry(kind: str) -> Registry:
         ValueError: There is no such kind.
     """
     if kind not in registries:
-        raise ValueError(f"unknown kind {suggest(kind, KINDS)}; there are: {_listed(KINDS)}")
+        raise ValueError(f"unknown kind {suggest(kind, KINDS)}; there are: {listed(KINDS)}")
     return registries[kind]
 
 
@@ -196,7 +178,7 @@ def register(kind: str, name: str, /) -> Callable:
     before an import.
 
     Raises:
-        TypeError: The name is not a string, or the component not callable.
+        TypeError: The component is not callable.
         ValueError: The kind is unknown, or another component has the name.
 
     Example:
@@ -228,21 +210,15 @@ def configuration_of(component: object) -> dict:
         ValueError: The component or a part has no registered name, or an argument that no file can hold.
     """
     if not hasattr(component, "configuration"):
-        raise ValueError(
-            f"{type(component).__name__} must have a name to be stored; put @gaigs.register(kind, name) over the class"
-        )
+        kind = type(component).__name__
+        raise ValueError(f"{kind} must have a name to be stored; put @gaigs.register(kind, name) over the class")
     return storable(component.configuration, name_of(component))
 
 
-def storable(value: object, where: str):
+def storable(value: Any, where: str) -> Any:
     """A value in plain dictionaries, lists, numbers and strings.
 
-    Args:
-        value: These, registered components, paths, and numbers of numpy or torch.
-        where: Its name in errors.
-
-    Raises:
-        ValueError: The value has, or holds, another type.
+    It holds these, registered components, paths, and numbers of numpy or torch; another type is a ``ValueError``.
     """
     if isinstance(value, Mapping):
         return {key: storable(entry, f"{where}, {key}") for key, entry in value.items()}
@@ -256,19 +232,19 @@ def storable(value: object, where: str):
         return value
     if hasattr(value, "configuration"):
         return configuration_of(value)
-    raise ValueError(
-        f"{where} must be a number, a text, a list or a registered component to be stored, got {type(value).__name__}"
-    )
+    kinds = "a number, a text, a list or a registered component"
+    raise ValueError(f"{where} must be {kinds} to be stored, got {type(value).__name__}")
 
 
-def _noting(kind: str, name: str, component: Callable) -> Callable:
+def _noting(kind: str, name: str, component: Any) -> Any:
     """Makes the instances of a class note their arguments as ``configuration``; functions are returned unchanged."""
-    make = getattr(component, "__init__", None)
+    make: Any = getattr(component, "__init__", None)
     if not isinstance(component, type) or getattr(make, "notes", None) is component:
         return component
     signature = inspect.signature(make)
-    itself = next(iter(signature.parameters))
-    given = {itself, *GIVEN.get(kind, ())}
+    itself, *_ = signature.parameters
+    names = {parameter.kind: key for key, parameter in signature.parameters.items()}
+    given = {itself, names.get(inspect.Parameter.VAR_POSITIONAL), *GIVEN.get(kind, ())}
 
     @functools.wraps(make)
     def noting(self, *args, **kwargs) -> None:
@@ -276,32 +252,21 @@ def _noting(kind: str, name: str, component: Callable) -> Callable:
         if type(self) is component:  # a subclass has a name of its own, or none
             bound = signature.bind(self, *args, **kwargs)
             bound.apply_defaults()
-            options = {}
-            for key, value in bound.arguments.items():
-                match signature.parameters[key].kind:
-                    case inspect.Parameter.VAR_KEYWORD:
-                        options |= value
-                    case inspect.Parameter.VAR_POSITIONAL:
-                        pass
-                    case _:
-                        options[key] = value
-            options = {key: value for key, value in options.items() if key not in given}
+            options = {key: value for key, value in bound.arguments.items() if key not in given}
+            options |= options.pop(names.get(inspect.Parameter.VAR_KEYWORD), {})
             with contextlib.suppress(AttributeError):  # e.g. of a tuple
                 object.__setattr__(self, "configuration", {**options, "name": name})
 
-    noting.notes = component
-    component.__init__ = noting
+    vars(noting)["notes"] = component
+    type.__setattr__(component, "__init__", noting)
     return component
 
 
-def call(what: str, function: Callable, options: Mapping, /, **context):
-    """Calls a function or class with the options of a configuration.
+def call(owner: str, function: Callable, options: Mapping, /, **context):
+    """Calls a function or class with the options of a configuration, and with those of ``context`` that it takes.
 
     Args:
-        what: Name of the options' owner in errors.
-        function: Its parameters are the options.
-        options: Values by name.
-        context: Arguments of the caller; passed if the function has such a parameter.
+        owner: Name in errors.
 
     Raises:
         TypeError: The options are not a mapping, or one does not suit its annotation, see ``check_type``.
@@ -309,40 +274,35 @@ def call(what: str, function: Callable, options: Mapping, /, **context):
             if it is of torch or Lightning, fails.
     """
     if not isinstance(options, Mapping):
-        raise TypeError(f"{what} must be a mapping of options, got {options!r}")
-    parameters = _signature(function).parameters.values()
-    named = {p.name: p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+        raise TypeError(f"{owner} must be a mapping of options, got {options!r}")
+    named, kinds = _named(function), {p.kind for p in _signature(function).parameters.values()}
     # A torch module without a constructor has the signature (*args, **kwargs), and takes nothing.
-    variable = {p.kind for p in parameters} & {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
-    takes_all = variable == {inspect.Parameter.VAR_KEYWORD}
+    takes_all = inspect.Parameter.VAR_KEYWORD in kinds and inspect.Parameter.VAR_POSITIONAL not in kinds
     has = [key for key in named if key not in context]
-    unknown = [key for key in options if key in context or not (takes_all or key in named)]
-    if unknown:
+    if unknown := [key for key in options if key in context or not (takes_all or key in named)]:
         words = " or ".join(suggest(key, has) for key in unknown)
-        raise ValueError(f"{what} has no option {words}; it has: {_listed(has)}")
+        raise ValueError(f"{owner} has no option {words}; it has: {listed(has)}")
     arguments = {**options, **{key: value for key, value in context.items() if takes_all or key in named}}
-    missing = [key for key, p in named.items() if p.default is p.empty and key not in arguments]
-    if missing:
-        raise ValueError(f"{what} needs option {_listed(missing)}; it has: {_listed(has)}")
+    if missing := [key for key, p in named.items() if p.default is p.empty and key not in arguments]:
+        raise ValueError(f"{owner} needs option {listed(missing)}; it has: {listed(has)}")
     for key in options.keys() & named.keys():
         if options[key] is not named[key].default:  # `width: int = None` is a common shorthand
-            check_type(f"{what} option {key!r}", options[key], named[key].annotation)
+            check_type(f"{owner} option {key!r}", options[key], named[key].annotation)
     try:
         return function(**arguments)
     except (Exception, SystemExit) as error:
         # Messages that name no option; errors of torch and Lightning name none either.
-        is_bare = isinstance(error, ArithmeticError | MemoryError | SystemExit)
-        is_bare = is_bare or (isinstance(error, RuntimeError) and "tried to allocate" in str(error))
+        text = str(error)
+        is_bare = isinstance(error, ArithmeticError | MemoryError | SystemExit) or "tried to allocate" in text
         if not is_bare and function.__module__.partition(".")[0] not in ("lightning", "torch"):
             raise
-        text = str(error)
         suspects = [key for key, own in options.items() if key in text or (isinstance(own, str) and own in text)]
-        keys = _listed(f"{key}={options[key]}" for key in suspects) if suspects else _listed(options)
+        keys = listed(f"{key}={options[key]}" for key in suspects) if suspects else listed(options)
         cause = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"{what} cannot be made ({cause})\ncheck its options: {keys}") from error
+        raise ValueError(f"{owner} cannot be made ({cause})\ncheck its options: {keys}") from error
 
 
-def check_type(what: str, value: object, annotation: object) -> None:
+def check_type(name: str, value: Any, annotation: Any) -> None:
     """Checks a value against an annotation in ``PLAIN`` or a union of them; other annotations are not checked.
 
     In a union with other classes, their objects are accepted, too.
@@ -351,7 +311,7 @@ def check_type(what: str, value: object, annotation: object) -> None:
         TypeError: The value does not suit.
     """
     is_union = typing.get_origin(annotation) in (typing.Union, UnionType)
-    allowed = typing.get_args(annotation) if is_union else (annotation,)
+    allowed = [*typing.get_args(annotation)] if is_union else [annotation]
     kinds = [typing.get_origin(kind) or kind for kind in allowed]
     is_plain = [isinstance(kind, type) and kind in PLAIN for kind in kinds]
     is_known = is_union and any(is_plain) and all(isinstance(kind, type) for kind in kinds)
@@ -363,35 +323,35 @@ def check_type(what: str, value: object, annotation: object) -> None:
             return
         allowed = kinds = [float]  # a number must be finite whatever the annotation
     if fitting := [whole for whole, kind in zip(allowed, kinds, strict=True) if _suits(value, kind)]:
-        return _check_entries(what, value, typing.get_args(fitting[0]))
+        return _check_entries(name, value, typing.get_args(fitting[0]))
     words = " or ".join(PLAIN[kind][1] for kind in kinds)
     if isinstance(value, float) and not math.isfinite(value):
         words = words.replace("a number", "a finite number")
     elif type(value) is int and {int, float} & set(kinds):
         words += f" up to {LARGEST:.2g}"
     is_whole = int in kinds and isinstance(value, float) and value.is_integer() and _suits(int(value), int)
-    raise TypeError(f"{what} must be {words}, got {value!r}" + (f"; write {int(value)}" if is_whole else ""))
+    raise TypeError(f"{name} must be {words}, got {value!r}" + (f"; write {int(value)}" if is_whole else ""))
 
 
-def _suits(value: object, kind: type) -> bool:
+def _suits(value: Any, kind: Any) -> bool:
     """True if a value has a type of ``PLAIN``; entries are not checked."""
     if kind in (int, float) and isinstance(value, numbers.Integral):
         return not isinstance(value, bool) and abs(int(value)) <= LARGEST
     return isinstance(value, PLAIN[kind][0]) and (kind is not float or math.isfinite(value))
 
 
-def _check_entries(what: str, value: object, kinds: tuple) -> None:
+def _check_entries(name: str, value: object, kinds: tuple) -> None:
     """Checks the entries of a list or mapping whose annotation has these arguments."""
     if isinstance(value, Mapping) and kinds:
         for key, entry in value.items():
-            check_type(f"a key of {what}", key, kinds[0])
-            check_type(f"{what}, entry {key!r},", entry, kinds[1])
+            check_type(f"a key of {name}", key, kinds[0])
+            check_type(f"{name}, entry {key!r},", entry, kinds[1])
     elif isinstance(value, list | tuple) and kinds:
         kinds = kinds[:1] * len(value) if kinds[1:] in ((), (...,)) else kinds
         if len(value) != len(kinds):
-            raise TypeError(f"{what} must be a list of {len(kinds)}, got {value!r}")
+            raise TypeError(f"{name} must be a list of {len(kinds)}, got {value!r}")
         for number, (entry, kind) in enumerate(zip(value, kinds, strict=True)):
-            check_type(f"{what}, entry {number},", entry, kind)
+            check_type(f"{name}, entry {number},", entry, kind)
 
 
 def _signature(function: Callable) -> inspect.Signature:
@@ -401,13 +361,20 @@ def _signature(function: Callable) -> inspect.Signature:
         return inspect.signature(function)
 
 
+def _named(function: Callable) -> dict[str, inspect.Parameter]:
+    """Parameters with a name of their own."""
+    parameters = _signature(function).parameters.items()
+    return {key: p for key, p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+
+
 def suggest(word: str, known: Iterable[str]) -> str:
     """A word in quotes, with the most similar known word."""
     near = difflib.get_close_matches(str(word), known, n=1)
     return f"{word!r} (did you mean {near[0]!r}?)" if near else repr(word)
 
 
-def _listed(words: Iterable[str]) -> str:
+def listed(words: Iterable[str]) -> str:
+    """Words joined by commas; ``none`` without any."""
     return ", ".join(words) or "none"
 
 

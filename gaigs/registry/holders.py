@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -38,7 +38,6 @@ class Holder:
     """The owner of a name.
 
     Attributes:
-        name: The registered name.
         where: File or distribution, for errors.
         target: ``module`` that registers the component by decorator, or ``module:attribute``.
         file: File of the module if the name was read from it.
@@ -67,47 +66,25 @@ class Holder:
         if self.root is not None:
             return self.root / self.package
         spec = find_spec(self.package)  # imports nothing, as the name has no dots
-        places = (spec and spec.submodule_search_locations) or ()
-        return next(map(Path, places), None)
-
-    def options(self, kind: str) -> dict:
-        """The options of the component with their defaults, read from its source.
-
-        Inherited options, and those whose default is no literal, are left out.
-        """
-        if self.file is not None:
-            stat = self.file.stat()
-            claims = _claims(self.file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size)
-            return next(_options(kind, node) for own, name, node in claims if (own, name) == (kind, self.name))
-        module, _, attribute = self.target.partition(":")
-        if self.folder is None:
-            return {}
-        place = self.folder.parent.joinpath(*module.strip().split("."))
-        file = next((file for file in (place / "__init__.py", place.with_suffix(".py")) if file.is_file()), None)
-        nodes = ast.parse(file.read_bytes()).body if file else ()
-        return next((_options(kind, node) for node in nodes if getattr(node, "name", None) == attribute.strip()), {})
+        return next(map(Path, (spec and spec.submodule_search_locations) or ()), None)
 
 
 def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
     """The holders of a kind's names, or of one name: gaigs, then installed packages, then ./plugins.
 
-    Returns:
-        The holders, and the unreadable files, each with the cause.
+    The second list has the unreadable files, each with the cause.
     """
     cwd = Path.cwd()
     built_in, unreadable = _scan(kind, PACKAGE / kind, f"gaigs.{kind}")
-    points = _installed(f"gaigs.{kind}", _path())
+    # An installation changes a folder of sys.path.
+    path = tuple((folder, os.stat(folder or ".").st_mtime_ns) for folder in sys.path if os.path.isdir(folder or "."))
+    points = _installed(f"gaigs.{kind}", path)
     installed = [Holder(p.name, f"distribution {p.dist.name} {p.dist.version}", p.value) for p in points]
     dropped, causes = _scan(kind, cwd / "plugins", "plugins", root=cwd)
     targets = {(holder.name, holder.target) for holder in installed}
     # A package in ./plugins may be installed as well.
     holders = built_in + installed + [holder for holder in dropped if (holder.name, holder.target) not in targets]
     return [holder for holder in holders if name in (None, holder.name)], unreadable + causes
-
-
-def _path() -> tuple:
-    """The folders of ``sys.path`` with their times of change, which an installation changes."""
-    return tuple((folder, os.stat(folder or ".").st_mtime_ns) for folder in sys.path if os.path.isdir(folder or "."))
 
 
 @functools.lru_cache
@@ -139,22 +116,17 @@ def digests(names: Container[str]) -> dict[str, str]:
 def _with_imports(place: Path) -> set[Path]:
     """The source files of a module or package, and of those in ./plugins that they import."""
     plugins = Path.cwd() / "plugins"
-    found, places = set(), [place]
+    roots = [plugins, *sources(plugins)]
+    found: set[Path] = set()
+    places = [place]
     while places:
         place = places.pop()
         files = {place} if place.is_file() else {*place.rglob("*.py")}
         for file in files - found:
-            try:
-                tree = ast.parse(file.read_bytes())
-            except (SyntaxError, ValueError):  # a file that is not imported
-                continue
-            for node in ast.walk(tree):
-                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-                names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
-                for first, *others in (name.split(".") for name in names):
-                    own = [plugins / others[0]] if first == "plugins" and others else []
-                    own += [source / first for source in sources(plugins)]
-                    places += [each for path in own for each in (path, path.with_suffix(".py")) if each.exists()]
+            lines = re.findall(r"^\s*(?:from|import)\s(.*)", file.read_text(errors="replace"), re.M)
+            words = {word for line in lines for word in re.findall(r"(?:plugins\.)?(\w+)", line)}
+            paths = [root / name for root in roots for word in words for name in (word, f"{word}.py")]
+            places += [path for path in paths if path.exists()]
         found |= files
     return found
 
@@ -166,17 +138,15 @@ def _scan(kind: str, folder: Path, package: str, root: Path | None = None) -> tu
         where = str(file.relative_to(root or PACKAGE.parent))
         try:
             if file.name == "pyproject.toml":
-                source = _source(file.parent)
-                holders += [Holder(name, where, target, root=source) for name, target in _entry_points(kind, file)]
+                (source,) = sources(folder, file.parent.name)
+                project = tomllib.loads(file.read_text(encoding="utf-8")).get("project", {})
+                points = project.get("entry-points", {}).get(f"gaigs.{kind}", {})
+                holders += [Holder(name, where, str(target), root=source) for name, target in points.items()]
             else:
-                holders += [Holder(name, where, module, file, root) for name in _decorated(kind, file)]
-        except (
-            SyntaxError,
-            ValueError,
-            OSError,
-            RecursionError,
-            MemoryError,
-        ) as error:  # of the parser, too
+                stat = file.stat()
+                claims = _claims(file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size)
+                holders += [Holder(name, where, module, file, root) for own, name in claims if own == kind]
+        except Exception as error:  # any error of a parser
             unreadable.append(f"{where}: {str(error) or type(error).__name__}")
     return holders, unreadable
 
@@ -193,42 +163,15 @@ def _files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
             yield from _files(path, f"{package}.{path.name}")
 
 
-def _source(project: Path) -> Path:
-    """The folder of an installable project's packages: ``src`` if it exists, else that of the pyproject.toml."""
-    return project / "src" if (project / "src").is_dir() else project
-
-
-def sources(folder: Path) -> list[Path]:
-    """The package folders of all installable projects in a folder."""
-    return [_source(file.parent) for file in sorted(folder.glob("[!_.]*/pyproject.toml"))]
-
-
-def _entry_points(kind: str, file: Path) -> Iterable[tuple[str, str]]:
-    """Names and targets that a pyproject.toml declares.
-
-    Raises:
-        ValueError: The file is no TOML, or an entry has another type.
-    """
-    points = tomllib.loads(file.read_text(encoding="utf-8"))
-    for key in ("project", "entry-points", f"gaigs.{kind}"):
-        points = points.get(key, {})
-        if not isinstance(points, dict):
-            raise ValueError(f"{key} must be a table, got {points!r}")
-    for name, target in points.items():
-        if not isinstance(target, str):
-            raise ValueError(f"entry point {name!r} must be a string module:attribute, got {target!r}")
-    return points.items()
-
-
-def _decorated(kind: str, file: Path) -> list[str]:
-    """Names of a kind that a file's top-level ``@register(kind, name)`` decorators claim."""
-    stat = file.stat()
-    return [name for own, name, _ in _claims(file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size) if own == kind]
+def sources(folder: Path, project: str = "[!_.]*") -> list[Path]:
+    """The folders with the packages of the installable projects in a folder: ``src`` if it exists, else their own."""
+    places = [file.parent for file in sorted(folder.glob(f"{project}/pyproject.toml"))]
+    return [place / "src" if (place / "src").is_dir() else place for place in places]
 
 
 @functools.cache  # called for each kind
-def _claims(file: Path, *_state: int) -> list[tuple[str, str, ast.stmt]]:
-    """Kinds and names in the decorators of a file, and the decorated statements."""
+def _claims(file: Path, *_state: int) -> list[tuple[str, str]]:
+    """Kinds and names that a file's top-level ``@register(kind, name)`` decorators claim."""
     found = []
     for node in ast.parse(file.read_bytes(), file.name).body:
         for decorator in getattr(node, "decorator_list", ()):
@@ -237,32 +180,8 @@ def _claims(file: Path, *_state: int) -> list[tuple[str, str, ast.stmt]]:
                     func=ast.Name(id="register") | ast.Attribute(attr="register"),
                     args=[ast.Constant(value=str(kind)), ast.Constant(value=str(name))],
                 ):
-                    found.append((kind, name, node))
+                    found.append((kind, name))
     return found
-
-
-def _options(kind: str, node: ast.stmt) -> dict:
-    """Options of a class or function, see ``Holder.options``."""
-    if isinstance(node, ast.ClassDef):
-        methods = (each for each in node.body if isinstance(each, ast.FunctionDef) and each.name == "__init__")
-        node = next(methods, None)
-    if not isinstance(node, ast.FunctionDef):
-        return {}
-    positional = [*node.args.posonlyargs, *node.args.args]
-    defaults = [None] * (len(positional) - len(node.args.defaults)) + node.args.defaults
-    options = {}
-    for argument, default in zip(
-        (*positional, *node.args.kwonlyargs), (*defaults, *node.args.kw_defaults), strict=True
-    ):
-        if argument.arg == "self" or argument.arg in GIVEN.get(kind, ()):
-            continue
-        try:
-            value = MISSING if default is None else ast.literal_eval(default)
-        except ValueError:  # e.g. a constant's name
-            continue
-        if is_plain(value):
-            options[argument.arg] = value
-    return options
 
 
 def is_plain(value: object) -> bool:

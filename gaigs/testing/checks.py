@@ -1,6 +1,7 @@
 """Rules, tolerances, tensors, gradients and random inputs, shared by the checks."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,17 +13,17 @@ PRECISION = {torch.float32: 1e-4, torch.float64: 1e-9}
 """Largest error of a result, relative to the largest true value."""
 
 
-def require(holds: bool, rule: str) -> None:
+def require(holds: object, rule: str) -> None:
     """Raises an ``AssertionError`` with the rule unless it holds."""
     if not holds:
         raise AssertionError(rule)
 
 
-def require_raises(error: type[Exception], call: Callable, rule: str) -> None:
-    """Raises an ``AssertionError`` with the rule unless a call raises an error of that type."""
+def require_refusal(call: Callable[[], object], rule: str) -> None:
+    """Raises an ``AssertionError`` with the rule unless a call raises a ``ValueError``, or a type checker's error."""
     try:
         call()
-    except error:
+    except (ValueError, TypeError):
         return
     except Exception as other:
         raise AssertionError(rule) from other
@@ -46,18 +47,30 @@ def require_tensor(
     require(tensor.dtype == dtype, f"{name} must be {dtype} as its input, got {tensor.dtype}")
     same = device is None or tensor.device.type == torch.device(device).type
     require(same, f"{name} must be on {device} as its input, got {tensor.device}")
-    require(bool(tensor.isfinite().all()), f"{name} must be finite")
+    require(tensor.isfinite().all(), f"{name} must be finite")
 
 
-def require_gradients(outputs: Sequence[Tensor], leaves: dict[str, Tensor]) -> None:
+def require_independence(result: Any, again: Any, alone: Any, per_query: Collection[str], tolerance: float) -> None:
+    """Requires named tuples of two calls to be equal, and one of the last query alone to equal the last row."""
+    for name, whole, twice, single in zip(result._fields, result, again, alone, strict=True):
+        if whole is None:
+            require(twice is None and single is None, f"{name} must be given for all queries or for none")
+            continue
+        require(torch.equal(whole, twice), f"two calls must give the same {name}")
+        own = whole[-1:] if name in per_query else whole
+        require_close(single, own, tolerance, f"{name} must not depend on the other queries")
+
+
+def require_gradients(outputs: Iterable[Tensor | None], leaves: Mapping[str, Tensor]) -> None:
     """Requires finite gradients of a fixed function of the outputs; a leaf that has no influence needs none."""
-    outputs = [output for output in outputs if output.requires_grad and output.numel()]
-    if not outputs:
+    given = [output for output in outputs if output is not None and output.requires_grad and output.numel()]
+    if not given or not leaves:
         return
-    total = sum(map(fixed_sum, outputs))
-    gradients = torch.autograd.grad(total, [*leaves.values()], allow_unused=True, retain_graph=True)
+    gradients = torch.autograd.grad(
+        sum(map(fixed_sum, given)), [*leaves.values()], allow_unused=True, retain_graph=True
+    )
     for name, gradient in zip(leaves, gradients, strict=True):
-        require(gradient is None or bool(gradient.isfinite().all()), f"the gradient of {name} must be finite")
+        require(gradient is None or gradient.isfinite().all(), f"the gradient of {name} must be finite")
 
 
 def require_groups(groups: Mapping[str, Iterable[nn.Parameter]], module: nn.Module) -> None:
@@ -73,13 +86,6 @@ def fixed_sum(values: Tensor) -> Tensor:
         values = torch.view_as_real(values.resolve_conj())
     weights = torch.arange(values.numel(), device=values.device).cos().to(values)
     return (values.flatten() * weights).sum()
-
-
-def random_labels(shape: Sequence[int], dtype: torch.dtype, generator: torch.Generator) -> Tensor:
-    """Labels that suit every task: uniform in [0, 1], in both parts of complex ones."""
-    if dtype.is_complex:
-        return torch.view_as_complex(torch.rand(*shape, 2, generator=generator)).to(dtype)
-    return torch.rand(*shape, generator=generator).to(dtype)
 
 
 def random_places(scene: Scene, count: int, generator: torch.Generator) -> Tensor:

@@ -1,34 +1,26 @@
 """Made-up links, and the check of kind ``data``."""
 
+import contextlib
 import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.antenna import Array, Receiver
-from gaigs.data import Links, Parts, Split
+from gaigs.data import Links, Split
 from gaigs.data.nerf2_spectrum import NORMALISATION
 from gaigs.geometry import Grid, Pose
 from gaigs.query import CARRIERS, Query
 from gaigs.scene import Scene
+from gaigs.task import Task
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
 from gaigs.testing.checks import flat, require, require_close, require_tensor
 
-POSES = (
-    Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)),
-    Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0)),
-)
-
-CARRIER = 2.44e9
-"""Carrier of the made-up channels [Hz]."""
-
-BANDWIDTH = 5e8
-"""Bandwidth of made-up spectra and levels with a known carrier [Hz]."""
+POSES = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)), Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0))
 
 
 def example_links(task: str = "spectrum", carrier: float | None = None) -> Links:
@@ -38,7 +30,7 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
         task: ``spectrum``: random spectra of 18 x 36 pixels, each of another place. ``rssi``: random levels of 12
             places that both receivers hear. ``csi``: channels of 12 such places at 4 elements and 5 subcarriers, the
             direct wave and noise.
-        carrier: Carrier of all links [Hz], with a known bandwidth; spectra then come from 3 x 3 patches half a
+        carrier: Carrier of all links [Hz], with a bandwidth of 0.5 GHz; spectra then come from 3 x 3 patches half a
             wavelength apart. None if unknown.
 
     Raises:
@@ -49,6 +41,7 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
     heard_by = torch.arange(24) % 2
     rows = torch.arange(24) // 2
     array = Array.single()
+    made: Task
     match task:
         case "spectrum":
             grid = Grid.degrees(range(4, 90, 5), range(0, 360, 10))
@@ -60,11 +53,14 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
             made, places = Rssi(), places[:12].repeat_interleave(2, 0)
             labels = -60 - 10 * torch.rand(24, generator=generator)
         case "csi":
-            array, places = Array.planar(2, 2, speed_of_light / CARRIER / 2), places[:12].repeat_interleave(2, 0)
-            made = Csi(len(array), CARRIER + torch.linspace(-1e7, 1e7, 5, dtype=torch.float64))
+            array, places = Array.planar(2, 2, speed_of_light / 2.44e9 / 2), places[:12].repeat_interleave(2, 0)
+            frequencies = 2.44e9 + torch.linspace(-1e7, 1e7, 5, dtype=torch.float64)
+            made = Csi(len(array), frequencies)
             noise = torch.randn(24, *made.shape, dtype=torch.complex64, generator=generator)
             elements = torch.stack([pose.to(array.elements).world(array.elements) for pose in POSES])[heard_by]
-            labels = _direct_waves(places, elements, made.frequencies) + 0.1 * noise
+            distances = (places[:, None] - elements).double().norm(dim=-1)[..., None]
+            direct = torch.polar(1 / distances, -2 * math.pi * frequencies / speed_of_light * distances)
+            labels = direct.to(torch.complex64) + 0.1 * noise
         case _:
             raise ValueError(f"task must be spectrum, rssi or csi, got {task!r}")
     return Links(
@@ -75,23 +71,14 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
         rows=rows,
         official=lambda: torch.arange(24).split((20, 4)),
         split=Split("example", *torch.arange(24).split((16, 4, 4))),
-        bandwidth=None if carrier is None else BANDWIDTH,
+        bandwidth=None if carrier is None else 5e8,
     )
-
-
-def _direct_waves(
-    places: Float[Tensor, "k 3"], elements: Float[Tensor, "k e 3"], frequencies: Float[Tensor, " s"]
-) -> Complex[Tensor, "k e s"]:
-    """exp(-j 2 pi f d / c) / d, of amplitudes about 1."""
-    distances = (places[:, None] - elements).double().norm(dim=-1)[..., None]
-    return torch.polar(1 / distances, -2 * math.pi * frequencies / speed_of_light * distances).to(torch.complex64)
 
 
 def check_data(links: Links) -> None:
     """Checks a reader's links: shapes, ranges, repeatable labels, parts without overlap, a storable scene.
 
-    Raises:
-        AssertionError: The links break the contract of ``gaigs.data.Links``.
+    The contract is that of ``gaigs.data.Links``.
     """
     n = len(links)
     _check_query(links)
@@ -99,7 +86,7 @@ def check_data(links: Links) -> None:
         turn, elements = receiver.pose.rotation, receiver.array.elements
         require_tensor(f"the position of {receiver.name}", receiver.pose.position, (3,), torch.float32)
         require_close(turn.mT @ turn, torch.eye(3), 1e-5, f"the rotation of {receiver.name} must be orthonormal")
-        require(bool(turn.det() > 0), f"the rotation of {receiver.name} must not mirror")
+        require(turn.det() > 0, f"the rotation of {receiver.name} must not mirror")
         require_tensor(f"the elements of {receiver.name}", elements, (len(elements), 3), elements.dtype)
         require(elements.dtype.is_floating_point, f"the elements of {receiver.name} must be floats [m]")
     width = links.bandwidth
@@ -109,42 +96,40 @@ def check_data(links: Links) -> None:
     require(len({*names}) == len(names), "receivers must have different names")
     require_tensor("edges", links.edges, (len(links.edges), 2, 3), torch.float32)
     _check_rows(links)
-    parts = _official(links)
-    if parts is not None:
-        check_parts(dict(zip(("train", "test"), parts, strict=True)), n)
-    if links.split is None:
-        everything = torch.arange(n)
-        links = replace(links, split=Split("everything", everything, everything[:0], everything[:0]))
-    else:
+    with contextlib.suppress(FileNotFoundError):  # a missing index file prevents the official split only
+        if links.official is not None:
+            train, test = links.official()
+            check_parts({"train": train, "test": test}, n)
+    if links.split is not None:
         check_parts(links.split.parts(), n)
     _check_labels(links)
-    state = links.scene.state()
+    everything = torch.arange(n)
+    state = replace(links, split=links.split or Split("all", everything, everything[:0], everything[:0])).scene.state()
     require(flat(state) == flat(Scene.from_state(state).state()), "the scene must come back from its state as it was")
 
 
 def check_parts(parts: dict[str, Tensor], n: int) -> None:
-    """Checks parts of n links: ascending numbers without repetition, some to train and some to test on."""
+    """Checks parts of n links: ascending numbers without repetition, with links to train and to test on."""
     for name, part in parts.items():
         require(part.ndim == 1 and part.dtype == torch.long, f"{name} must be the numbers of links, got {part.dtype}")
-        require(bool((part.diff() > 0).all()), f"{name} must ascend")
+        require(part.diff().gt(0).all(), f"{name} must ascend")
     everything = torch.cat([*parts.values()])
     require(len(everything.unique()) == len(everything), f"no link may stand twice in {', '.join(parts)}")
-    require(bool(everything.lt(n).all() and everything.ge(0).all()), f"the split must point at the {n} links")
+    require((everything.lt(n) & everything.ge(0)).all(), f"the split must point at the {n} links")
     require(len(parts["train"]) and len(parts["test"]), "the split must leave links to train and to test on")
 
 
 def _check_query(links: Links) -> None:
-    n, query = len(links), links.query
-    require_tensor("transmitters", query.transmitters, (n, 3), torch.float32)
-    index = query.receivers
+    n, index, frequencies = len(links), links.query.receivers, links.query.frequencies
+    require_tensor("transmitters", links.query.transmitters, (n, 3), torch.float32)
     require(tuple(index.shape) == (n,) and index.dtype == torch.long, "receivers must hold an integer for each link")
-    require(bool(index.lt(len(links.receivers)).all() and index.ge(0).all()), "the query must point into receivers")
-    if query.frequencies is not None:
-        require_tensor("frequencies", query.frequencies, (n,), query.frequencies.dtype)
-        require(query.frequencies.dtype.is_floating_point, "frequencies must be floats [Hz]")
+    require((index.lt(len(links.receivers)) & index.ge(0)).all(), "the query must point into receivers")
+    if frequencies is not None:
+        require_tensor("frequencies", frequencies, (n,), frequencies.dtype)
+        require(frequencies.dtype.is_floating_point, "frequencies must be floats [Hz]")
         low, high = CARRIERS
-        holds = (query.frequencies >= low) & (query.frequencies <= high)
-        require(bool(holds.all()), f"frequencies must be from {low:g} to {high:g} Hz")
+        inside = frequencies.ge(low) & frequencies.le(high)
+        require(inside.all(), f"frequencies must be from {low:g} to {high:g} Hz")
 
 
 def _check_rows(links: Links) -> None:
@@ -152,34 +137,23 @@ def _check_rows(links: Links) -> None:
         return
     rows, places = links.rows, links.query.transmitters
     require(tuple(rows.shape) == (len(links),) and rows.dtype == torch.long, "rows must hold an integer for each link")
-    require(bool((rows >= 0).all()), "rows must count from 0")
+    require(rows.ge(0).all(), "rows must count from 0")
     _, which = rows.unique(return_inverse=True)
     first = torch.zeros(int(which.max()) + 1, dtype=torch.long).scatter_(0, which, torch.arange(len(rows)))
-    require(torch.equal(places[first[which]], places), "links of one row must have the transmitter's place in common")
-
-
-def _official(links: Links) -> Parts | None:
-    """The parts that came with the data; None without parts or their files."""
-    try:
-        return None if links.official is None else links.official()
-    except FileNotFoundError:  # only the official split needs them
-        return None
+    require(torch.equal(places[first[which]], places), "links of one row must have one transmitter position")
 
 
 def _check_labels(links: Links) -> None:
     task = links.task
     some = torch.linspace(0, len(links) - 1, 9).long().flip(0)
-    labels = links.labels[some]
+    labels, batch = links.labels[some], links.batch(some)
     require_tensor("labels", labels, (len(some), *task.shape), task.dtype)
-    require(torch.equal(labels, links.labels[some]), "labels asked for twice must be the same")
-    require(torch.equal(labels[-1:], links.labels[some[-1:]]), "a label must not depend on which others are asked for")
-    batch = links.batch(some)
+    require(torch.equal(labels, links.labels[some]), "labels read twice must be the same")
+    require(torch.equal(labels[-1:], links.labels[some[-1:]]), "a label must not depend on the others that are read")
     require(torch.equal(batch.labels, labels), "a batch must have the labels of its links")
-    same = torch.equal(batch.query.transmitters, links.query.transmitters[some])
-    require(same, "a batch must have the places of its links")
     if isinstance(task, Spectrum):
-        require(bool(labels.ge(0).all() and labels.le(1).all()), "spectra must lie in [0, 1]")
-        require(bool(task.directions.elevations.abs().max() <= math.pi / 2 + 1e-6), "elevations must be in radians")
-        require(bool(task.directions.azimuths.abs().max() <= 2 * math.pi + 1e-6), "azimuths must be in radians")
+        require((labels.ge(0) & labels.le(1)).all(), "spectra must lie in [0, 1]")
+        require(task.directions.elevations.abs().max() <= math.pi / 2 + 1e-6, "elevations must be in radians")
+        require(task.directions.azimuths.abs().max() <= 2 * math.pi + 1e-6, "azimuths must be in radians")
     best = task.scores(labels, labels)[task.monitor]
-    require(bool(best.isfinite().all()), "each label must have a score")
+    require(best.isfinite().all(), "each label must have a score")

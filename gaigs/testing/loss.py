@@ -14,15 +14,8 @@ from gaigs.testing.checks import PRECISION, require, require_close, require_grad
 def check_loss(loss: Loss, links: Links, device: torch.device | str = "cpu") -> None:
     """Checks a loss: least at the labels, a mean over the links, finite gradients everywhere, terms by name.
 
-    Labels on a grid are also compared on every second row and column.
-
-    Args:
-        loss: Made with the task of the links.
-        links: Links with labels.
-        device: Device of the computation.
-
-    Raises:
-        AssertionError: The contract of ``gaigs.loss.Loss`` is broken.
+    It is made with the task of the links. Labels on a grid are also compared on every second row and column. The
+    contract is that of ``gaigs.loss.Loss``.
     """
     batch = links.batch(links.split.train[:6])
     batches = [batch]
@@ -41,28 +34,27 @@ def _check_batch(loss: Loss, batch: Batch, dtype: torch.dtype) -> None:
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(labels.shape, dtype=labels.dtype, generator=generator).to(labels.device)
     least, terms = loss(labels, batch)
-    require_tensor("the loss", least, (), dtype, labels.device)
-    require(isinstance(terms, dict) and bool(terms), f"terms must be a dictionary of at least one, got {terms!r}")
+    require(isinstance(terms, dict) and terms, f"terms must be a dictionary of at least one, got {terms!r}")
     for name, term in terms.items():
         named = isinstance(name, str) and isinstance(term, Tensor)
         require(named, f"terms must be numbers by name, got {type(term).__name__} as {name!r}")
         require_tensor(f"the term {name}", term, (), dtype, labels.device)
     for scale in (1e-2, 0.3, -0.3, 10.0):
-        values, what = labels + scale * noise, f"with errors of about {scale:g}"
+        values, case = labels + scale * noise, f"with errors of about {scale:g}"
         total, terms_there = loss(values, batch)
-        require_tensor(f"the loss {what}", total, (), dtype, labels.device)
+        require_tensor(f"the loss {case}", total, (), dtype, labels.device)
         require([*terms_there] == [*terms], "terms must be the same for all values")
-        require(bool(total > least), f"the loss must be least at the labels, got {least:g} there and {total:g} {what}")
+        require(total > least, f"the loss must be least at the labels, got {least:g} there and {total:g} {case}")
         single = lambda i: replace(batch, query=batch.query[i : i + 1], labels=labels[i : i + 1])
         each = torch.stack([loss(values[i : i + 1], single(i))[0] for i in range(len(batch))])
         require_close(each.mean(), total, PRECISION[dtype], "the loss must be the mean over its links")
     hard = {"at the labels": labels, "next to the labels": labels + 1e-12 * noise, "at zero": 0 * labels}
     hard["far off"] = 1e3 * noise
-    for what, values in hard.items():
+    for case, values in hard.items():
         leaf = values.clone().requires_grad_()
         total, _ = loss(leaf, batch)
         require(total.requires_grad, "the loss must carry a gradient")
-        require_gradients([total], {f"the values {what}": leaf})
+        require_gradients([total], {f"the values {case}": leaf})
     leaf = (labels + 0.1 * noise).requires_grad_()
     (gradient,) = torch.autograd.grad(loss(leaf, batch)[0], leaf)
-    require(bool(gradient[..., None].flatten(1).any(1).all()), "each link must pull at its value")
+    require(gradient[..., None].flatten(1).any(1).all(), "the loss must have a gradient for the value of each link")

@@ -20,62 +20,59 @@ from gaigs.testing.checks import PRECISION, require, require_close, require_grad
 
 
 def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch.device | str = "cpu") -> None:
-    """A pooling: the task's value for each map or set of paths, finite gradients, independence of the batch.
+    """Checks a pooling: the task's value for each map or set of paths, finite gradients, independence of the batch.
 
-    It is fitted to the links, and its twin has the same state. Silent maps and paths are among the inputs. A pooling of
-    maps without a grid of its own is given maps over the label's directions and over a list of some of them. Any other
-    is asked for these. A pooling of maps that gives a real number a link must also take maps that are constant, span 12
-    decades or are of half precision.
-
-    Args:
-        build: Makes the pooling for a scene.
-        links: Links of the task that it is made for; it is fitted to them.
-        device: Device of its inputs.
-
-    Raises:
-        AssertionError: It breaks the contract of ``gaigs.pooling.Pooling``.
+    ``build`` makes it for a scene. It is fitted to links of its task, and its twin has the same state. Silent maps and
+    paths are among the inputs. A pooling of maps without a grid of its own is given maps over the label's directions
+    and over a list of some of them. Any other is called with such a list. A pooling of maps whose label is one real
+    number must also take maps that are constant, span 12 decades or are of half precision. The contract is that of
+    ``gaigs.pooling.Pooling``.
     """
     pooling, task = build(links.scene), links.task
-    channels, takes_paths = pooling.channels, isinstance(pooling, PathPooling)
-    require(isinstance(channels, int) and channels > 0, f"channels must be how many it needs, got {channels!r}")
-    require(not takes_paths or channels == 2, f"paths have 2 channels, real and imaginary part, got {channels}")
-    _check_grid(pooling)
+    takes_paths, grid = isinstance(pooling, PathPooling), pooling.grid
+    require(isinstance(pooling.channels, int), f"channels must be a number, got {pooling.channels!r}")
+    require(not takes_paths or pooling.channels == 2, f"paths have 2 channels, got channels {pooling.channels}")
+    low, high = pooling.zone
+    require(-math.pi / 2 <= low < high <= math.pi / 2, f"zone must be two elevations [rad], got {pooling.zone}")
+    require(grid is None or isinstance(grid, Grid), f"grid must be a Grid or None, got {type(grid).__name__}")
+    if grid is None:
+        grid = task.directions
+    require(takes_paths or grid is not None, f"labels of task {task.name!r} need a pooling with a grid")
     pooling.fit(links)
     twin = build(links.scene)
     twin.load_state_dict(pooling.state_dict())
-    grid = task.directions if pooling.grid is None else pooling.grid
-    rule = f"labels of task {task.name!r} have no directions, so the pooling must have a grid"
-    require(takes_paths or grid is not None, rule)
+    receiver = links.query.receivers[0]
+    same_receiver = (links.query.receivers == receiver).nonzero()[:, 0]
     for b, dtype in ((3, torch.float32), (1, torch.float32), (3, torch.float64)):
         module, other = (copy.deepcopy(part).to(device, dtype).eval() for part in (pooling, twin))
-        query = _query(links, b).to(device)
+        query = links.query[same_receiver[:b]].to(device)
+        received: Tensor | ReceivedPaths
         if takes_paths:
-            what, received = "paths", example_paths(links.receivers[int(query.receivers[0])], query, dtype)
+            noun, paths = "paths", example_paths(links.receivers[int(receiver)], query, dtype)
             names = ("means", "semi_axes", "amplitudes", "lengths", "coherences", "bandwidth")
-            leaves = {name: getattr(received, name).requires_grad_() for name in names}
-            silence = replace(received, amplitudes=torch.zeros_like(received.amplitudes).requires_grad_())
-            silent = {"silent paths": silence.amplitudes}
+            leaves = {name: getattr(paths, name).requires_grad_() for name in names}
+            silent = torch.zeros_like(paths.amplitudes).requires_grad_()
+            received, silence = paths, replace(paths, amplitudes=silent)
         else:
-            generator = torch.Generator().manual_seed(0)
-            what, received = "maps", torch.randn(b, channels, *grid.shape, generator=generator).to(device, dtype)
-            leaves = {"the map": received.requires_grad_()}
-            silence = torch.zeros_like(received).requires_grad_()
-            silent = {"a silent map": silence}
+            noun, generator = "maps", torch.Generator().manual_seed(0)
+            image = torch.randn(b, pooling.channels, *grid.shape, generator=generator).to(device, dtype)
+            leaves = {"the map": image.requires_grad_()}
+            received, silence = image, (silent := torch.zeros_like(image).requires_grad_())
         value = module(received, query)
         wanted = dtype.to_complex() if task.dtype.is_complex else dtype
         require_tensor("the value", value, (b, *task.shape), wanted, device)
         require(torch.equal(value, module(received, query)), "two calls must give the same value")
-        require(torch.equal(value, other(received, query)), "all that it takes in fit must be in the state dict")
+        require(torch.equal(value, other(received, query)), "a pooling's state dict must restore it")
         alone = module(rows_of(received, slice(-1, None)), query[-1:])
-        require_close(alone, value[-1:], PRECISION[dtype], f"a value must not depend on the other {what}")
+        require_close(alone, value[-1:], PRECISION[dtype], f"a value must not depend on the other {noun}")
         require_gradients([value], dict(module.named_parameters()) | leaves)
         quiet = module(silence, query)
-        require(bool(quiet.isfinite().all()), "the value of silence must be finite")
-        require_gradients([quiet], silent)
+        require(quiet.isfinite().all(), "the value of silence must be finite")
+        require_gradients([quiet], {f"silent {noun}": silent})
         none = module(rows_of(received, slice(0, 0)), query[:0])
-        require(tuple(none.shape) == (0, *task.shape), f"no {what} must give no values, got {tuple(none.shape)}")
+        require(tuple(none.shape) == (0, *task.shape), f"no {noun} must give no values, got {tuple(none.shape)}")
         if not takes_paths and pooling.grid is None:
-            row = received.flatten(2)[:, :, None, ::3]
+            row = image.flatten(2)[:, :, None, ::3]
             single = module(row, query)
             require_tensor("the value of a list of rays", single, (b, *row.shape[2:]), wanted, device)
             rule = "a list of rays must have the values of their pixels"
@@ -85,7 +82,7 @@ def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch
             rule = "fewer directions must get the same values"
             require_close(module(received, query, rays), value.flatten(1)[:, 1::3], PRECISION[dtype], rule)
         if not takes_paths and task.shape == () and not task.dtype.is_complex:
-            _check_hard_maps(module, received.detach(), query)
+            _check_hard_maps(module, image.detach(), query)
 
 
 def example_paths(receiver: Receiver, query: Query, dtype: torch.dtype, n: int = 9) -> ReceivedPaths:
@@ -97,16 +94,15 @@ def example_paths(receiver: Receiver, query: Query, dtype: torch.dtype, n: int =
     to = lambda part: part.to(query.transmitters.device, dtype)
     directions = torch.nn.functional.normalize(random(b, n, 3) - 0.5, dim=-1)
     points = to(directions * (1 + 5 * random(b, n, 1)))
-    means = receiver.pose.to(points).world(points)
     return ReceivedPaths(
-        means,
-        to(0.3 * (random(b, n, 3, 3) - 0.5)),
-        amplitudes.to(means.device, dtype.to_complex()),
-        to(1 + 20 * random(b, n)),
-        to(random(n)),
-        to(torch.tensor(4e8)),
-        receiver,
-        to(carriers),
+        means=receiver.pose.to(points).world(points),
+        semi_axes=to(0.3 * (random(b, n, 3, 3) - 0.5)),
+        amplitudes=amplitudes.to(points.device, dtype.to_complex()),
+        lengths=to(1 + 20 * random(b, n)),
+        coherences=to(random(n)),
+        bandwidth=to(torch.tensor(4e8)),
+        receiver=receiver,
+        carriers=to(carriers),
     )
 
 
@@ -114,23 +110,8 @@ def rows_of(received: Tensor | ReceivedPaths, rows: slice) -> Tensor | ReceivedP
     """Some queries' maps or paths."""
     if isinstance(received, Tensor):
         return received[rows]
-    shared = {"semi_axes"} if len(received.semi_axes) == 1 else set()
-    names = {"means", "semi_axes", "amplitudes", "lengths", "carriers"} - shared
+    names = ("means", "semi_axes", "amplitudes", "lengths", "carriers")
     return replace(received, **{name: getattr(received, name)[rows] for name in names})
-
-
-def _check_grid(pooling: Pooling) -> None:
-    low, high = pooling.zone
-    require(-math.pi / 2 <= low < high <= math.pi / 2, f"zone must be two elevations [rad], got {pooling.zone}")
-    if pooling.grid is not None:
-        require(isinstance(pooling.grid, Grid), f"grid must be a Grid or None, got {type(pooling.grid).__name__}")
-        require(min(pooling.grid.shape) > 0, f"grid must have pixels, got {pooling.grid.shape}")
-
-
-def _query(links: Links, count: int) -> Query:
-    """Some links to one receiver."""
-    receiver = links.query.receivers[0]
-    return links.query[(links.query.receivers == receiver).nonzero()[:count, 0]]
 
 
 def _check_hard_maps(pooling: Pooling, image: Float[Tensor, "b c rows columns"], query: Query) -> None:
@@ -143,6 +124,5 @@ def _check_hard_maps(pooling: Pooling, image: Float[Tensor, "b c rows columns"],
         leaf.requires_grad_()
         value = pooling(leaf, query)
         dtype = torch.float32 if leaf.dtype == torch.half else leaf.dtype
-        require(value.dtype == dtype, f"the value of {name} must be {dtype}, got {value.dtype}")
-        require(bool(value.isfinite().all()), f"the value of {name} must be finite")
+        require_tensor(f"the value of {name}", value, value.shape, dtype)
         require_gradients([value], {**dict(pooling.named_parameters()), name: leaf})

@@ -1,7 +1,7 @@
 """The check of kind ``rasterizer``, against the formula over all pairs of splat and pixel."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import torch
@@ -14,12 +14,9 @@ from gaigs.testing.checks import PRECISION, fixed_sum, require, require_close, r
 
 
 def check_rasterizer(rasterizer: Rasterizer, device: torch.device | str = "cpu") -> None:
-    """A rasterizer: map, transmittance and gradients against ``rasterize_densely``, on easy scenes and hard ones.
+    """Checks a rasterizer: map, transmittance and gradients against ``rasterize_densely``, on easy and hard scenes.
 
-    float64 may be refused by a ``TypeError``.
-
-    Raises:
-        AssertionError: It breaks the contract of ``gaigs.rasterizer.Rasterizer``.
+    float64 may be refused by a ``TypeError``. The contract is that of ``gaigs.rasterizer.Rasterizer``.
     """
     for title, arguments in _scenes():
         # Where A meets one of its bounds to within rounding, the two may rightly decide differently.
@@ -38,8 +35,11 @@ def check_rasterizer(rasterizer: Rasterizer, device: torch.device | str = "cpu")
             again = render_with_gradients(rasterizer, moved, away.to(device))
             for name in ("map", "transmittance"):
                 require(torch.equal(found[name], again[name]), f"{title}: two runs must give the same {name}")
-            require(isinstance(rasterizer.used, str), f"used must say what drew the map, got {rasterizer.used!r}")
-            alone = render_with_gradients(rasterizer, _only_last(moved), away[-1:].to(device))
+            require(isinstance(rasterizer.used, str), f"used must name the rasterizer, got {rasterizer.used!r}")
+            splats, *per_query, plane = moved
+            last = [None if part is None else part[-1:] for part in per_query]
+            alone_splats = replace(splats, factors=splats.factors[-1:])
+            alone = render_with_gradients(rasterizer, (alone_splats, *last, plane), away[-1:].to(device))
             rule = f"{title}: a map must not depend on other transmitters"
             require_close(alone["map"], found["map"][-1:], tolerance, rule)
     _check_nan_shows(rasterizer, device)
@@ -123,32 +123,31 @@ def _scenes() -> Iterator[tuple[str, tuple]]:
     disc = elevations.cos() * azimuths.cos(), elevations.cos() * azimuths.sin()
     yield "rows and columns mixed", scene(plane=Plane(*disc, None), own=True, attenuations=True)
     yield "columns mixed", scene(plane=Plane(azimuths * elevations.cos(), elevations, None))
-    rays = torch.stack((6.28 * torch.rand(30, generator=generator) - 3.14, 1.5 * torch.rand(30, generator=generator)))
-    yield "rays in a single row", scene(plane=Plane(*rays[:, None], 2 * math.pi), attenuations=True)
+    u, v = (6.28 * torch.rand(1, 30, generator=generator) - 3.14, 1.5 * torch.rand(1, 30, generator=generator))
+    yield "rays in a single row", scene(plane=Plane(u, v, 2 * math.pi), attenuations=True)
     splats, *rest = scene()
     splats.depths.round_()
     yield "equal depths", (splats, *rest)
     splats, *rest = scene()
     splats.factors[:, ~splats.visible], splats.means2d[~splats.visible] = torch.nan, torch.inf
-    yield "rubbish that is not visible", (splats, *rest)
+    yield "invisible splats with NaN", (splats, *rest)
 
 
 def render_with_gradients(
-    rasterizer: Rasterizer, arguments: tuple, pixels: Bool[Tensor, "b rows columns"]
+    rasterizer: Callable, arguments: tuple, pixels: Bool[Tensor, "b rows columns"]
 ) -> dict[str, Tensor]:
     """Map and transmittance at ``pixels``, and the gradients of a fixed function of both."""
     splats, signal, opacities, attenuations, plane = arguments
     leaves = {"means2d": splats.means2d, "factors": splats.factors}
     leaves |= {"signal": signal, "opacities": opacities, "attenuations": attenuations}
-    leaves = {name: None if leaf is None else leaf.detach().clone().requires_grad_() for name, leaf in leaves.items()}
-    means2d, factors, *others = leaves.values()
-    image, left = rasterizer(replace(splats, means2d=means2d, factors=factors), *others, plane)
+    leaves = {name: leaf.detach().clone().requires_grad_() for name, leaf in leaves.items() if leaf is not None}
+    changed = replace(splats, means2d=leaves["means2d"], factors=leaves["factors"])
+    image, left = rasterizer(changed, leaves["signal"], leaves["opacities"], leaves.get("attenuations"), plane)
     image, left = image * pixels[:, None], left * pixels
     (fixed_sum(image) + fixed_sum(left)).backward()
     results = {"map": image.detach(), "transmittance": left.detach()}
     for name, leaf in leaves.items():
-        if leaf is not None:
-            results[f"gradient of {name}"] = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+        results[f"gradient of {name}"] = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
     return results
 
 
@@ -156,15 +155,8 @@ def cast_scene(arguments: tuple, device: torch.device | str, dtype: torch.dtype)
     """Arguments of a rasterizer on another device and in another precision."""
     splats, signal, opacities, attenuations, plane = arguments
     to = lambda tensor: None if tensor is None else tensor.to(device, dtype)
-    splats = Splats(*map(to, (splats.means2d, splats.factors, splats.depths)), splats.visible.to(device))
+    splats = Splats(to(splats.means2d), to(splats.factors), to(splats.depths), splats.visible.to(device))
     return splats, to(signal), to(opacities), to(attenuations), Plane(to(plane.u), to(plane.v), plane.period)
-
-
-def _only_last(arguments: tuple) -> tuple:
-    """The last transmitter by itself."""
-    splats, signal, opacities, attenuations, plane = arguments
-    splats = replace(splats, factors=splats.factors[-1:])
-    return splats, signal[-1:], opacities[-1:], None if attenuations is None else attenuations[-1:], plane
 
 
 def _check_nan_shows(rasterizer: Rasterizer, device: torch.device | str) -> None:
@@ -175,4 +167,4 @@ def _check_nan_shows(rasterizer: Rasterizer, device: torch.device | str) -> None
         front = torch.where(splats.visible, splats.depths, torch.inf).argmin()
         broken.get(name, opacities)[:, front] = torch.nan
         image, _ = rasterizer(splats, signal, opacities, attenuations, plane)
-        require(bool(image.isnan().any()), f"NaN in {name} must show as NaN in the map")
+        require(image.isnan().any(), f"NaN in {name} must show as NaN in the map")

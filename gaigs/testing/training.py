@@ -4,7 +4,9 @@ import math
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
@@ -15,14 +17,13 @@ from gaigs.checkpoint import KEY
 from gaigs.data import Links
 from gaigs.model import Model
 from gaigs.processes import stopping
-from gaigs.query import Batch
 from gaigs.scene import Scene
-from gaigs.testing.checks import flat, require, require_close, require_raises
+from gaigs.testing.checks import flat, require, require_close, require_refusal
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.checkpoints import KeepLast, save
 
 STEPS, STOP = 6, 3
-"""Steps of a whole training and of an interrupted one; every second step validates."""
+"""Steps of a training and of an interrupted one; every second step validates."""
 
 
 def check_training(
@@ -33,41 +34,54 @@ def check_training(
 ) -> None:
     """Checks a training: one step a batch, validation, results that follow from the seed, bit-exact resume.
 
+    The contract is that of ``gaigs.training.descent.Descent``.
+
     Args:
         build: Makes the training, given ``model``, ``loss``, ``identity`` and ``seed`` by name, as
             ``functools.partial(registry("training").build, config)`` does; all learning rates are positive.
         build_model: Makes a model for a scene.
         links: Links with a split that validates.
-        device: Device of the computation.
-
-    Raises:
-        AssertionError: The contract of kind ``training`` is broken, see ``gaigs.training.descent.Descent``.
     """
     identity = {"who": "the check", "numbers": torch.arange(3)}
 
-    def make(**changes) -> lightning.LightningModule:
+    def loss(values, batch):
+        error = (values - batch.labels).abs().square().mean()
+        return error, {"squared": error}
+
+    def make(**changes) -> Any:
         torch.manual_seed(0)
         model = build_model(links.scene)
         model.fit(links)
         for name, value in changes.items():
             setattr(model, name, value)
-        return build(model=model, loss=_squared, identity=identity, seed=0)
+        return build(model=model, loss=loss, identity=identity, seed=0)
 
     module = make()
-    _check_attributes(module, links)
+    require(isinstance(module, lightning.LightningModule), f"a training must be a LightningModule, got {type(module)}")
+    require(isinstance(module.model, Model), "the training's model must be its attribute model")
+    require(module.task.name == links.task.name, "the training's task must be that of its model's scene")
+    size, patience, density = module.batch_size, module.patience, module.density
+    require(isinstance(size, int) and size >= 1, f"batch_size must be a number of places, got {size!r}")
+    counts = patience is None or (isinstance(patience, int) and patience >= 1)
+    require(counts, f"patience must be a number of validations or None, got {patience!r}")
+    require(density is None or isinstance(density, Mapping), f"density must be options or None, got {density!r}")
     content: dict = {}
     module.on_save_checkpoint(content)
     require(flat(content.get(KEY)) == flat(identity), f"a checkpoint must hold the identity as its entry {KEY!r}")
     other = f"none but {module.model.trained_by}"
-    require_raises(ValueError, lambda: make(trained_by=other), "a model of another training must be a ValueError")
+    require_refusal(lambda: make(trained_by=other), "a model of another training must be a ValueError")
     before = _copy(module.model)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
         whole = _train(module, links, folder, device)
         require(whole.steps == list(range(1, STEPS + 1)), f"{STEPS} batches must be as many steps, got {whole.steps}")
         finite = all(map(math.isfinite, whole.losses))
         require(finite, f"each step must log a finite train/loss for the progress bar, got {whole.losses}")
-        _check_changes(module.model, before)
+        after, names = whole.states[-1], {id(parameter): name for name, parameter in module.model.named_parameters()}
+        for group, parameters in module.model.parameter_groups().items():
+            own = [names[id(parameter)] for parameter in parameters if parameter.requires_grad]
+            changed = any(not torch.equal(after[name], before[name]) for name in own)
+            require(changed, f"the parameters of group {group} must change in training")
         _check_validation(module.model, links, whole.metrics)
         again = _train(make(), links, folder, device)
         _compare(again.states, whole.states, "the same seed must give the same training")
@@ -78,15 +92,15 @@ def check_training(
     _compare(rest.states, whole.states[STOP:], "a resumed training must equal an uninterrupted one")
 
 
+@dataclass(eq=False)
 class _Course(Callback):
     """Keeps the model and the logged loss of every step; writes a checkpoint after step ``STOP``."""
 
-    def __init__(self, folder: Path):
-        self.folder = folder
-        self.steps: list[int] = []
-        self.states: list[dict[str, Tensor]] = []
-        self.losses: list[float] = []
-        self.metrics: dict[str, float] = {}
+    folder: Path
+    steps: list[int] = field(default_factory=list)
+    states: list[dict[str, Tensor]] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
+    metrics: dict[str, float] = field(default_factory=dict)
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
         self.steps.append(trainer.global_step)
@@ -104,47 +118,16 @@ def _train(module, links: Links, folder: Path, device, resume: Path | None = Non
     with stopping(), warnings.catch_warnings():
         for message in (".*LeafSpec", ".*does not have many workers", "GPU available but not used"):  # Lightning's
             warnings.filterwarnings("ignore", message)
-        quiet = dict.fromkeys(("logger", "enable_progress_bar", "enable_model_summary"), False)
-        steps = {"max_epochs": -1, "max_steps": STEPS, "val_check_interval": 2, "check_val_every_n_epoch": None}
         trainer = lightning.Trainer(
-            accelerator="gpu" if torch.device(device).type == "cuda" else "cpu",
-            devices=1,
-            num_sanity_val_steps=0,
-            log_every_n_steps=1,
-            callbacks=[course, KeepLast(folder / "last.ckpt", math.inf)],
-            default_root_dir=folder,
-            **steps,
-            **quiet,
-        )
+            accelerator="gpu" if torch.device(device).type == "cuda" else "cpu", devices=1, max_epochs=-1,
+            max_steps=STEPS, val_check_interval=2, check_val_every_n_epoch=None, num_sanity_val_steps=0,
+            log_every_n_steps=1, logger=False, enable_progress_bar=False, enable_model_summary=False,
+            callbacks=[course, KeepLast(folder / "last.ckpt", math.inf)], default_root_dir=folder,
+        )  # fmt: skip
         batches = Batches(links, links.split.train, module.batch_size, 0, STEPS)
         validation = InOrder(links, links.split.validation, module.batch_size)
         trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     return course
-
-
-def _squared(values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-    """The mean squared error of any task."""
-    error = (values - batch.labels).abs().square().mean()
-    return error, {"squared": error}
-
-
-def _check_attributes(module: lightning.LightningModule, links: Links) -> None:
-    """Attributes that a run reads."""
-    require(isinstance(module, lightning.LightningModule), f"a training must be a LightningModule, got {type(module)}")
-    require(isinstance(module.model, Model), "the training's model must be its attribute model")
-    require(module.task.name == links.task.name, "the training's task must be that of its model's scene")
-    size, patience, density = module.batch_size, module.patience, module.density
-    require(isinstance(size, int) and size >= 1, f"batch_size must be a number of places, got {size!r}")
-    counts = patience is None or (isinstance(patience, int) and patience >= 1)
-    require(counts, f"patience must be a number of validations or None, got {patience!r}")
-    require(density is None or isinstance(density, Mapping), f"density must be options or None, got {density!r}")
-
-
-def _check_changes(model: Model, before: dict[str, Tensor]) -> None:
-    after, names = _copy(model), {id(parameter): name for name, parameter in model.named_parameters()}
-    for group, parameters in model.parameter_groups().items():
-        changed = any(not torch.equal(after[names[id(p)]], before[names[id(p)]]) for p in parameters if p.requires_grad)
-        require(changed, f"the parameters of group {group} must change in training")
 
 
 def _check_validation(model: Model, links: Links, metrics: Mapping[str, float]) -> None:

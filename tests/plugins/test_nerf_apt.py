@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.interpolate import RegularGridInterpolator
-from splatting import build, check_task, composed, run
+from splatting import build, composed
 from torch import nn
 
 from gaigs.geometry import Grid, Rays
 from gaigs.query import Batch
-from gaigs.registry import registry
 from gaigs.task.spectrum import Spectrum
 from gaigs.testing import example_links
 
@@ -36,20 +35,6 @@ def make(scene=LINKS.scene, **changes):
 def package():
     """The module that has the model."""
     return sys.modules[type(make()).__module__]
-
-
-@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_it_keeps_the_contract_of_models(task):
-    check_task(task, *SMALL)
-
-
-def test_a_package_in_plugins_finds_another_one_there(monkeypatch):
-    for name in [name for name in sys.modules if name.startswith(("gaigs_nerf2", "gaigs_nerf_apt"))]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr(registry("model"), "_registered", {})
-    model = make()
-    assert type(model).__mro__[1].__module__ == "gaigs_nerf2.marching"
-    assert isinstance(model, sys.modules["gaigs_nerf2"].RayMarching)
 
 
 # --- the U-Net ---
@@ -190,35 +175,3 @@ def test_a_trained_models_links_do_not_depend_on_each_other(task):
     assert (together - lonely).abs().max() > 1e-3 * lonely.abs().max(), "batch normalisation"
     model.eval()
     torch.testing.assert_close(model(batch).value[:1], model(alone).value, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_a_run_from_start_to_end(task, tmp_path, monkeypatch):
-    data = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}[task]
-    config, metrics, model = run(tmp_path, monkeypatch, f"data={data}", *SMALL)
-    assert config["loss"]["name"] == ("log_relative_error" if task == "csi" else "squared")
-    assert metrics["models"].keys() == {"nerf_apt", "mean"}
-    assert type(model).__name__ == "NerfApt"
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"samples": 6}, r"multiples of 4, of at least 2 rows, got 6 and \[3, 8\]"),
-        ({"rays": [3, 10]}, r"multiples of 4, of at least 2 rows, got 4 and \[3, 10\]"),
-        ({"rays": [1, 8]}, r"multiples of 4, of at least 2 rows, got 4 and \[1, 8\]"),
-        ({"rays": [8]}, r"model.rays must be \[rows, columns\], got \[8\]"),
-        ({"widths": [4, 4]}, r"model.widths must be three numbers of at least 2, got \[4, 4\]"),
-        ({"widths": [1, 4, 4]}, "three numbers of at least 2"),
-        ({"octaves": -1}, "model.octaves must be at least 0 and at most 30, got -1"),
-        ({"octaves": 200}, "model.octaves must be at least 0 and at most 30, got 200"),
-    ],
-)
-def test_options_out_of_range(changes, message):
-    with pytest.raises(ValueError, match=message):
-        make(**changes)
-
-
-def test_several_carriers():
-    with pytest.raises(ValueError, match="of one carrier, and these links have 2; take another model"):
-        make(replace(LINKS.scene, frequencies=torch.tensor([1e9, 2e9])))

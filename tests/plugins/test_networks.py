@@ -1,9 +1,7 @@
 """The networks: formulas against plain loops in float64, contracts, refusals, and a short run of each on each task."""
 
 import functools
-import json
 import math
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,22 +10,19 @@ from types import SimpleNamespace
 import lightning
 import numpy as np
 import pytest
+import splatting
 import torch
-from hydra import compose, initialize_config_dir
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import CSVLogger
-from omegaconf import OmegaConf
 from scipy.interpolate import BSpline
 
-import gaigs
-from gaigs import configuration, runs
 from gaigs.loss.absolute import Absolute
 from gaigs.model import Model, Prediction
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.report.curves import read_curves
 from gaigs.task.scalar import Scalar
-from gaigs.testing import check_model, check_training, example_links
+from gaigs.testing import check_training, example_links
 from gaigs.training.batches import Batches, InOrder
 
 ROOT = Path(__file__).parents[2]
@@ -46,15 +41,14 @@ every_system = pytest.mark.parametrize("name", SMALL)
 
 
 @pytest.fixture(autouse=True)
-def place(monkeypatch):
+def place():
     """The root of the repository, where the package is found by name."""
-    monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(sys, "path", sys.path[:])  # the registry appends to it
+    with splatting.repository():
+        yield
 
 
 def build(name, scene, **options):
-    torch.manual_seed(0)
-    return registry("model").build({"name": name} | SHARED | SMALL[name] | options, scene=scene)
+    return splatting.build("model", {"name": name} | SHARED | SMALL[name] | options, scene=scene)
 
 
 def fitted(name, task, **options):
@@ -80,25 +74,12 @@ def numbers(module):
     return {name: value.detach().numpy() for name, value in module.state_dict().items()}
 
 
-def told(model, count=3):
+def numbers_of_links(model, count=3):
     width = model.question.width
     return torch.randn(count, width, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
 
 
 # --- contracts ---
-
-
-@every_system
-@pytest.mark.parametrize("task", TASKS)
-def test_they_keep_the_contract_of_models(name, task):
-    check_model(lambda scene: build(name, scene), LINKS[task])
-
-
-@every_system
-def test_several_carriers(name):
-    links = LINKS["rssi"]
-    frequencies = torch.tensor([2.4e9, 5.0e9, 5.8e9])[torch.arange(24) % 3]
-    check_model(lambda scene: build(name, scene), replace(links, query=replace(links.query, frequencies=frequencies)))
 
 
 @every_system
@@ -129,39 +110,14 @@ def test_a_batch_of_one_link_trains(name, task):
     assert any((gradient != 0).any() for gradient in gradients)
 
 
-@every_system
-@pytest.mark.parametrize("task", TASKS)
-def test_they_learn(name, task):
-    """Labels that bend over the room are fitted to half of their mean's error."""
-    links = LINKS[task]
-    bend = (links.query.transmitters[:, 0] - 3) / 3
-    shape = [-1, *[1] * len(links.task.shape)]
-    labels = (0.5 + 0.3 * bend).reshape(shape).expand(-1, *links.task.shape).to(links.task.dtype)
-    links = replace(links, labels=labels if task != "rssi" else 20 * labels - 70)
-    model = build(name, links.scene, **({"dropout": 0.0} if name == "mlp" else {}))
-    model.fit(links)
-    model.train()
-    optimizer = torch.optim.Adam(model.parameter_groups()["network"], lr=2e-2)
-    batch = links.batch(links.split.train)
-    for _ in range(60):
-        value, penalties = model(batch)
-        loss = (value - batch.labels).abs().square().mean() + sum(penalties.values())
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    error = (model.predict(batch.query) - batch.labels).abs().square().mean()
-    mean = (batch.labels - batch.labels.mean(0)).abs().square().mean()
-    assert error < mean / 2
-
-
-# --- what a network is told ---
+# --- inputs ---
 
 
 def moved(scene, by=0.0, factor=1.0):
     return replace(scene, lower=factor * scene.lower + by, upper=factor * scene.upper + by)
 
 
-def test_places_are_told_relative_to_the_box():
+def test_places_are_relative_to_the_box():
     scene, places = LINKS["rssi"].scene, LINKS["rssi"].query.transmitters
     ask = lambda scene, places: build("mlp", scene).question(Query(places, torch.zeros(len(places), dtype=torch.long)))
     answer = ask(scene, places)
@@ -176,13 +132,7 @@ def test_places_are_told_relative_to_the_box():
     assert answer[:, -2:].tolist() == [[1.0, 0.0]] * len(places)
 
 
-def test_a_flat_box():
-    scene = LINKS["rssi"].scene
-    flat = replace(scene, upper=torch.cat((scene.upper[:2], scene.lower[2:])))
-    assert build("mlp", flat).predict(LINKS["rssi"].query.transmitters).isfinite().all()
-
-
-def test_receivers_and_carriers_are_told():
+def test_receivers_and_carriers_are_inputs():
     scene = replace(LINKS["rssi"].scene, frequencies=torch.tensor([2.4e9, 5.0e9, 5.8e9]))
     question = build("mlp", scene).question
     place = torch.ones(3, 3)
@@ -194,19 +144,6 @@ def test_receivers_and_carriers_are_told():
     assert (band[0] - band[2]).abs().max() > 0.1
     with pytest.raises(ValueError, match="a frequency must be given"):
         question(Query(place, torch.tensor([0, 1, 1])))
-
-
-def test_one_receiver_needs_no_telling():
-    scene = LINKS["rssi"].scene
-    assert build("mlp", replace(scene, receivers=scene.receivers[:1])).question.width == 21
-
-
-def test_octaves_are_by_default_those_that_can_be_learnt():
-    scene = LINKS["spectrum"].scene
-    from gaigs.tokenizer.euclidean import learnable_octaves
-
-    found = build("mlp", scene, octaves=None).question.frequencies
-    assert torch.equal(found, build("mlp", scene, octaves=[*learnable_octaves(scene)]).question.frequencies)
 
 
 # --- labels as images ---
@@ -256,7 +193,7 @@ def test_an_image_with_all_pixels_is_the_label(task):
 
 
 @pytest.mark.parametrize(("pixel", "shape"), [(5.0, (18, 36)), (10.0, (9, 36)), (19.0, (6, 36)), (20.0, (5, 18))])
-def test_pixels_are_at_most_as_large_as_told(pixel, shape):
+def test_pixels_are_at_most_as_large_as_the_option(pixel, shape):
     assert build("mlp", LINKS["spectrum"].scene, pixel=pixel).label.shape == (1, *shape)
 
 
@@ -300,7 +237,7 @@ def normalised(x, part):
 
 def test_the_mlp_is_the_formula():
     model = doubled(build("mlp", LINKS["spectrum"].scene))
-    given = told(model)
+    given = numbers_of_links(model)
     x = given.numpy()
     for layer in (0, 4):  # linear, normalised, rectified; a prediction leaves nothing out
         linear, norm = (numbers(model.network[layer + i]) for i in (0, 1))
@@ -308,14 +245,6 @@ def test_the_mlp_is_the_formula():
     head = numbers(model.network[8])
     expected = (x @ head["weight"].T + head["bias"]).reshape(3, 1, 5, 18)
     np.testing.assert_allclose(model.draw(given).detach(), expected, rtol=1e-9, atol=1e-9)
-
-
-def test_dropout_is_for_the_training_alone():
-    batch = LINKS["rssi"].batch(torch.arange(8))
-    for dropout in (0.0, 0.5):
-        model = fitted("mlp", "rssi", dropout=dropout)
-        one, other = (model.train()(batch).value for _ in range(2))
-        assert torch.equal(one, other) == (dropout == 0)
 
 
 def test_a_kolmogorov_arnold_layer_is_the_formula():
@@ -357,7 +286,7 @@ def test_fire_draws_from_the_middle_of_the_prior():
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_what_the_encoder_lets_through_is_charged_for(task):
+def test_the_latent_code_is_penalised_by_its_divergence(task):
     links = LINKS[task]
     model = fitted("fire", task).train()
     batch = links.batch(torch.arange(6))
@@ -402,7 +331,7 @@ def transposed_by_loops(x, weight, bias, stride, padding):
 @pytest.mark.parametrize("task", TASKS)
 def test_the_generator_is_four_transposed_convolutions(task):
     model = doubled(build("dcgan", LINKS[task].scene))
-    given = told(model)
+    given = numbers_of_links(model)
     linear, *blocks = [part for part in model.generator if numbers(part)]
     first = numbers(linear)
     x = np.concatenate((np.zeros((3, 3)), given.numpy()), 1) @ first["weight"].T + first["bias"]
@@ -417,15 +346,6 @@ def test_the_generator_is_four_transposed_convolutions(task):
     assert [layer.in_channels for layer in blocks[1::2]] == widths[:-1]
     assert x.shape[1:] == {"spectrum": (1, 8, 32), "rssi": (1, 1, 1), "csi": (2, 4, 8)}[task]
     np.testing.assert_allclose(model.draw(given).detach(), x[..., :rows, :columns], rtol=1e-9, atol=1e-9)
-
-
-def test_the_generator_gets_noise_in_the_training_alone():
-    batch = LINKS["rssi"].batch(torch.arange(8))
-    model = fitted("dcgan", "rssi")
-    one, other = (model.train()(batch).value for _ in range(2))
-    assert not torch.equal(one, other)
-    one, other = (model.eval()(batch).value for _ in range(2))
-    assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -445,101 +365,22 @@ def test_the_discriminator_looks_at_label_and_link(task):
     assert {*map(id, groups["discriminator"])}.isdisjoint(map(id, groups["network"]))
 
 
+@pytest.mark.parametrize(("name", "dropout"), [("mlp", 0.5), ("mlp", 0.0), ("dcgan", None)])
+def test_dropout_and_noise_are_for_the_training_alone(name, dropout):
+    batch = LINKS["rssi"].batch(torch.arange(8))
+    model = fitted(name, "rssi", **({} if dropout is None else {"dropout": dropout}))
+    one, other = (model.train()(batch).value for _ in range(2))
+    assert torch.equal(one, other) == (dropout == 0)
+    one, other = (model.eval()(batch).value for _ in range(2))
+    assert torch.equal(one, other)
+
+
 @pytest.mark.parametrize("stride", range(1, 7))
 def test_the_discriminator_takes_labels_however_thin(stride):
     links = LINKS["spectrum"]
     model = fitted("dcgan", "spectrum", pixel=1.0)
     thin = links.task.thinning(stride=stride)(links.batch(torch.arange(4)), torch.Generator().manual_seed(0))
     assert model.discriminate(thin, thin.labels).isfinite().all()
-
-
-# --- options ---
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        ("mlp", {"octaves": [2, 1]}, r"model\.octaves must be \[lowest, highest\] within -30..30, got \[2, 1\]"),
-        ("mlp", {"pixel": 0.0}, r"model\.pixel must be above 0 and at most 90 \[deg\], got 0\.0"),
-        ("mlp", {"widths": []}, r"model\.widths must be of at least 1, got \[\]"),
-        ("mlp", {"dropout": 1.0}, r"model\.dropout must be in \[0, 1\), got 1\.0"),
-        ("fire", {"widths": [4, 0, 4]}, r"model\.widths must be of at least 1"),
-        ("fire", {"latent": 0}, r"model\.latent must be of at least 1, got 0"),
-        ("dcgan", {"width": 0}, r"model\.width must be of at least 1"),
-        ("dcgan", {"noise": 0}, r"model\.noise must be of at least 1"),
-        ("wrf_kan", {"intervals": 0}, r"model\.intervals must be of at least 1"),
-        ("wrf_kan", {"widths": [-1]}, r"model\.widths must be of at least 1"),
-    ],
-)
-def test_options_out_of_range(name, options, message):
-    with pytest.raises(ValueError, match=message):
-        build(name, LINKS["spectrum"].scene, **options)
-
-
-# --- whole runs ---
-
-
-def composed(name, task):
-    few = ["data.transmitters=20", "data.order=1", "split.validation=0.2", "trainer.max_steps=3"]
-    if task == "csi":
-        few.append("data.subcarriers=5")
-    if task == "spectrum":
-        few.append("training.thinning.stride=8")
-    quiet = [
-        "trainer.accelerator=cpu",
-        "trainer.val_check_interval=2",
-        "trainer.log_every_n_steps=1",
-        "trainer.enable_progress_bar=false",
-    ]
-    own = [f"model.{option}={value}" for option, value in SMALL[name].items()]
-    words = [
-        f"data={TASKS[task]}",
-        f"model={name}",
-        *few,
-        *quiet,
-        *own,
-        "training.batch_size=5",
-        "baselines=[{name: mean}]",
-    ]
-    with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", words), resolve=True)
-
-
-LOSSES = {
-    "mlp": {"spectrum": "l1_ssim", "rssi": "squared", "csi": "log_relative_error"},
-    "fire": {"spectrum": "squared", "rssi": "squared", "csi": "log_relative_error"},
-    "dcgan": {"spectrum": "absolute", "rssi": "absolute", "csi": "log_relative_error"},
-    "wrf_kan": {"spectrum": "l1_ssim", "rssi": "squared", "csi": "log_relative_error"},
-}
-
-
-@every_system
-@pytest.mark.parametrize("task", TASKS)
-def test_a_run(name, task, tmp_path, monkeypatch):
-    monkeypatch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
-    config = composed(name, task)
-    assert config["loss"]["name"] == LOSSES[name][task]
-    assert config["training"]["name"] == ("adversarial" if name == "dcgan" else "descent")
-    metrics = runs.run(config, tmp_path)
-    assert [*metrics["models"]] == [name, "mean"]
-    assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
-    model = gaigs.load(tmp_path / "best.ckpt")
-    assert model.label.scale.item() != 1
-    with np.load(tmp_path / "predictions.npz") as run:
-        query = Query(torch.tensor(run["transmitters"]), torch.tensor(run["receiver"]))
-        frequency = model.scene.frequencies[:1].expand(len(query)) if len(model.scene.frequencies) else None
-        again = model.predict(replace(query, frequencies=frequency)).numpy()
-        np.testing.assert_allclose(run["prediction"], again, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ["mlp", "fire", "dcgan", "wrf_kan"])
-def test_channels_take_half_the_digits(name):
-    """``trainer.precision=bf16-mixed``: complex numbers are made of float32."""
-    links, model = LINKS["csi"], fitted(name, "csi")
-    with torch.autocast("cpu", torch.bfloat16):
-        value = model(links.batch(links.split.train)).value
-    assert value.dtype == torch.complex64
-    assert torch.view_as_real(value).isfinite().all()
 
 
 # --- adversarial training ---
@@ -566,10 +407,6 @@ class Forger(Model):
 
     def discriminate(self, batch, values):
         return self.judge(torch.stack((values, batch.query.transmitters[:, 0]), 1))[:, 0]
-
-
-class Plain(Forger):
-    trained_by = "descent"
 
 
 class Unjudged(Forger):
@@ -644,35 +481,21 @@ def test_a_step_is_goodfellows_with_the_gradient_of_its_own_player_alone(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("model", "options", "error", "message"),
+    ("model", "options", "message"),
     [
-        (Plain, {}, ValueError, "this model is trained by 'descent'; set training=descent"),
-        (Unjudged, {}, ValueError, "adversarial training needs a model with a parameter group 'discriminator'"),
-        (Forger, {"weight": -1.0}, ValueError, r"training\.weight must be at least 0, got -1\.0"),
-        (
-            Forger,
-            {"jiter": 0.1},
-            ValueError,
-            r"'adversarial' has no option 'jiter' \(did you mean 'jitter'\?\)",
-        ),
-        (Forger, {"batch_size": 4.0}, TypeError, "training 'adversarial' option 'batch_size' must be a whole number"),
-        (Forger, {"weight": "much"}, TypeError, "training 'adversarial' option 'weight' must be a number, got 'much'"),
+        (type("Plain", (Forger,), {"trained_by": "descent"}), {}, "is trained by 'descent'; set training=descent"),
+        (Unjudged, {}, "adversarial training needs a model with a parameter group 'discriminator'"),
+        (Forger, {"weight": -1.0}, r"training\.weight must be at least 0, got -1\.0"),
     ],
 )
-def test_adversarial_training_refuses(model, options, error, message):
-    with pytest.raises(error, match=message):
+def test_adversarial_training_refuses(model, options, message):
+    with pytest.raises(ValueError, match=message):
         adversarial(model, **options)
 
 
-@pytest.mark.parametrize(
-    ("processes", "scaler", "message"),
-    [
-        (2, None, r"adversarial training takes one process; set trainer\.devices=1"),
-        (1, "a scaler", r"adversarial training does not scale gradients; set trainer\.precision"),
-    ],
-)
+@pytest.mark.parametrize(("processes", "scaler", "message"), [(2, None, "one process"), (1, "a scaler", "not scale")])
 def test_adversarial_training_takes_one_process_and_unscaled_gradients(processes, scaler, message):
     module = adversarial()
     module._trainer = SimpleNamespace(world_size=processes, precision_plugin=SimpleNamespace(scaler=scaler))
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"adversarial training .*{message}"):
         module.on_fit_start()

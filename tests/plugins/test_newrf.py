@@ -10,14 +10,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from splatting import build, composed, run
+from splatting import build, composed
 
 from gaigs.antenna import Array, Receiver
 from gaigs.data.synthetic.image_source import Room, respond
 from gaigs.geometry import Pose
 from gaigs.query import Batch, Query
 from gaigs.task.csi import Csi
-from gaigs.testing import check_model, example_links
+from gaigs.testing import example_links
 
 SMALL = ("model=newrf", "model.arrivals=3", "model.samples=4", "model.octaves=2", "model.width=8", "model.layers=5")
 LIGHT = 299792458.0
@@ -37,10 +37,6 @@ def make(scene=LINKS.scene, **changes):
 def package():
     """The module that has the model."""
     return sys.modules[type(make()).__module__]
-
-
-def test_it_keeps_the_contract_of_models():
-    check_model(make, LINKS)
 
 
 # --- the sum ---
@@ -177,57 +173,3 @@ def test_more_links_than_it_looks_at_and_receivers_that_nobody_trains():
     model.fit(links)
     assert (model.origins[0, 1] - POSE.position).norm() > 1
     torch.testing.assert_close(model.origins[1], POSE.position.expand(2, 3))
-
-
-def test_it_learns_channels_of_free_space():
-    links = room_links(60)
-    direct = replace(ROOM, walls=("ceiling_board",) * 6)
-    labels = respond(direct, links.query.transmitters, links.receivers[0], 5e9, links.task.frequencies - 5e9, 0)
-    links = replace(links, labels=labels.to(torch.complex64))
-    model = make(links.scene, arrivals=1, width=32)
-    model.fit(links)
-    optimizer = torch.optim.Adam(model.parameters(), 1e-2)
-    batch = links.batch(links.split.train)
-    for _ in range(60):
-        errors = (model(batch).value - batch.labels).abs().square().sum((1, 2))
-        loss = (errors / batch.labels.abs().square().sum((1, 2))).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert loss < 0.2
-
-
-# --- runs and refusals ---
-
-
-def test_a_run_from_start_to_end(tmp_path, monkeypatch):
-    config, metrics, model = run(tmp_path, monkeypatch, "data=synthetic_csi", *SMALL)
-    assert config["loss"]["name"] == "log_relative_error"
-    assert metrics["models"].keys() == {"newrf", "mean"}
-    assert type(model).__name__ == "NeWrf"
-    assert (model.origins[0].diff(dim=0).norm(dim=1) > 0.1).all()
-
-
-@pytest.mark.parametrize("task", ["spectrum", "rssi"])
-def test_labels_without_delays_are_refused(task):
-    with pytest.raises(ValueError, match=f"model 'newrf' gives complex channels, not labels of task '{task}'"):
-        make(example_links(task).scene)
-
-
-def test_a_single_subcarrier_is_refused():
-    scene = replace(LINKS.scene, task=Csi(4, torch.tensor([2.4e9])))
-    with pytest.raises(ValueError, match="delays, which a single subcarrier does not tell; take another model"):
-        make(scene)
-
-
-def test_several_carriers_are_refused():
-    scene = replace(LINKS.scene, frequencies=torch.tensor([1e9, 2e9]))
-    with pytest.raises(ValueError, match="of one carrier, and these links have 2; take another model"):
-        make(scene)
-
-
-@pytest.mark.parametrize("option", ["arrivals", "samples", "octaves", "view_octaves", "width", "layers"])
-def test_options_out_of_range(option):
-    least = {"samples": 2, "octaves": 0, "view_octaves": 0}.get(option, 1)
-    with pytest.raises(ValueError, match=f"model.{option} must be at least {least}, got {least - 1}"):
-        make(**{option: least - 1})

@@ -1,25 +1,23 @@
 """Ray tracing as a model: its fields against Sionna RT's and a plain transcription, its rooms, its calibration."""
 
-import contextlib
 import functools
 import importlib
 import itertools
 import math
 import shutil
-import sys
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pytest
+import splatting
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from scipy.constants import epsilon_0, speed_of_light
+from splatting import composed, repository
 
 import gaigs
-from gaigs import configuration, runs
+from gaigs import runs
 from gaigs.data import load, synthetic
 from gaigs.data.sionna import ROOMS
 from gaigs.data.sionna.meshes import THICKNESS, Cuboid, edges, wavefront_obj
@@ -31,17 +29,11 @@ from gaigs.testing import check_model, example_links
 
 ROOT = Path(__file__).parents[2]
 CARRIER = 5e9
-OPTIONS = {"room": "built_in", "mesh": None, "materials": {}, "frequency": None, "depth": 2, "rays": 2000}
+OPTIONS = {
+    "name": "ray_tracing", "room": "built_in", "mesh": None, "materials": {}, "frequency": None, "depth": 2,
+    "rays": 2000,
+}  # fmt: skip
 WALLS = {"floor": "brick", "west wall": "mat-itu_wood", "others": "concrete"}
-
-
-@contextlib.contextmanager
-def repository():
-    """As from the root of the repository, where plug-ins are found by name."""
-    path = sys.path[:]  # the registry appends to it
-    with contextlib.chdir(ROOT):
-        yield
-    sys.path[:] = path
 
 
 @functools.cache
@@ -53,16 +45,7 @@ def module(name):
 
 
 def build(scene, calibrate=True, **options):
-    with repository():
-        return registry("model").build(
-            {"name": "ray_tracing"} | OPTIONS | {"calibrate": calibrate} | options, scene=scene
-        )
-
-
-def composed(*overrides):
-    """The whole configuration, as the command line would have it."""
-    with repository(), initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+    return splatting.build("model", OPTIONS | {"calibrate": calibrate} | options, scene=scene)
 
 
 @pytest.fixture(scope="module")
@@ -333,14 +316,6 @@ def test_descent_finds_what_the_walls_are_made_of(tracer, hall, task):
     assert materials["metal"]["permittivity"] == 1
 
 
-def test_facts_without_calibration_are_the_tables(tracer, hall):
-    links = example_links("rssi", carrier=CARRIER)
-    model = build(links.scene, calibrate=False, mesh=str(hall))
-    model.fit(links)
-    real, c, d = MATERIALS["concrete"]
-    assert model.facts()["materials"]["concrete"] == pytest.approx({"permittivity": real, "conductivity": c * 5**d})
-
-
 # --- rooms ---
 
 
@@ -357,9 +332,41 @@ def test_the_built_in_room_is_the_simulated_one():
     assert known["refrigerator"] == "metal"
 
 
-@pytest.mark.parametrize("name", ROOMS)
-def test_rooms_of_the_ray_tracer_are_its_own(name):
-    assert module("rooms").find_meshes(name, None) == ROOMS[name].meshes()
+WALL = '<bsdf type="itu-radio-material" id="wall"><string name="type" value="{}"/></bsdf>'
+LEAF = '<shape type="{}" id="leaf">{}<ref id="wall" name="bsdf"/></shape>'
+FAR = LEAF.format("ply", '<string name="filename" value="far.ply"/>')
+PLY = """ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z
+element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1e9 0 0\n0 1 0\n3 0 1 2\n"""
+
+
+def scene(material, shape):
+    return f'<scene version="2.1.0">{WALL.format(material)}{shape}</scene>'
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("room.obj", "v 0 0", "line 1: expected numbers x y z, got 'v 0 0'"),
+        ("room.obj", "v 0 0 0\nf 1 2 3", "line 2: expected a face of three vertices or more of the 1 before it"),
+        ("room.obj", "v 0 0 nan\nv 0 1 0\nv 1 0 0\nf 1 2 3", "line 1: expected numbers x y z, got 'v 0 0 nan'"),
+        ("room.obj", "v 0 0 0", "must hold surfaces, and holds none"),
+        ("room.stl", "solid", r"model\.mesh must be a file \.obj, \.ply, \.xml, got .*room\.stl"),
+        ("room.ply", "no mesh", r"expected a \.ply file of vertices"),
+        ("room.xml", "no mesh", "must be a scene that Sionna RT"),
+        ("room.xml", scene("wood", LEAF.format("rectangle", "")), "shape '.*', must be a mesh of type ply or obj"),
+        ("room.xml", scene("gold", LEAF.format("rectangle", "")), "must be a scene that Sionna RT reads, .*gold"),
+        ("room.xml", scene("wood", "<shape>"), "must be a scene that Sionna RT reads, and is not: "),
+        ("room.xml", scene("wood", FAR), "shape .*: expected positions"),
+    ],
+)
+def test_a_damaged_file_gives_one_line(tmp_path, tracer, name, text, message):
+    (tmp_path / "far.ply").write_text(PLY)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        module("rooms").find_meshes("none", str(tmp_path / name))
+    assert "\n" not in str(caught.value)
+    with pytest.raises(FileNotFoundError, match=r"no mesh at nowhere\.ply"):
+        module("rooms").find_meshes("none", "nowhere.ply")
 
 
 @pytest.mark.parametrize(
@@ -416,66 +423,6 @@ def test_an_obj_has_faces_of_many_corners_counted_from_either_end():
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("v 0 0", "line 1: expected numbers x y z, got 'v 0 0'"),
-        ("v 0 0 0\nf 1 2 3", "line 2: expected a face of three vertices or more of the 1 before it"),
-        ("v 0 0 0\nf 1 1", "a face of three vertices or more"),
-        ("v a b c", "line 1"),
-        ("v 0 0 nan\nv 0 1 0\nv 1 0 0\nf 1 2 3", "line 1: expected numbers x y z, got 'v 0 0 nan'"),
-        ("v 0 0 0", "must hold surfaces, and holds none"),
-    ],
-)
-def test_a_damaged_mesh_is_told(tmp_path, text, message):
-    file = tmp_path / "room.obj"
-    file.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        module("rooms").find_meshes("none", str(file))
-
-
-def test_other_files_are_refused(tmp_path, tracer):
-    rooms = module("rooms")
-    with pytest.raises(ValueError, match=r"model\.mesh must be a file \.obj, \.ply, \.xml, got room\.stl"):
-        rooms.find_meshes("none", "room.stl")
-    with pytest.raises(FileNotFoundError, match=r"no mesh at nowhere\.ply"):
-        rooms.find_meshes("none", "nowhere.ply")
-    for name, message in (
-        ("room.ply", r"expected a \.ply file of vertices"),
-        ("room.xml", "must be a scene that Sionna RT"),
-    ):
-        (tmp_path / name).write_text("no mesh")
-        with pytest.raises(ValueError, match=message):
-            rooms.find_meshes("none", str(tmp_path / name))
-
-
-WALL = '<bsdf type="itu-radio-material" id="wall"><string name="type" value="{}"/></bsdf>'
-LEAF = '<shape type="{}" id="leaf">{}<ref id="wall" name="bsdf"/></shape>'
-PLY = """ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z
-element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n{} 0 0\n0 1 0\n3 0 1 2\n"""
-
-
-@pytest.mark.parametrize(
-    ("material", "shape", "message"),
-    [
-        ("wood", LEAF.format("rectangle", ""), r"room\.xml, shape '.*', must be a mesh of type ply or obj"),
-        ("gold", LEAF.format("rectangle", ""), r"room\.xml must be a scene that Sionna RT reads, and is not: .*gold"),
-        ("wood", "<shape>", r"room\.xml must be a scene that Sionna RT reads, and is not: "),
-        (
-            "wood",
-            LEAF.format("ply", '<string name="filename" value="far.ply"/>'),
-            r"shape .*: expected positions",
-        ),
-    ],
-)
-def test_a_damaged_scene_is_told_in_one_line(tmp_path, tracer, material, shape, message):
-    (tmp_path / "far.ply").write_text(PLY.format("1e9"))
-    (tmp_path / "room.xml").write_text(f'<scene version="2.1.0">{WALL.format(material)}{shape}</scene>')
-    with pytest.raises(ValueError, match=message) as caught:
-        module("rooms").find_meshes("none", str(tmp_path / "room.xml"))
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
     ("chosen", "message"),
     [
         ({}, r"material 'paint' must be one of concrete, .*: \+model\.materials\.paint=concrete"),
@@ -491,31 +438,10 @@ def test_unknown_materials_are_refused(chosen, message):
     assert rooms.known_materials(meshes, {"paint": "wood"}) == {"paint": "wood"}
 
 
-# --- what it refuses ---
+# --- refusals ---
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"room": "nerf2_spectrum"}, "must know the room: one of built_in, l_shape, slanted, furnished, got 'nerf2_sp"),
-        ({"depth": 0}, r"model\.depth must be in 1\.\.8, got 0"),
-        ({"rays": 0}, r"model\.rays must be at least 1, got 0"),
-        ({"frequency": -1.0}, r"model\.frequency must be a carrier in Hz, from 10000 to 3e\+11, got -1"),
-    ],
-)
-def test_options_out_of_range_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        build(example_links("rssi").scene, **options)
-
-
-def test_other_labels_are_refused():
-    scene = example_links("rssi").scene
-    task = type("Delay", (type(scene.task),), {"name": "delay", "unit": "ns"})()
-    with pytest.raises(ValueError, match="predicts spectra, RSSI and channels, not labels of task 'delay'"):
-        build(replace(scene, task=task))
-
-
-def test_a_missing_package_is_told_with_the_command_that_installs_it(monkeypatch):
+def test_a_missing_package_gives_the_command_that_installs_it(monkeypatch):
     def missing(name):
         raise metadata.PackageNotFoundError(name)
 
@@ -529,7 +455,7 @@ def test_a_missing_package_is_told_with_the_command_that_installs_it(monkeypatch
 # --- a whole run ---
 
 
-def test_a_run_trains_stores_and_tells_the_materials(tracer, tmp_path):
+def test_a_run_stores_the_materials(tracer, tmp_path):
     config = composed(
         "+experiment=csi", "model=ray_tracing", "model.depth=2", "model.rays=2000", "data.transmitters=14",
         "data.subcarriers=3", "trainer.max_steps=4", "trainer.val_check_interval=2", "trainer.accelerator=cpu",

@@ -1,16 +1,16 @@
-"""WideGS: what it is made of, and that both of its networks see the carrier."""
+"""WideGS: both of its networks see the carrier."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from splatting import build, check_task, composed, repository, run
+from splatting import build, composed, repository, run
 
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.gaussians import Placed
 from gaigs.query import Query
-from gaigs.testing import check_model, example_links
+from gaigs.testing import example_links
 
 CARRIERS = torch.tensor([2.4e9, 5.0e9, 28e9])
 SMALL = ("model=wide_gs", "gaussians.count=40", "deformation.width=16", "rasterizer=torch")
@@ -21,16 +21,6 @@ def links():
     """Spectra of three carriers."""
     links = example_links()
     return replace(links, query=replace(links.query, frequencies=CARRIERS[torch.arange(24) % 3]))
-
-
-@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_it_keeps_the_contract_of_models(task):
-    check_task(task, *SMALL)
-
-
-def test_it_keeps_the_contract_with_several_carriers(links):
-    config = composed(*SMALL)["model"]
-    check_model(lambda scene: build("model", config, scene=scene), links)
 
 
 def test_both_networks_see_the_carrier(links):
@@ -45,39 +35,6 @@ def test_both_networks_see_the_carrier(links):
         for i, j in ((0, 1), (1, 2)):
             assert (part[i] - part[j]).abs().max() > 1e-3
     assert residuals.delta_quats is residuals.delta_scales is residuals.delta_opacities is None
-
-
-def test_carriers_in_between_are_predicted_and_a_missing_one_is_asked_for(links):
-    model = build("model", composed(*SMALL)["model"], scene=links.scene)
-    low, between = (model.predict(links.query.transmitters[0], 0, frequency) for frequency in (2.4e9, 3.5e9))
-    assert (low - between).abs().max() > 1e-3
-    with pytest.raises(ValueError, match="3 carriers"):
-        model.predict(links.query.transmitters[0], 0)
-
-
-def test_one_carrier_is_no_input(links):
-    links = replace(links, query=replace(links.query, frequencies=CARRIERS[:1].expand(24)))
-    one, several = (
-        build("model", composed(*SMALL)["model"], scene=scene).tokenizer.network[0].in_features
-        for scene in (links.scene, replace(links.scene, frequencies=CARRIERS))
-    )
-    assert one < several
-
-
-@pytest.mark.parametrize(
-    ("chosen", "pooling", "width"),
-    [
-        ((), "spectrum", 128),
-        (("data=synthetic_rssi",), "softmax_attention", 64),
-        (("+experiment=rssi",), "softmax_attention", 64),
-        (("+experiment=csi",), "element_sum", 64),
-    ],
-)
-def test_it_is_itself_with_every_task(chosen, pooling, width):
-    config = composed("model=wide_gs", *chosen)["model"]
-    assert (config["name"], config["tokenizer"]["name"]) == ("wide_gs", "euclidean")
-    assert config["deformation"]["heads"] == ["signal", "attenuation"]
-    assert (config["pooling"]["name"], config["deformation"]["width"]) == (pooling, width)
 
 
 def test_a_run_on_a_folder_with_the_carrier_of_each_link(tmp_path, monkeypatch):

@@ -1,9 +1,10 @@
-"""The checks of tokenizers, deformations, losses, placements and models find what is broken."""
+"""The checks of the parts of splatting find faults."""
 
 from dataclasses import replace
 
 import pytest
 import torch
+from faults import broken, fed, field, having
 from torch import nn
 
 from gaigs.deformation import Deformation, Residuals
@@ -13,14 +14,22 @@ from gaigs.loss.absolute import Absolute
 from gaigs.loss.l1_ssim import L1Ssim
 from gaigs.loss.relative_error import RelativeError
 from gaigs.loss.squared import Squared
-from gaigs.model import Model, Prediction
 from gaigs.placement import Placement
-from gaigs.query import Query
+from gaigs.pooling import Pooling, sphere
+from gaigs.pooling.path_rssi import PathRssi
+from gaigs.pooling.spectrum import SpectrumPooling
+from gaigs.projection import Plane
+from gaigs.projection.direction_cosine import DirectionCosine
+from gaigs.projection.equirectangular import Equirectangular
+from gaigs.projection.mercator import Mercator
+from gaigs.rasterizer.torch import TorchRasterizer
 from gaigs.testing import (
     check_deformation,
     check_loss,
-    check_model,
     check_placement,
+    check_pooling,
+    check_projection,
+    check_rasterizer,
     check_tokenizer,
     example_links,
 )
@@ -35,53 +44,35 @@ def seed():
     torch.manual_seed(0)
 
 
-def broken(kind, change, method="forward"):
-    """A class whose method's result is changed by a function of the result and the arguments."""
-    return type("Broken", (kind,), {method: lambda self, *given: change(getattr(kind, method)(self, *given), *given)})
-
-
-def field(name, change):
-    """Changes one field of a named tuple."""
-    return lambda result, *given: result._replace(**{name: change(getattr(result, name))})
-
-
-def fed(kind, change):
-    """A class whose ``forward`` gets changed arguments."""
-    return type("Fed", (kind,), {"forward": lambda self, *given: kind.forward(self, *change(*given))})
-
-
-# --- tokenizers ---
-
-DEAF = fed(
-    EuclideanTokenizer, lambda placed, o, query: (placed, o, replace(query, transmitters=0 * query.transmitters))
-)
-NOISY = fed(EuclideanTokenizer, lambda p, o, query: (Placed(p.means + torch.rand_like(p.means)), o, query))
-STILL = fed(EuclideanTokenizer, lambda placed, o, query: (Placed(placed.means[:1]), o, query))
-
-
 @pytest.mark.parametrize(
     ("tokenizer", "message"),
     [
         (
             broken(EuclideanTokenizer, field("transmitters", lambda token: token - token.mean(0))),
-            "the token transmitters must not depend on the other queries",
+            "transmitters must not depend on the other queries",
         ),
         (
             broken(EuclideanTokenizer, lambda tokens, *_: Tokens(tokens[2], tokens[1], tokens[0])),
             r"the token scene must be of shape \(3, 0\), got \(3, 8\)",
         ),
-        (DEAF, "tokens of two transmitters must differ"),
-        (NOISY, "two calls must give the same tokens"),
-        (STILL, "Gaussians that differ between queries must have own tokens"),
+        (
+            fed(EuclideanTokenizer, lambda p, o, query: (p, o, replace(query, transmitters=0 * query.transmitters))),
+            "tokens of two transmitters must differ",
+        ),
+        (
+            fed(EuclideanTokenizer, lambda p, o, query: (Placed(p.means + torch.rand_like(p.means)), o, query)),
+            "two calls must give the same gaussians",
+        ),
+        (
+            fed(EuclideanTokenizer, lambda placed, o, query: (Placed(placed.means[:1]), o, query)),
+            "Gaussians that differ between queries must have own tokens",
+        ),
     ],
 )
-def test_a_broken_tokenizer_is_found(tokenizer, message):
+def test_a_faulty_tokenizer_is_found(tokenizer, message):
     options = {"gaussian_octaves": (-1, 1), "transmitter_octaves": (-1, 1), "hidden": 8, "width": 8}
     with pytest.raises(AssertionError, match=message):
         check_tokenizer(tokenizer(SCENE, **options), SCENE)
-
-
-# --- deformations ---
 
 
 @pytest.mark.parametrize(
@@ -89,15 +80,12 @@ def test_a_broken_tokenizer_is_found(tokenizer, message):
     [
         (field("attenuations", lambda part: 0 * part), r"attenuations must lie in \(0, 1\]"),
         (field("delta_quats", lambda part: part - part.mean(0)), "delta_quats must not depend on the other queries"),
-        (
-            field("delta_signal", lambda part: part.squeeze(-1)),
-            r"delta_signal must be of shape \(3, 7, 2, 1\), got \(3, 7, 2\)",
-        ),
+        (field("delta_signal", lambda part: part.squeeze(-1)), r"delta_signal must be of shape \(3, 7, 2, 1\)"),
         (lambda residuals, *_: [*residuals], "a deformation must give Residuals, got list"),
         (field("delta_opacities", lambda part: (0 * part).sqrt()), "the gradient of .* must be finite"),
     ],
 )
-def test_a_broken_deformation_is_found(change, message):
+def test_a_faulty_deformation_is_found(change, message):
     heads, sizes = ["rotation", "signal", "opacity", "attenuation"], {"attenuation_layers": 1, "signal_layers": 1}
     kind = broken(TwoBranch, change)
     build = lambda tokenizer_widths, channels, scene: kind(tokenizer_widths, channels, width=8, heads=heads, **sizes)
@@ -120,7 +108,7 @@ def test_a_deformation_without_tokens_keeps_the_contract():
 
 
 def averaged(kind, mean):
-    return type("Averaged", (kind,), {"mean": lambda self, values, labels: mean(values - labels)})
+    return having(kind, mean=lambda self, values, labels: mean(values - labels))
 
 
 def relative_error_of_all(result, values, batch):
@@ -132,6 +120,11 @@ def summed_where_thinned(result, values, batch):
     return result[0] * (1 + (batch.labels.shape[1] < 18) * (len(values) - 1)), result[1]
 
 
+def extra_term(result, values, batch):
+    return result[0], result[1] | ({"large": result[0]} if result[0] > 5 else {})
+
+
+ROOT = averaged(Absolute, lambda errors: errors.square().sqrt().mean())
 MEAN = "the loss must be the mean over its links"
 
 
@@ -141,26 +134,13 @@ MEAN = "the loss must be the mean over its links"
         (averaged(Squared, lambda errors: errors.square().sum()), "rssi", MEAN),
         (averaged(Absolute, lambda errors: errors[:1].abs().mean()), "rssi", MEAN),
         (averaged(Absolute, lambda errors: (errors - 1).abs().mean()), "rssi", "the loss must be least at the labels"),
-        (
-            averaged(Absolute, lambda errors: errors.square().sqrt().mean()),
-            "rssi",
-            "the gradient of the values at the labels must be finite",
-        ),
-        (
-            broken(Absolute, lambda result, *_: (result[0], {"errors": result[1]}), "__call__"),
-            "rssi",
-            "terms must be numbers by name",
-        ),
-        (
-            broken(Absolute, lambda r, *_: (r[0], r[1] | ({"large": r[0]} if r[0] > 5 else {})), "__call__"),
-            "rssi",
-            "terms must be the same for all values",
-        ),
+        (ROOT, "rssi", "the gradient of the values at the labels must be finite"),
+        (broken(Absolute, extra_term, "__call__"), "rssi", "terms must be the same for all values"),
         (broken(RelativeError, relative_error_of_all, "__call__"), "csi", MEAN),
         (broken(L1Ssim, summed_where_thinned, "__call__"), "spectrum", MEAN),
     ],
 )
-def test_a_broken_loss_is_found(kind, task, message):
+def test_a_faulty_loss_is_found(kind, task, message):
     with pytest.raises(AssertionError, match=message):
         check_loss(kind(LINKS[task].task), LINKS[task])
 
@@ -214,156 +194,203 @@ class Mirror(Placement):
         )
 
 
-OF_RECEIVER = broken(
-    Mirror, lambda placed, _, query: placed._replace(gains=placed.gains * (1 + query.receivers[:, None]))
-)
-OF_ALL = broken(Mirror, lambda placed, _, query: placed._replace(coherences=placed.coherences / (1 + len(query))))
+def shifted(placed, _, query):
+    return placed._replace(means=placed.means + 0.1 * len(query))
+
+
+def weighted_by_receiver(placed, _, query):
+    return placed._replace(gains=placed.gains * (1 + query.receivers[:, None]))
 
 
 @pytest.mark.parametrize(
     ("placement", "message"),
     [
         (broken(Halfway, lambda placed, *_: placed.means), "a placement must give a Placed, got Tensor"),
-        (broken(Halfway, field("means", lambda part: part[0])), r"means must be \(1 or 3, 40, 3\), got \(40, 3\)"),
-        (
-            broken(Halfway, lambda placed, _, query: placed._replace(means=placed.means + 0.1 * len(query))),
-            "means must not depend on the other queries",
-        ),
-        (broken(Halfway, field("lengths", lambda part: -part)), "lengths must not be negative"),
-        (
-            broken(Halfway, field("lengths", lambda part: (0 * part).sqrt())),
-            r"the gradient of gaussians\.means must be finite",
-        ),
-        (type("Alone", (Mirror,), {"keeps_free": False}), "the free Gaussians, 40, must be among .*, got 1"),
-        (type("Ungrouped", (Mirror,), {"parameter_groups": lambda self: {}}), "must be in one of parameter_groups"),
+        (broken(Halfway, field("means", lambda part: part[0])), r"means must be of shape \(3, 40, 3\), got \(40, 3\)"),
+        (broken(Halfway, shifted), "means must not depend on the other queries"),
+        (broken(Halfway, field("lengths", lambda part: -part)), r"lengths must lie in \[0, inf\]"),
+        (broken(Halfway, field("lengths", lambda part: (0 * part).sqrt())), "the gradient of transmitters must be fin"),
+        (having(Mirror, keeps_free=False), "the free Gaussians, 40, must be among .*, got 1"),
+        (having(Mirror, parameter_groups=lambda self: {}), "must be in one of parameter_groups"),
         (broken(Mirror, field("signal", lambda part: None)), "must be given together, and signal is missing"),
         (broken(Mirror, field("quats", lambda part: 2 * part)), "quats must be of length 1"),
         (broken(Mirror, field("scales", lambda part: 0 * part)), "scales must be positive"),
         (broken(Mirror, field("opacities", lambda part: 2 * part)), r"opacities must lie in \[0, 1\]"),
         (broken(Mirror, field("gains", lambda part: part.real)), "gains must be torch.complex64 as its input"),
-        (OF_RECEIVER, "gains must not depend on the receiver unless sees_receivers says so"),
-        (OF_ALL, "coherences must not depend on the other queries"),
-        (broken(Mirror, field("coherences", lambda part: -part)), r"coherences must lie in \[0, 1\]"),
-        (
-            broken(Mirror, field("bandwidth", lambda part: part.expand(41))),
-            r"bandwidth must be of shape \(\), got \(41,",
-        ),
-        (broken(Mirror, field("bandwidth", lambda part: -part)), "bandwidth must not be negative"),
+        (broken(Mirror, weighted_by_receiver), "gains must not depend on the receiver unless sees_receivers"),
+        (broken(Mirror, field("bandwidth", lambda part: part.expand(41))), r"bandwidth must be of shape \(\), got"),
     ],
 )
-def test_a_broken_placement_is_found(placement, message):
+def test_a_faulty_placement_is_found(placement, message):
     with pytest.raises(AssertionError, match=message):
         check_placement(placement(), SCENE)
 
 
-# --- models ---
+@pytest.mark.parametrize("kind", [Halfway, Mirror])
+def test_sound_placements_keep_the_contract(kind):
+    check_placement(kind(), SCENE)
 
 
-class Grey(Model):
-    """The same grey in all directions, learnt."""
-
-    level = 1.0
-
-    def __init__(self, scene):
-        super().__init__(scene)
-        self.grey = nn.Parameter(torch.full((), 0.5))
-
-    def forward(self, batch):
-        return Prediction(self.level * self.grey * self.grey.new_ones(len(batch), *batch.directions.shape), {})
+# --- poolings ---
 
 
-class Level(Model):
-    """One level for each receiver and carrier, learnt."""
+class Power(Pooling):
+    """Mean power of a map in dB, over a floor."""
+
+    floor = 1e-2
 
     def __init__(self, scene):
-        super().__init__(scene)
-        self.levels = nn.Parameter(-60.0 - torch.arange(len(scene.receivers)))
+        super().__init__()
+        self.scene, self.grid = scene, sphere("pooling.grid", [4, 8])
 
-    def forward(self, batch):
-        levels = self.levels[batch.query.receivers]
-        if batch.query.frequencies is not None:
-            levels = levels - batch.query.frequencies / 1e9
-        return Prediction(levels, {})
+    def forward(self, image, query, directions=None):
+        image = image.to(torch.promote_types(image.dtype, torch.float32))
+        return 10 * (image.square().sum(1).mean((1, 2)) + self.floor).log10()
 
 
-@pytest.mark.parametrize("kept", [Halfway, Mirror, Grey, Level])
-def test_sound_ones_keep_the_contract(kept):
-    if issubclass(kept, Placement):
-        check_placement(kept(), SCENE)
-        return
-    check_model(kept, LINKS["spectrum" if kept is Grey else "rssi"])
-    if kept is Level:  # asked at its carriers
-        links = LINKS["rssi"]
-        frequencies = torch.tensor([2.4e9, 5.0e9])[torch.arange(24) // 2 % 2]
-        check_model(Level, replace(links, query=replace(links.query, frequencies=frequencies)))
+class Beamed(Power):
+    """The power of a map of its own, spread over the directions of a spectrum."""
+
+    def forward(self, image, query, directions=None):
+        level = image.square().mean((1, 2, 3))
+        heights = (directions or self.scene.task.directions).vectors()[..., 2].to(level)
+        return level.reshape(-1, *[1] * heights.ndim) * heights
 
 
-def changed(change, kind=Grey):
-    """A model whose value is changed by a function of the value and the batch."""
-    return broken(kind, lambda prediction, batch: prediction._replace(value=change(prediction.value, batch)))
+class OfMap(SpectrumPooling):
+    def __init__(self, scene):
+        super().__init__(2)
 
 
-def shaded(value, batch):
-    """A gradient by the number of the row."""
-    shades = torch.linspace(0, 1, batch.directions.shape[0])
-    return value * shades.reshape(-1, *[1] * (value.ndim - 2))
+def windowed(value, image, query):
+    return value * torch.linspace(1, 2, image.shape[2]).to(image)[:, None]
 
 
-def without_nan(self, transmitters, *others, **options):
-    if not isinstance(transmitters, Query):
-        transmitters = torch.as_tensor(transmitters).nan_to_num()
-    return Model.predict(self, transmitters, *others, **options)
+def clamped(value, image, query):
+    return 20 * image.to(value.dtype).square().sum(1).mean((1, 2)).sqrt().clamp(min=1e-3).log10()
 
 
-def without_the_last(value, model):
-    return value if model.chunk is None else value * (torch.arange(value.shape[-1]) < value.shape[-1] - 1)
-
-
-def with_methods(**methods):
-    return type("Own", (Grey,), methods)
+def narrow(value, image, query):
+    return 10 * (image.square().sum(1).mean((1, 2)) + 1e-2).log10().to(value.dtype)
 
 
 @pytest.mark.parametrize(
-    ("model", "message"),
+    ("pooling", "task", "message"),
     [
-        (with_methods(parameter_groups=lambda self: {"network": []}), "must be in one of parameter_groups"),
+        (broken(OfMap, lambda value, image, _: image.square().sum(1).sqrt()), "spectrum", "of silent maps must be fin"),
+        (broken(OfMap, lambda v, image, _: v / image.abs().max()), "spectrum", "must not depend on the other maps"),
         (
-            changed(lambda value, batch: value.mean() * value.new_ones(len(batch), 18, 36)),
-            "predict must give the directions asked for",
+            broken(OfMap, lambda v, *_: v.flatten(1)),
+            "spectrum",
+            r"the value must be of shape \(3, 18, 36\), got",
         ),
+        (broken(OfMap, windowed), "spectrum", "a list of rays must have the values of their pixels"),
+        (having(OfMap, zone=(1.0, -1.0)), "spectrum", "zone must be two elevations"),
+        (OfMap, "rssi", "labels of task 'rssi' need a pooling with a grid"),
+        (having(Power, floor=0.0), "rssi", "the value of silence must be finite"),
+        (broken(Power, clamped), "rssi", "the gradient of silent maps must be finite"),
+        (broken(Power, narrow), "rssi", "the value of 12 decades in float16 must be finite"),
+        (broken(Power, lambda v, image, _: v.to(image.dtype)), "rssi", "a silent map in float16 must be torch.float32"),
+        (having(Power, fit=lambda self, links: setattr(self, "floor", 2.0)), "rssi", "state dict must restore it"),
+        (Power, "csi", r"the value must be of shape \(3, 4, 5\), got \(3,\)"),
+        (fed(PathRssi, lambda heard, *_: (heard / heard.abs().max(), *_), "read"), "rssi", "depend on the other paths"),
         (
-            with_methods(fit=lambda self, links: setattr(self, "level", links.labels.mean())),
-            "all that predict needs must be in the state dict",
+            broken(PathRssi, lambda v, *_: v[:, None], "read"),
+            "rssi",
+            r"the value must be of shape \(3,\), got \(3, 1\)",
         ),
-        (changed(lambda value, batch: value * len(batch)), "the batch size must not change predictions"),
-        (changed(lambda value, batch: (value * 0).sqrt()), "the gradient of grey must be finite"),
+        (having(PathRssi, channels=1), "rssi", "paths have 2 channels, got channels 1"),
         (
-            with_methods(predict=lambda self, places, *_, **options: torch.full((len(places), 18, 36), 0.5)),
-            "a grid of positions must give a grid of predictions",
+            broken(Beamed, lambda v, *_: v[:, None] if v.ndim == 2 else v),
+            "spectrum",
+            "fewer directions must get",
         ),
-        (with_methods(predict=without_nan), "transmitters with NaN must be a ValueError"),
-        (changed(shaded), "predict must give the directions asked for"),
-        (
-            changed(lambda value, batch: value * (1 + batch.query.receivers[:1].sum())),
-            "links to several receivers must get the values of single links",
-        ),
-        (with_methods(facts=lambda self: {"mean": torch.zeros(())}), "facts must be plain values"),
-        (with_methods(trained_by="osmosis"), "trained_by must be one of .*'descent'.*, got 'osmosis'"),
-        (
-            broken(Grey, lambda result, batch: result._replace(penalties={"each": result.value.flatten(1)[:, 0]})),
-            r"the penalty each must be of shape \(\), got \(5,\)",
-        ),
-        (
-            with_methods(evaluate=lambda self, batch: without_the_last(Model.evaluate(self, batch), self)),
-            "chunk must not change values",
-        ),
-        (
-            changed(lambda value, batch: value.sort().values, Level),
-            "links to several receivers must get the values of single links|the order of links must not matter",
-        ),
-        (changed(lambda value, batch: value.double(), Level), "predictions must be torch.float32"),
     ],
 )
-def test_a_broken_model_is_found(model, message):
+def test_a_faulty_pooling_is_found(pooling, task, message):
     with pytest.raises(AssertionError, match=message):
-        check_model(model, LINKS["rssi" if issubclass(model, Level) else "spectrum"])
+        check_pooling(pooling, LINKS[task])
+
+
+@pytest.mark.parametrize(("pooling", "task"), [(Beamed, "spectrum"), (Power, "rssi")])
+def test_sound_poolings_keep_the_contract(pooling, task):
+    check_pooling(pooling, LINKS[task])
+
+
+# --- projections and rasterizers ---
+
+
+def without_bound(jacobian, points):
+    azimuth, elevation = jacobian.unbind(-2)
+    azimuth = nn.functional.normalize(azimuth, dim=-1) / points[..., :2].norm(dim=-1, keepdim=True)
+    return torch.stack((azimuth, elevation), -2)
+
+
+SKEW = torch.tensor([[1.0], [1.001]])
+
+
+@pytest.mark.parametrize(
+    ("projection", "message"),
+    [
+        (broken(Mercator, lambda j, points: j * SKEW.to(points), "jacobian"), "jacobian must be the derivative of"),
+        (broken(Equirectangular, without_bound, "jacobian"), "factors at hard places must be finite"),
+        (broken(Equirectangular, lambda p, _: replace(p, v=p.v + 1e-6), "plane"), "plane.v must be coordinates' v"),
+        (broken(Equirectangular, lambda p, _: replace(p, period=None), "plane"), "a plane must have the projection's"),
+        (
+            broken(Mercator, lambda p, _: replace(p, v=p.v.reshape(-1, 1)), "plane"),
+            r"plane.v of a list of rays must be of shape \(1, 1\) or \(1, 108\), got \(108, 1\)",
+        ),
+        (broken(DirectionCosine, lambda p, _: Plane(p.u.float(), p.v.float(), None), "plane"), "directions' dtype"),
+        (
+            broken(Mercator, lambda splats, *_: replace(splats, visible=splats.depths < 100), "project"),
+            "a Gaussian must be hidden if it sits on the receiver",
+        ),
+    ],
+)
+def test_a_faulty_projection_is_found(projection, message):
+    with pytest.raises(AssertionError, match=message):
+        check_projection(projection(0.02))
+
+
+def changed(change):
+    return fed(TorchRasterizer, change, "__call__")
+
+
+def mixed(result, *_):
+    return result[0] + 1e-2 * (len(result[0]) - 2), result[1]
+
+
+def eight_channels(splats, signal, *others):
+    """Draws eight channels, and repeats the first beyond."""
+    return splats, torch.cat((signal[..., :8], signal[..., :1].expand_as(signal)[..., 8:]), -1), *others
+
+
+@pytest.mark.parametrize(
+    ("rasterizer", "message"),
+    [
+        (
+            changed(lambda *given: (*given[:4], replace(given[4], period=None))),
+            "random: map must be that",
+        ),
+        (
+            changed(lambda s, *given: (replace(s, depths=0 * s.depths), *given)),
+            "random: map must be that",
+        ),
+        (changed(lambda s, g, o, a, plane: (s, g, o, None, plane)), "attenuations: map must be that"),
+        (
+            changed(lambda s, *given: (replace(s, means2d=s.means2d.detach()), *given)),
+            "random: gradient of means2d must be that of the formula",
+        ),
+        (changed(lambda s, signal, *given: (s, signal.nan_to_num(), *given)), "NaN in signal must show as NaN in the"),
+        (
+            broken(TorchRasterizer, lambda result, *_: [part.float() for part in result], "__call__"),
+            r"random: map must be torch\.float64 as its input, got torch\.float32",
+        ),
+        (broken(TorchRasterizer, mixed, "__call__"), "random: a map must not depend on other transmitters"),
+        (changed(eight_channels), "many channels: map must be that"),
+        (having(TorchRasterizer, used=None), "used must name the rasterizer, got None"),
+    ],
+)
+def test_a_faulty_rasterizer_is_found(rasterizer, message):
+    with pytest.raises(AssertionError, match=message):
+        check_rasterizer(rasterizer())

@@ -1,51 +1,41 @@
-"""Checks of data, splits and tasks find what is broken; and the made-up links keep all of them."""
+"""The checks of data, splits, tasks and models find faults; the example links keep their contracts."""
 
 from dataclasses import replace
 
 import pytest
 import torch
+from faults import broken, having
+from torch import nn
 
 from gaigs.antenna import Receiver
 from gaigs.data import Split
 from gaigs.geometry import Pose, Rays
+from gaigs.io.images import GreyImages
+from gaigs.model import Model, Prediction
 from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 from gaigs.task.spectrum import Spectrum
-from gaigs.testing import check_data, check_split, check_task, example_links
+from gaigs.testing import check_data, check_model, check_split, check_task, example_links
 
-LINKS = example_links()
+LINKS, RSSI = example_links(), example_links("rssi")
 MIRROR = Pose(torch.zeros(3), torch.diag(torch.tensor([1.0, 1.0, -1.0])))
-
-
-def asked(**changes):
-    return {"query": replace(LINKS.query, **changes)}
 
 
 # --- links ---
 
 
+@pytest.mark.parametrize("carrier", [None, 5e9])
 @pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_example_links_keep_the_contract(task):
-    links = example_links(task)
-    assert len(links) == 24
-    assert links.task.name == task
+def test_example_links_keep_the_contract(task, carrier):
+    links, same = example_links(task, carrier), example_links(task)
     check_data(links)
     check_data(replace(links, split=None))
-    same = example_links(task)
-    assert torch.equal(links.labels, same.labels)
+    check_task(links.task)
     assert torch.equal(links.query.transmitters, same.query.transmitters)
-
-
-@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_example_links_of_a_known_carrier_keep_the_contract(task):
-    links = example_links(task, 5e9)
-    check_data(links)
-    assert links.scene.frequencies.tolist() == [5e9]
-    assert links.scene.bandwidth == 5e8
-    assert torch.equal(links.query.transmitters, example_links(task).query.transmitters)
-    assert len(links.receivers[0].array) == {"spectrum": 9, "rssi": 1, "csi": 4}[task]
+    assert links.scene.frequencies.tolist() == ([] if carrier is None else [5e9])
+    assert links.scene.bandwidth == (None if carrier is None else 5e8)
 
 
 def test_other_examples_are_refused():
@@ -64,41 +54,30 @@ def test_the_channels_of_the_example_follow_the_direct_path():
         assert abs(slopes + 2 * torch.pi * steps * distance / 299_792_458) < 0.5
 
 
-def tell(links):
-    """Links whose labels change from one reading to the next."""
+class Labels(GreyImages):
+    """Labels by a function of the numbers of the links."""
 
-    class Restless:
-        def __getitem__(self, index):
-            return torch.rand(len(index), *links.task.shape)
+    def __init__(self, read):
+        self.read = read
 
-    return replace(links, labels=Restless())
+    def __getitem__(self, index):
+        return self.read(index)
 
 
-def relative(links):
-    """Links whose labels are scaled by the others that are asked for."""
-
-    class Relative:
-        def __getitem__(self, index):
-            return links.labels[index] * links.labels[index].mean()
-
-    return replace(links, labels=Relative())
+def with_query(**changes):
+    return {"query": replace(LINKS.query, **changes)}
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (asked(transmitters=torch.zeros(24, 3, dtype=torch.float64)), "transmitters must be torch.float32"),
-        (asked(transmitters=torch.full((24, 3), torch.nan)), "transmitters must be finite"),
-        (asked(receivers=torch.full((24,), 2)), "the query must point into receivers"),
-        (asked(receivers=torch.zeros(24)), "receivers must hold an integer for each link"),
-        (asked(frequencies=torch.full((24,), 2.4)), r"frequencies must be from 10000 to 3e\+11 Hz"),
-        (asked(frequencies=torch.full((24,), 920e9)), r"frequencies must be from 10000 to 3e\+11 Hz"),
-        (asked(frequencies=torch.ones(23)), r"frequencies must be of shape \(24,\), got \(23,\)"),
-        (asked(frequencies=torch.ones(24, dtype=torch.long)), r"frequencies must be floats \[Hz\]"),
+        (with_query(transmitters=torch.zeros(24, 3, dtype=torch.float64)), "transmitters must be torch.float32"),
+        (with_query(transmitters=torch.full((24, 3), torch.nan)), "transmitters must be finite"),
+        (with_query(receivers=torch.full((24,), 2)), "the query must point into receivers"),
+        (with_query(frequencies=torch.full((24,), 2.4)), r"frequencies must be from 10000 to 3e\+11 Hz"),
         ({"receivers": (Receiver("one", MIRROR), LINKS.receivers[1])}, "the rotation of one must not mirror"),
         ({"receivers": LINKS.receivers[:1] * 2}, "receivers must have different names"),
-        ({"rows": torch.zeros(24).long()}, "links of one row must have the transmitter's place in common"),
-        ({"rows": torch.arange(23)}, "rows must hold an integer for each link"),
+        ({"rows": torch.zeros(24).long()}, "links of one row must have one transmitter position"),
         ({"rows": -torch.arange(24)}, "rows must count from 0"),
         ({"official": lambda: (torch.arange(20), torch.arange(19, 24))}, "no link may stand twice in train, test"),
         ({"official": lambda: (torch.arange(20).flip(0), torch.arange(20, 24))}, "train must ascend"),
@@ -106,23 +85,18 @@ def relative(links):
         ({"labels": torch.full((24, 18, 36), 1.5)}, r"spectra must lie in \[0, 1\]"),
         ({"labels": torch.zeros(24, 36, 18)}, r"labels must be of shape \(9, 18, 36\), got \(9, 36, 18\)"),
         ({"labels": torch.zeros(24, 18, 36, dtype=torch.float64)}, "labels must be torch.float32"),
+        ({"labels": Labels(lambda i: torch.rand(len(i), 18, 36))}, "labels read twice must be the same"),
+        ({"labels": Labels(lambda i: LINKS.labels[i] * LINKS.labels[i].mean())}, "must not depend on the others"),
         ({"split": replace(LINKS.split, test=torch.arange(3))}, "no link may stand twice"),
         ({"split": replace(LINKS.split, test=torch.arange(24, 26))}, "must point at the 24 links"),
     ],
 )
-def test_broken_links_are_found(changes, message):
+def test_faulty_links_are_found(changes, message):
     with pytest.raises(AssertionError, match=message):
         check_data(replace(LINKS, **changes))
 
 
-def test_labels_that_change_are_found():
-    with pytest.raises(AssertionError, match="labels asked for twice must be the same"):
-        check_data(tell(LINKS))
-    with pytest.raises(AssertionError, match="a label must not depend on which others are asked for"):
-        check_data(relative(LINKS))
-
-
-def test_an_official_split_whose_files_are_missing_hurts_only_who_asks_for_it():
+def test_a_missing_index_file_prevents_the_official_split_only():
     def read():
         raise FileNotFoundError("train_index.txt")
 
@@ -133,99 +107,62 @@ def test_an_official_split_whose_files_are_missing_hurts_only_who_asks_for_it():
 
 
 def taking(choose):
-    """A split of the RSSI's links by a function of their number and the seed, and the name of the seed."""
+    """A split of the RSSI's links by a function of a generator, and the name of the seed."""
 
     def build(seed):
         test = choose(torch.Generator().manual_seed(seed))
         rest = torch.tensor(sorted({*range(24)} - {*test.tolist()}))
-        return Split(f"broken, seed {seed}", rest, rest[:0], test)
+        return Split(f"by row, seed {seed}", rest, rest[:0], test)
 
     return build
 
 
-def whole_rows(generator):
+def by_row(generator):
     rows = torch.randperm(12, generator=generator)[:3].sort().values
     return (2 * rows[:, None] + torch.arange(2)).flatten()
 
 
 def overlapping(seed):
-    split = taking(whole_rows)(seed)
+    split = taking(by_row)(seed)
     return replace(split, validation=split.train[:2])
 
 
-def unnamed(seed):
-    return replace(taking(whole_rows)(seed), name="broken")
-
-
-def forgetful(seed):
-    return taking(lambda _: whole_rows(torch.Generator().manual_seed(int(torch.randint(1000, ())))))(seed)
+BY_LINK = taking(lambda generator: torch.randperm(24, generator=generator)[:6].sort().values)
+GLOBAL = taking(lambda _: by_row(torch.Generator().manual_seed(int(torch.randint(1000, ())))))
 
 
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (taking(lambda g: torch.randperm(24, generator=g)[:6].sort().values), "links of one row must be in one"),
-        (taking(lambda g: whole_rows(g).flip(0)), "test must ascend"),
-        (taking(lambda g: torch.arange(4)), "another seed must give another split"),
+        (BY_LINK, "links of one row must be in one"),
+        (taking(lambda generator: by_row(generator).flip(0)), "test must ascend"),
+        (taking(lambda generator: torch.arange(4)), "another seed must give another split"),
         (overlapping, "no link may stand twice in train, validation, test"),
-        (unnamed, "a split's name must differ between seeds"),
-        (forgetful, "the same seed must give the same split in any random state"),
+        (lambda seed: replace(taking(by_row)(seed), name="by row"), "a split's name must differ between seeds"),
+        (GLOBAL, "the same seed must give the same split in any random state"),
     ],
 )
-def test_a_broken_split_is_found(build, message):
-    check_split(taking(whole_rows), example_links("rssi"))
+def test_a_faulty_split_is_found(build, message):
+    check_split(taking(by_row), RSSI)
+    check_split(BY_LINK, RSSI, parts_rows=True)
     with pytest.raises(AssertionError, match=message):
-        check_split(build, example_links("rssi"))
-
-
-def test_parts_that_came_with_the_data_may_part_rows():
-    build = taking(lambda g: torch.randperm(24, generator=g)[:6].sort().values)
-    check_split(build, example_links("rssi"), parts_rows=True)
+        check_split(build, RSSI)
 
 
 # --- tasks ---
 
 
-class Biased(Rssi):
-    def scores(self, labels, values):
-        return super().scores(labels, values - 0.5)
+def pooled(scores, *_):
+    return {name: score + 1e-3 * score.mean() for name, score in scores.items()}
 
 
-class Upside(Rssi):
-    higher_is_better = True
+def blind(self, labels, values):
+    """Scores that do not see that a prediction is NaN."""
+    return Csi.scores(self, labels, torch.where(values.isnan(), 0, values))
 
 
-class Pooled(Rssi):
-    def scores(self, labels, values):
-        scores = super().scores(labels, values)
-        return {name: score + 1e-3 * score.mean() for name, score in scores.items()}
-
-
-class Trusting(Rssi):
-    def scores(self, labels, values):
-        return {self.monitor: (values - labels).detach().double().abs()}
-
-
-class Blind(Csi):
-    """A score that does not see that a prediction is NaN."""
-
-    def scores(self, labels, values):
-        return super().scores(labels, torch.where(values.isnan(), 0, values))
-
-
-class Cheerful(Rssi):
-    def summarise(self, scores):
-        return super().summarise(scores) if len(scores[self.monitor]) else dict.fromkeys(self.metrics(), 0.0)
-
-
-class Renamed(Rssi):
-    def summarise(self, scores):
-        return {f"{name}_db": number for name, number in super().summarise(scores).items()}
-
-
-class Amnesic(Spectrum):
-    def options(self):
-        return super().options() | {"normalisation": "forgotten"}
+def cheerful(self, scores):
+    return Rssi.summarise(self, scores) if len(scores[self.monitor]) else dict.fromkeys(self.metrics(), 0.0)
 
 
 class Parted(Spectrum):
@@ -251,42 +188,134 @@ class Careless(Spectrum):
         return lambda batch, generator: thin(batch, torch.Generator().manual_seed(int(torch.randint(10**6, ()))))
 
 
-GRID = LINKS.task.directions
-SPECTRUM = GRID.elevations, GRID.azimuths, "none"
+SPECTRUM = LINKS.task.directions.elevations, LINKS.task.directions.azimuths, "none"
 
 
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        (Biased(), "true values must score best"),
-        (Upside(), "true values must score best"),
-        (Pooled(), "the score mae_db must not depend on the other samples"),
-        (Trusting(), "values of different number must be a ValueError"),
-        (Blind(2, torch.tensor([1e9, 2e9])), "values that are NaN must be a ValueError"),
-        (Cheerful(), "a summary of no samples must be a ValueError"),
-        (Renamed(), "summarise must give mae_db, median_ae_db, rmse_db, got mae_db_db"),
-        (Amnesic(*SPECTRUM), "the task's state must restore it"),
-        (Parted(*SPECTRUM), "labels and directions must be thinned together"),
-        (Careless(*SPECTRUM), "only the generator may decide the thinning"),
+        (having(Rssi, scores=lambda self, labels, values: Rssi.scores(self, labels, values - 0.5)), "must score best"),
+        (having(Rssi, higher_is_better=True), "true values must score best"),
+        (broken(Rssi, pooled, "scores"), "the score mae_db must not depend on the other samples"),
+        (
+            having(Rssi, scores=lambda self, labels, values: {"mae_db": (values - labels).detach().double().abs()}),
+            "values of different number must be a ValueError",
+        ),
+        (having(Csi, scores=blind), "values that are NaN must be a ValueError"),
+        (having(Rssi, summarise=cheerful), "a summary of no samples must be a ValueError"),
+        (
+            broken(Rssi, lambda numbers, *_: {f"{name}_db": number for name, number in numbers.items()}, "summarise"),
+            "summarise must give mae_db, median_ae_db, rmse_db, got mae_db_db",
+        ),
+        (broken(Spectrum, lambda o: o | {"normalisation": "forgotten"}, "options"), "task's state must restore it"),
+        (Parted, "labels and directions must be thinned together"),
+        (Careless, "only the generator may decide the thinning"),
+        (having(Rssi, name="nobody's"), 'a task must have its registered name, got "nobody\'s"'),
     ],
 )
-def test_a_broken_task_is_found(task, message, monkeypatch):
-    thinnings = [{"rays": 20}] if isinstance(task, Spectrum) else []
+def test_a_faulty_task_is_found(task, message, monkeypatch):
+    options = {Csi: (2, torch.tensor([1e9, 2e9])), Spectrum: SPECTRUM}.get(task.__base__, ())
     # As if it were registered, so that it comes back as itself.
-    monkeypatch.setattr(registry("task"), "get", lambda name: type(task))
+    monkeypatch.setattr(registry("task"), "get", lambda name: task)
     with pytest.raises(AssertionError, match=message):
-        check_task(task, *thinnings)
+        check_task(task(*options), *([{"rays": 20}] if issubclass(task, Spectrum) else []))
 
 
-def test_a_task_under_a_name_of_nobody_is_found():
-    class Nameless(Rssi):
-        name = "nobody's"
-
-    with pytest.raises(AssertionError, match='a task must bear its registered name, got "nobody\'s"'):
-        check_task(Nameless())
+# --- models ---
 
 
-@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_the_tasks_of_the_example_keep_the_contract(task):
-    check_task(example_links(task).task)
-    assert isinstance(example_links(task).query, Query)
+class Grey(Model):
+    """The same grey in all directions, learnt."""
+
+    level = 1.0
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.grey = nn.Parameter(torch.full((), 0.5))
+
+    def forward(self, batch):
+        return Prediction(self.level * self.grey * self.grey.new_ones(len(batch), *batch.directions.shape), {})
+
+
+class Level(Model):
+    """One level for each receiver and carrier, learnt."""
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.levels = nn.Parameter(-60.0 - torch.arange(len(scene.receivers)))
+
+    def forward(self, batch):
+        levels = self.levels[batch.query.receivers]
+        if batch.query.frequencies is not None:
+            levels = levels - batch.query.frequencies / 1e9
+        return Prediction(levels, {})
+
+
+def test_sound_models_keep_the_contract():
+    check_model(Grey, LINKS)
+    check_model(Level, RSSI)
+    frequencies = torch.tensor([2.4e9, 5.0e9])[torch.arange(24) // 2 % 2]
+    check_model(Level, replace(RSSI, query=replace(RSSI.query, frequencies=frequencies)))
+
+
+def changed(change, kind=Grey):
+    """A model whose value is changed by a function of the value and the batch."""
+    return broken(kind, lambda prediction, batch: prediction._replace(value=change(prediction.value, batch)))
+
+
+def shaded(value, batch):
+    """A gradient by the number of the row."""
+    shades = torch.linspace(0, 1, batch.directions.shape[0])
+    return value * shades.reshape(-1, *[1] * (value.ndim - 2))
+
+
+def without_nan(self, transmitters, *others, **options):
+    if not isinstance(transmitters, Query):
+        transmitters = torch.as_tensor(transmitters).nan_to_num()
+    return Model.predict(self, transmitters, *others, **options)
+
+
+def without_the_last(self, batch):
+    value = Model.evaluate(self, batch)
+    return value if self.chunk is None else value * (torch.arange(value.shape[-1]) < value.shape[-1] - 1)
+
+
+def flat_list(self, places, *_, **options):
+    return torch.full((len(places), 18, 36), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (having(Grey, parameter_groups=lambda self: {"network": []}), "must be in one of parameter_groups"),
+        (
+            changed(lambda v, batch: v.mean() * v.new_ones(len(batch), 18, 36)),
+            "must give the directions",
+        ),
+        (
+            having(Grey, fit=lambda self, links: setattr(self, "level", links.labels.mean())),
+            "a model's state dict must restore its predictions",
+        ),
+        (changed(lambda value, batch: value * len(batch)), "the batch size must not change predictions"),
+        (changed(lambda value, batch: (value * 0).sqrt()), "the gradient of grey must be finite"),
+        (having(Grey, predict=flat_list), "a grid of positions must give a grid of predictions"),
+        (having(Grey, predict=without_nan), "NaN as a position must be a ValueError"),
+        (changed(shaded), "predict must give the directions"),
+        (
+            changed(lambda value, batch: value * (1 + batch.query.receivers[:1].sum())),
+            "links to several receivers must get the values of single links",
+        ),
+        (having(Grey, facts=lambda self: {"mean": torch.zeros(())}), "facts must be plain values"),
+        (having(Grey, trained_by="osmosis"), "trained_by must be one of .*'descent'.*, got 'osmosis'"),
+        (
+            broken(Grey, lambda result, batch: result._replace(penalties={"each": result.value.flatten(1)[:, 0]})),
+            r"the penalty each must be of shape \(\), got \(5,\)",
+        ),
+        (having(Grey, evaluate=without_the_last), "chunk must not change values"),
+        (changed(lambda value, batch: value.sort().values, Level), "must get the values of single links"),
+        (changed(lambda value, batch: value.double(), Level), "predictions must be torch.float32"),
+    ],
+)
+def test_a_faulty_model_is_found(model, message):
+    with pytest.raises(AssertionError, match=message):
+        check_model(model, RSSI if issubclass(model, Level) else LINKS)

@@ -94,7 +94,7 @@ class ArrayResponse(Model):
         return Prediction(((spectra - low) / (high - low)).unflatten(1, directions.shape), {})
 
     def steer(self, directions: Directions) -> Float[Tensor, "fields 2 pixels"]:
-        """What the real and imaginary parts of the fields, one behind the other, add to those of the sum."""
+        """Matrix from the fields, all real parts before all imaginary ones, to those of the sum."""
         vectors = directions.to(self.elements).flatten().vectors()
         phases = 2 * math.pi * self.elements @ vectors[:, :2].T
         cos, sin = phases.cos(), phases.sin()

@@ -1,4 +1,4 @@
-"""GSRF: complex-valued Gaussians that send by direction and turn the phase of what passes through them."""
+"""GSRF: complex-valued Gaussians that send by direction and turn the phase of waves that pass through them."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -24,11 +24,11 @@ class Gsrf(Model):
     S(u) = sum_i psi_i alpha_i(u) prod_{j<i} (1 - alpha_j(u)) exp(j phi_j w_j(u)), front to back by distance to the
     receiver; ``gaigs_gsrf.rendering`` has the footprint w and alpha, ``gaigs_gsrf.gaussians`` the radiance psi.
 
-    What meets a ray does not depend on the transmitter, and is computed once a receiver.
+    The Gaussians on a ray do not depend on the transmitter, and is computed once a receiver.
 
     Args:
         scene: Receivers and task.
-        pooling: Configuration of what makes the task's value of the complex map; None where the task has none.
+        pooling: Configuration of the pooling of the complex map; None if the task has no pooling.
         degree: L of the radiance's Fourier-Legendre series.
         radius: Of the sphere on which footprints are measured [m].
         count, pitch, margin, opacity, signal: Of the Gaussians at the start, see ``ComplexGaussians``.

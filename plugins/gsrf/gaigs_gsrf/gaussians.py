@@ -1,4 +1,4 @@
-"""Complex-valued Gaussians: where they start, and what they send in each direction."""
+"""Complex-valued Gaussians: their start, and their radiance by direction."""
 
 import math
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ class ComplexGaussians(Gaussians):
     Args:
         scene: Its receivers and transmitters say where to put the Gaussians, its carrier how densely.
         zone: Lowest and highest elevation that anything is heard from, in the receivers' frames [rad].
-        channels: Real channels, half of which are real parts of complex ones and half imaginary.
+        channels: Real channels: all real parts of the complex ones before all imaginary parts.
         degree: L of the series.
         radius: Of the sphere of footprints [m].
         count: Points of the grid at most; where there would be more, its pitch is wider.
@@ -87,13 +87,13 @@ class ComplexGaussians(Gaussians):
         self.phases = nn.Parameter(torch.zeros(len(means)))
 
     def radiance(self, transmitters: Float[Tensor, "b 3"]) -> Complex[Tensor, "b n s"]:
-        """What each sends towards the transmitters, on s complex channels.
+        """Radiance of each towards the transmitters, on s complex channels.
 
         psi_i = sum_{l <= L, |m| <= l} c_ilm Y_lm at the direction from the Gaussian to the transmitter.
         """
         offsets = transmitters[:, None] - self.means
         lengths = offsets.norm(dim=-1, keepdim=True)
-        # A transmitter within a Gaussian's centre lies in no direction: one is taken for it.
+        # A transmitter within a Gaussian's centre has no direction; upwards is used.
         upwards = offsets.new_tensor([0.0, 0.0, 1.0])
         directions = torch.where(lengths < NEAR, upwards, offsets / lengths.clamp(min=NEAR))
         coefficients = torch.complex(*self.signal.unflatten(1, (2, -1)).unbind(1))

@@ -1,4 +1,4 @@
-"""What arrives along each ray: orthographic splatting on a sphere, composited with complex transmittances."""
+"""Field that arrives along each ray: orthographic splatting on a sphere, composited with complex transmittances."""
 
 import torch
 from jaxtyping import Complex, Float, Int
@@ -28,7 +28,7 @@ def render(
 
     Args:
         gaussians: Their centres, covariances, opacities and phases.
-        radiance: psi, what each sends towards each transmitter.
+        radiance: psi of each Gaussian towards each transmitter.
         receiver: In the middle of the sphere.
         vectors: The rays, unit vectors in the array's frame.
         radius: Of the sphere [m].

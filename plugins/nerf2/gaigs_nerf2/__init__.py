@@ -58,7 +58,7 @@ class Nerf2(RayMarching):
         inputs[self.joint] += features
         self.layers = nn.ModuleList(nn.Linear(size, width) for size in inputs)
         self.attenuate, self.feature = nn.Linear(width, 2), nn.Linear(width, width)
-        self.parts = width, features, features  # of what the second network's first layer takes
+        self.parts = width, features, features  # inputs of the second network's first layer
         self.join = nn.Linear(sum(self.parts), width)
         self.send = nn.Sequential(
             nn.Linear(width, width // 2), nn.ReLU(), nn.Linear(width // 2, 2 * self.reading.channels)
@@ -70,7 +70,7 @@ class Nerf2(RayMarching):
         for number, layer in enumerate(self.layers):
             hidden = relu(layer(torch.cat((places, hidden), -1) if number == self.joint else hidden))
         attenuations, turns = amplitudes_and_phases(self.attenuate(hidden))
-        # All links have in common what the layer makes of the ray: it is summed up part by part.
+        # All links share the layer's output for the ray: it is summed part by part.
         ray, view, transmitter = self.join.weight.split(self.parts, 1)
         ray = linear(self.feature(hidden), ray, self.join.bias)
         ray = ray + linear(fourier_features(views, self.frequencies), view)[:, None]
@@ -80,6 +80,6 @@ class Nerf2(RayMarching):
 
 
 def amplitudes_and_phases(values: Float[Tensor, "*batch 2c"]) -> tuple[Tensor, Tensor]:
-    """|leaky ReLU| of the first half of what a network gives, 2 pi sigmoid of the second [rad]."""
+    """|leaky ReLU| of the first half of a network's output, 2 pi sigmoid of the second [rad]."""
     amplitudes, phases = values.chunk(2, -1)
     return leaky_relu(amplitudes).abs(), 2 * math.pi * phases.sigmoid()

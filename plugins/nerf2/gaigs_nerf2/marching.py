@@ -1,4 +1,4 @@
-"""Samples along rays from each receiver into the room, and what they add up to."""
+"""Samples along rays from each receiver into the room, and their sums."""
 
 import math
 from abc import abstractmethod
@@ -22,12 +22,12 @@ CALIBRATION = 16, 200
 
 
 class Samples(NamedTuple):
-    """What is at the samples i along each ray r, counted from the receiver.
+    """Properties of the samples i along each ray r, counted from the receiver.
 
     Attributes:
-        attenuations: a, how fast the amplitude of what passes falls (r, i) [1/m].
-        turns: p, how fast its phase turns (r, i) [rad/m].
-        amplitudes: s, of what a sample sends towards the receiver for each link (b, r, i, c).
+        attenuations: a, decay of a passing wave's amplitude (r, i) [1/m].
+        turns: p, rate of its phase (r, i) [rad/m].
+        amplitudes: s, of the wave that a sample sends towards the receiver for each link (b, r, i, c).
         phases: phi, of the same (b, r, i, c) [rad].
     """
 
@@ -71,7 +71,7 @@ def check_octaves(octaves: int) -> None:
 class RayMarching(Model):
     """A model of values at samples along rays from the receivers; a subclass defines them in ``sample``.
 
-    Samples stand in the middles of equal steps. ``gaigs_nerf2.readings`` has what the sums along the rays are to
+    Samples stand in the middles of equal steps. ``gaigs_nerf2.readings`` turns the sums along the rays into
     spectra, RSSI and channels. The unit of strength is such that the untrained model gives the training labels' mean
     amplitude.
 
@@ -112,7 +112,7 @@ class RayMarching(Model):
 
     @abstractmethod
     def sample(self, query: Query, points: Float[Tensor, "r i 3"], views: Float[Tensor, "r 3"]) -> Samples:
-        """What is at points, for links to one receiver.
+        """Properties of points, for links to one receiver.
 
         Args:
             query: The links.
@@ -150,10 +150,10 @@ class RayMarching(Model):
         return Prediction(torch.cat(values)[torch.cat(links).argsort()], {})
 
     def march(self, query: Query, receiver: int, rays: Rays) -> Complex[Tensor, "b r c"]:
-        """What arrives along rays at one receiver, for links to it.
+        """Fields along rays at one receiver, for links to it.
 
-        Without gradients at most ``chunk`` pairs of a link and a ray at a time. All links have in common what dims and
-        turns the waves along a ray, so rays are parted, not links.
+        Without gradients at most ``chunk`` pairs of a link and a ray at a time. All links share the attenuation and
+        phase along a ray, so rays are parted, not links.
         """
         if torch.is_grad_enabled() or not len(query):
             return self.march_at_once(query, receiver, rays)

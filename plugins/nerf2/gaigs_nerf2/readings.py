@@ -1,4 +1,4 @@
-"""What a receiver makes of the rays that reach it: a spectrum, a level or a channel."""
+"""Labels of a receiver from the rays that reach it: a spectrum, a level or a channel."""
 
 import math
 
@@ -14,12 +14,12 @@ from gaigs.query import Query, check_carrier
 from gaigs.scene import Scene, check_elements, direct_waves
 
 REACH = 0.025
-"""What a sample adds to a spectrum falls with the distance as 0.025 m / t, as published: lambda / (4 pi) at about
+"""A sample's part of a spectrum falls with the distance as 0.025 m / t, as published: lambda / (4 pi) at about
 920 MHz."""
 
 
 class Reading(nn.Module):
-    """What S, the sums along rays, are to the label.
+    """Label from S, the sums along rays.
 
     Attributes:
         channels: Numbers that a sample has an amplitude and a phase of.
@@ -32,10 +32,10 @@ class Reading(nn.Module):
     carriers: Tensor | None = None
 
     def fit(self, links: Links) -> None:
-        """Takes what the training links say of themselves; by default nothing."""
+        """Fits constants to the training links; by default none."""
 
     def gains(self, distances: Float[Tensor, " i"]) -> Float[Tensor, " i"]:
-        """By which factor what a sample sends arrives from so far [m]."""
+        """Factor of a wave that arrives from a distance [m]."""
         return torch.ones_like(distances)
 
     def shifts(self, distances: Float[Tensor, " i"]) -> Float[Tensor, "i c"]:
@@ -45,7 +45,7 @@ class Reading(nn.Module):
         return 2 * math.pi / speed_of_light * distances[:, None] * self.carriers.to(distances)
 
     def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
-        """Magnitudes of S, or of what the rays add up to, that would give these labels."""
+        """Magnitudes of S, or of the sum of the rays, that would give these labels."""
         raise NotImplementedError
 
     def forward(self, sums: Complex[Tensor, "b r c"], query: Query, directions: Directions) -> Tensor:

@@ -77,7 +77,7 @@ class NerfApt(RayMarching):
         return prediction._replace(value=interpolated(prediction.value, self.grid, directions))
 
     def march(self, query: Query, receiver: int, rays: Rays) -> Complex[Tensor, "b r c"]:
-        """What arrives along rays at one receiver; they belong together, so links are parted."""
+        """Fields along rays at one receiver; they belong together, so links are parted."""
         if torch.is_grad_enabled() or not len(query):
             return self.march_at_once(query, receiver, rays)
         parts = query.parts(max(1, self.chunk // len(rays.azimuths)))

@@ -27,7 +27,7 @@ class Double(nn.Sequential):
 
 
 def after(width: int) -> tuple[nn.Module, nn.Module]:
-    """What follows a convolution."""
+    """Normalisation and activation after a convolution."""
     return nn.BatchNorm2d(width), nn.LeakyReLU(inplace=True)
 
 
@@ -89,8 +89,8 @@ class UNet(nn.Module):
 
         Args:
             image: Features, of one image or several.
-            shifts: What inputs that are alike all over an image, in which the links b differ, add to what the first
-                convolution gives. Each image is then seen b times, those of a link one after another.
+            shifts: Part of the first convolution's output by inputs that are constant over an image and differ
+                between links b. Each image is then seen b times, those of a link one after another.
         """
         full = self.first(image)
         if shifts is not None:

@@ -20,7 +20,7 @@ class Dcgan(Network):
     """Noise and a link's numbers -> a small image of many channels -> twice as large in each of four layers -> label.
 
     An axis that is shorter than 16 pixels doubles in the last layers alone, so that one number a link is drawn by
-    fully connected layers. What is drawn beyond the label's last row and column is cut off. The discriminator goes the
+    fully connected layers. Pixels beyond the label's last row and column are cut off. The discriminator goes the
     same way back, and is shown the link's numbers in every pixel. A prediction takes the noise's mean, 0.
 
     Args:

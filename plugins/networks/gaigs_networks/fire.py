@@ -14,10 +14,10 @@ from gaigs_networks.network import Network, check_widths, linear_layers
 
 
 class Fire(Network):
-    """While it is trained an encoder sees the label, and a decoder draws it anew from what the encoder lets through.
+    """In training an encoder maps the label to a latent code, and a decoder draws the label from the code.
 
     With y the label's image and c the link's numbers, a step draws z ~ N(mu(y, c), exp(lambda(y, c))), predicts the
-    decoder's image of (z, c), and is charged for what z tells,
+    decoder's image of (z, c), and adds a penalty on the information in z,
 
         KL = sum_i (mu_i² + exp(lambda_i) - lambda_i - 1) / 2   [nat]
 

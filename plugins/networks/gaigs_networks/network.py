@@ -1,4 +1,4 @@
-"""What the networks share: a link's numbers go in, its label's image comes out."""
+"""Base of the networks: a link's numbers go in, its label's image comes out."""
 
 from collections.abc import Sequence
 from itertools import pairwise

@@ -42,7 +42,7 @@ def render(
     distance z_i.
 
     Args:
-        fields: What a sample i along a ray k sends towards the antenna.
+        fields: Field that a sample i along a ray k sends towards the antenna.
         depths: Optical depth of each sample's step; of a ray's last one it may be infinite.
         distances: z, from the antenna [m].
         frequencies: Of the subcarriers [Hz].

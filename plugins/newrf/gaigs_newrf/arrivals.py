@@ -15,13 +15,13 @@ MOST_POINTS = 200_000
 """Of the coarse search's lattice."""
 
 OVERSAMPLING = 8
-"""Of the delays over what the band resolves."""
+"""Grid points of the delay per resolution of the band."""
 
 REFINEMENTS = 5
 """Of a found point, each to half the pitch of the one before."""
 
 PASSES = 4
-"""In which each point is looked for once more, near its place, in what all the others leave over."""
+"""Rounds in which each point is searched again, near its place, in the residual of all others."""
 
 
 def find_origins(
@@ -34,8 +34,8 @@ def find_origins(
 ) -> Float[Tensor, "count 3"]:
     """Points at whose distances the channels have most power, one after another; float64.
 
-    Each next one is searched in what the ones before leave over at every element. Paths whose delays the band does not
-    keep apart draw each other away, so all are refined in turn, each in what the others leave over.
+    Each next one is searched in the residual of those before at every element. Paths whose delays the band does not
+    keep apart draw each other away, so all are refined in turn, each in the residual of the others.
 
     Source: Fleury et al., Channel Parameter Estimation in Mobile Radio Environments Using the SAGE Algorithm, 1999.
 

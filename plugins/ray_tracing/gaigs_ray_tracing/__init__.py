@@ -36,7 +36,7 @@ BATCH = 64
 class RayTracing(Model):
     """Paths by Sionna RT, waves summed up along them at each element of the receiver's array.
 
-    A path's points do not depend on what the surfaces are made of, so each link is traced once. Its gain follows from
+    A path's points do not depend on the materials of the surfaces, so each link is traced once. Its gain follows from
     Fresnel's formulas for slabs: each material's permittivity is 1 + (e - 1) a and its conductivity s b, with e and s
     as tabulated and a, b learnt, 1 at the start. Diffracted paths keep the gain that they have at the start.
 
@@ -65,7 +65,7 @@ class RayTracing(Model):
     Source: Sionna RT technical report, arXiv:2504.21719; slabs and materials as in ITU-R P.2040-3.
     """
 
-    # Of logarithms [1], and of gains [Np, rad]: slower, as materials shall explain what they can.
+    # Of logarithms [1], and of gains [Np, rad]: slower, so that materials explain most.
     learning_rates: Mapping[str, float] = {"materials": 5e-2, "gains": 5e-3}
 
     def __init__(
@@ -178,13 +178,13 @@ class RayTracing(Model):
         return True
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Those of the materials, and the receivers' gains; without calibration there are none."""
+        """Those of the materials, and the receivers' gains; empty without calibration."""
         groups = {"materials": ["log_permittivities", "log_conductivities"], "gains": ["log_gains"]}
         parameters = dict(self.named_parameters())
         return {key: [parameters[name] for name in names if name in parameters] for key, names in groups.items()}
 
     def facts(self) -> dict[str, object]:
-        """What the surfaces are made of, at the lowest carrier, and how long it takes to trace a place."""
+        """Materials of the surfaces at the lowest carrier, and the time to trace a place."""
         carrier = self._carriers(Query(self.scene.lower[None], torch.tensor([0]), self._lowest())).item()
         slabs = self.slabs(carrier)
         tracer = self._tracer(carrier)
@@ -216,7 +216,7 @@ class RayTracing(Model):
         return Prediction(value.to(batch.query.transmitters.device), {})
 
     def _report(self, query: Query, receiver: int, carrier: float, batch: Batch) -> Tensor:
-        """What links to one receiver give."""
+        """Labels of links to one receiver."""
         antenna, task = self.scene.receivers[receiver], self.scene.task
         traced = padded(self._tracer(carrier).find(query.transmitters, receiver), antenna.pose.position)
         paths = Paths(traced.images, gains(traced, self.slabs(carrier)))
@@ -236,7 +236,7 @@ class RayTracing(Model):
         return 10 * (powers + SILENT).log10() + NEPER * self.log_gains[receiver, 0].cpu().double()
 
     def slabs(self, carrier: float) -> Slabs:
-        """What the surfaces are made of at a carrier [Hz]."""
+        """Materials of the surfaces at a carrier [Hz]."""
         real, c, d = torch.tensor([MATERIALS[kind] for kind in self.known.values()], dtype=torch.float64).T
         conductivities = c * (carrier / 1e9) ** d * self.log_conductivities.cpu().double().exp()
         permittivities = torch.complex(

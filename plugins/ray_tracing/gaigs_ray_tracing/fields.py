@@ -1,4 +1,4 @@
-"""What arrives along traced paths, as a function of what the surfaces are made of."""
+"""Fields along traced paths, as a function of the materials of the surfaces."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 from gaigs.propagation import fresnel
 
 REFLECTED, PASSED = 1, 2
-"""Kinds of what happens to a path; 0 is nothing."""
+"""Kinds of interactions of a path; 0 is none."""
 
 GRAZING = 1e-6
 """Smallest cosine of an angle of incidence: along a surface of air the coefficients would be 0 / 0."""
@@ -29,8 +29,8 @@ class Traced(NamedTuple):
     Attributes:
         images: Where the transmitter seems to stand (p, 3) [m].
         strengths: 1; of a diffracted path its whole gain, which does not change with the materials (p,).
-        kinds: What happens, 0, ``REFLECTED`` or ``PASSED`` (p, d).
-        surfaces: Number of the material at which it does (p, d).
+        kinds: Interaction, 0, ``REFLECTED`` or ``PASSED`` (p, d).
+        surfaces: Number of the surface's material (p, d).
         cosines: Of the angles of incidence (p, d).
         turns: From the components that a field has after one of them to those before the next (p, d + 1, 2, 2).
     """

@@ -23,7 +23,7 @@ FURNITURE = {
     "refrigerator": "metal",
     "column": "concrete",
 }
-"""What the built-in room's furniture is taken for. The simulation knows how much each piece dims, and no material."""
+"""Materials of the built-in room's furniture. The simulation knows how much each piece dims, and no material."""
 
 SUFFIXES = (".obj", ".ply", ".xml")
 
@@ -63,7 +63,7 @@ def known_materials(meshes: Sequence[Mesh], chosen: Mapping[str, str]) -> dict[s
 
     Args:
         meshes: Surfaces.
-        chosen: What the user says of some.
+        chosen: The user's choice for some.
 
     Raises:
         ValueError: A name is unknown, or is said of a material that there is not.
@@ -107,7 +107,7 @@ def read_obj(text: str, source: str) -> list[Mesh]:
 
     Args:
         text: Content of the file.
-        source: What errors call it.
+        source: Its name in errors.
 
     Raises:
         ValueError: A line holds no numbers where it must, or a face takes vertices that there are not.
@@ -128,9 +128,9 @@ def _read_scene(file: Path) -> list[Mesh]:
     try:
         scene = rt.load_scene(str(file))
     except Exception as error:  # whatever Mitsuba's parser raises, with a traceback in it where a material is wrong
-        told, traceback, calls = str(error).partition("Traceback (most recent call last):")
+        message, traceback, calls = str(error).partition("Traceback (most recent call last):")
         cause = calls.strip().rpartition("\n")[2] if traceback else ""
-        words = " ".join(f"{told} {cause}".split())
+        words = " ".join(f"{message} {cause}".split())
         raise ValueError(f"{file} must be a scene that Sionna RT reads, and is not: {words}") from error
     meshes = []
     for name, shape in scene.objects.items():

@@ -90,8 +90,8 @@ class Tracer:
             arrays = {name: torch.cat([getattr(link, name) for link in links]).numpy() for name in Traced._fields}
             return arrays | {"counts": np.array([len(link.strengths) for link in links])}
 
-        what = f"tracing the paths of {len(missing)} transmitters to {len(self.receivers)} receivers"
-        arrays = cache.keep(self.key | {"transmitters": missing}, trace, what)
+        title = f"tracing the paths of {len(missing)} transmitters to {len(self.receivers)} receivers"
+        arrays = cache.keep(self.key | {"transmitters": missing}, trace, title)
         counts = arrays.pop("counts").tolist()
         parts = (torch.from_numpy(arrays[name]).split(counts) for name in Traced._fields)
         links = list(map(Traced, *parts))
@@ -147,7 +147,7 @@ class Tracer:
         return found
 
     def _links(self, paths, places: Float[ndarray, "b 3"], identities: dict[int, int]) -> list[list[Traced]]:
-        """What Sionna RT found, by place and receiver."""
+        """Paths of Sionna RT, by place and receiver."""
         fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, :, 0]
         valid = paths.valid.numpy()
         there = np.zeros_like(valid)
@@ -214,7 +214,7 @@ class Tracer:
         meshes: Int[ndarray, "p d"],
         faces: Int[ndarray, "p d"],
     ) -> tuple[Float[ndarray, "p d"], Float[ndarray, "p d1 2 2"]]:
-        """Cosines of incidence, and what ``Traced.turns`` holds."""
+        """Cosines of incidence, and the content of ``Traced.turns``."""
         count, depth = kinds.shape
         before = _vertical(directions[:, 0])
         cosines, turns = np.ones((count, depth)), np.zeros((count, depth + 1, 2, 2))

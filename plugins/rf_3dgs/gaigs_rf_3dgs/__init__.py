@@ -1,4 +1,4 @@
-"""RF-3DGS: first where the Gaussians are, then what they send by radio."""
+"""RF-3DGS: first the geometry of the Gaussians, then their radio signal."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +16,7 @@ from gaigs.scene import Scene
 from gaigs_rf_3dgs.geometry import read_geometry
 
 GREY = 0.5
-"""What each Gaussian sends when its harmonics are reset, as colours of 3-D Gaussian splatting are then."""
+"""Signal of each Gaussian after its harmonics are reset, as of colours in 3-D Gaussian splatting."""
 
 GEOMETRY = ("means", "quats", "log_scales")
 """Parameters that the second stage leaves as they are."""
@@ -26,7 +26,7 @@ class Rf3dgs(GaussianSplatting):
     """The splatting pipeline, trained in two stages.
 
     1. Geometry. Without a file everything is trained, and each Gaussian sends alike for all transmitters, as a
-       photograph does not depend on the transmitter: it learns what the training spectra have in common. With a
+       photograph does not depend on the transmitter: it learns the common part of the training spectra. With a
        file there is no training: Gaussians stand at its points.
     2. Radio. Centres, orientations and scales are frozen and the signal is reset. Trained are opacities and spherical
        harmonics over the direction in which a transmitter sees a Gaussian.
@@ -62,7 +62,7 @@ class Rf3dgs(GaussianSplatting):
         """As the pipeline's.
 
         Raises:
-            ValueError: Several processes train, which cannot freeze what they have shared from the start.
+            ValueError: Several processes train, which cannot freeze shared parameters.
         """
         if self.training and distributed.is_available() and distributed.is_initialized():
             raise ValueError(
@@ -103,7 +103,7 @@ class Rf3dgs(GaussianSplatting):
         return super().facts() | {"stage": int(self.stage), "geometry": source}
 
     def _enter(self) -> None:
-        """Has count, and be trained, what the stage says."""
+        """Sets the harmonics that count, and the trained parameters, by the stage."""
         is_radio = int(self.stage) == 2
         self.gaussians.degree = self.degree if is_radio else 0
         for name in GEOMETRY:

@@ -1,15 +1,7 @@
-"""WRF-GS: splatting whose Gaussians send what NeRF²'s two-stage network says."""
+"""WRF-GS (INFOCOM 2025): splatting with the two-stage network of NeRF², as conf/model/wrf_gs.yaml has it."""
 
 from gaigs.model.gaigs import GaussianSplatting
 
 
 class WrfGs(GaussianSplatting):
-    """The splatting pipeline under the name of its results; ``conf/model/wrf_gs.yaml`` has the parts.
-
-    Args:
-        As for ``GaussianSplatting``.
-
-    Source: WRF-GS (INFOCOM 2025).
-    """
-
     name = "wrf_gs"

@@ -23,8 +23,8 @@ class TwoStage(Deformation):
     its end h the attenuation delta and a feature, both linear; delta through a sigmoid, at first
     ``INITIAL_ATTENUATION``.
     Signal network: [feature, E(P_TX), CLS, PE(view)] -> width -> half of it, with ReLU -> the signal of each channel.
-    The view is the unit vector from the receiver to the Gaussian. So matter is the same for all, and what it sends
-    depends on who sends and who hears.
+    The view is the unit vector from the receiver to the Gaussian. So matter is the same for all links, and its
+    signal depends on transmitter and receiver.
 
     Args:
         scene: Where the receivers stand.

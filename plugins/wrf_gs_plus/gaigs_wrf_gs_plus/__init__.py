@@ -1,15 +1,7 @@
-"""WRF-GS+: splatting with a static signal, to which a deformation adds a wave for each transmitter."""
+"""WRF-GS+ (IEEE TWC 2025): splatting with a wave for each transmitter, as conf/model/wrf_gs_plus.yaml has it."""
 
 from gaigs.model.gaigs import GaussianSplatting
 
 
 class WrfGsPlus(GaussianSplatting):
-    """The splatting pipeline under the name of its results; ``conf/model/wrf_gs_plus.yaml`` has the parts.
-
-    Args:
-        As for ``GaussianSplatting``.
-
-    Source: WRF-GS+ (IEEE TWC 2025).
-    """
-
     name = "wrf_gs_plus"

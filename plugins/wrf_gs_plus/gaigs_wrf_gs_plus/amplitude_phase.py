@@ -11,7 +11,7 @@ from gaigs.query import Query
 
 
 class AmplitudePhase(Deformation):
-    """What a transmitter adds to every Gaussian's rotation, scale and signal.
+    """Change by a transmitter of every Gaussian's rotation, scale and signal.
 
     Network: u = [E(P_x), E(P_TX), CLS] -> layers of one width with ReLU, u is fed into the middle one again.
     Linear heads from its end: rotation and scale, 0 at the start; amplitude a and phase phi of each wave. A wave is a
