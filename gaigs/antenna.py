@@ -33,7 +33,7 @@ class Array:
         (16, 1)
     """
 
-    elements: Float[Tensor, "e 3"]
+    elements: Tensor
     pattern: str = "isotropic"
 
     def __post_init__(self) -> None:
@@ -57,7 +57,7 @@ class Array:
         """
         if rows < 1 or columns < 1 or not 0 < pitch < math.inf:
             raise ValueError(
-                f"an array must have 1 x 1 elements or more at a positive pitch, got {rows}, {columns}, {pitch}"
+                f"an array must have at least 1 x 1 elements at a positive pitch, got {rows} x {columns} at {pitch} m"
             )
         steps = lambda count: (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * pitch
         x, y = torch.meshgrid(steps(columns), steps(rows), indexing="ij")

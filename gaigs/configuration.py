@@ -145,8 +145,9 @@ def check(config: dict) -> None:
         check_type(key, config.get(key), annotation)
     benchmark = config.get("benchmark")
     if (benchmark is not None) != (config["command"] == "benchmark"):
-        name = "null" if benchmark is None else benchmark.get("name")
-        raise ValueError(f"command=benchmark needs benchmark=..., and vice versa; got {config['command']} and {name}")
+        if benchmark is None:
+            raise ValueError("command=benchmark needs a benchmark; add benchmark=accuracy, budgets, rasterizer or step")
+        raise ValueError(f"benchmark={benchmark.get('name')} needs command=benchmark")
     for kind in KINDS[: KINDS.index("benchmark")]:
         if config.get(kind) is not None:
             check_type(f"{kind}.name", config[kind].get("name"), str)

@@ -160,7 +160,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("+thread=3", "the configuration has no key 'thread' (did you mean 'threads'?)"),
         ("command=trian", "command must be train, benchmark, agreement or devices, got 'trian'"),
         ("~command", "the configuration needs the key 'command'"),
-        ("benchmark=step", "command=benchmark needs benchmark=..., and vice versa; got train and step"),
+        ("benchmark=step", "benchmark=step needs command=benchmark"),
         ("data=nerf2_spectrum", "data.root must be given, as it has no default; add data.root=..."),
         ("data=nerf2_spectrum data.root=nowhere", "nowhere must be the folder of a data set"),
         ("-m model=knn,mean model.k=3", "in a sweep write ++model.k=... for a key that only the swept model has"),

@@ -92,9 +92,14 @@ class TwoBranch(Deformation):
         super().__init__()
         if unknown := set(heads) - set(HEADS):
             raise ValueError(f"deformation.heads must be among {', '.join(HEADS)}, got {', '.join(sorted(unknown))}")
-        if width < 1 or min(attenuation_layers, signal_layers) < 0:
-            sizes = f"{width}, {attenuation_layers} and {signal_layers}"
-            raise ValueError(f"deformation.width must be at least 1, the numbers of layers at least 0, got {sizes}")
+        sizes = {
+            "width": (width, 1),
+            "attenuation_layers": (attenuation_layers, 0),
+            "signal_layers": (signal_layers, 0),
+        }
+        for option, (value, least) in sizes.items():
+            if value < least:
+                raise ValueError(f"deformation.{option} must be at least {least}, got {value}")
         self.heads = nn.ModuleDict()
         if not heads:
             return

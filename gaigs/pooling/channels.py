@@ -31,7 +31,7 @@ class ChannelPooling(Pooling):
 
     def __init__(self, scene: Scene, name: str):
         super().__init__()
-        check_elements(f"pooling {name!r}", scene)
+        self.frequencies = check_elements(f"pooling {name!r}", scene).frequencies
         self.scene = scene
         if all(receiver.array.pattern == "cosine" for receiver in scene.receivers):
             self.zone = (0.0, math.pi / 2)
@@ -43,7 +43,7 @@ class ChannelPooling(Pooling):
     def fit(self, links: Links) -> None:
         train = links.split.train
         labels, query = links.labels[train].to(torch.complex128), links.query[train]
-        waves = direct_waves(self.scene, query, self.scene.task.frequencies)
+        waves = direct_waves(self.scene, query, self.frequencies)
         self.strength.fill_(strength(labels, waves, query.receivers))
         self.sign.fill_(phase_sign(labels, waves, query.receivers))
         self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))

@@ -30,7 +30,7 @@ class ElementSum(ChannelPooling):
 
     def __init__(self, scene: Scene, grid: Sequence[int] = (8, 16)):
         super().__init__(scene, "element_sum")
-        self.channels = 2 * len(scene.task.frequencies)
+        self.channels = 2 * len(self.frequencies)
         self.grid = sphere("pooling.grid", grid)
 
     def forward(
@@ -42,8 +42,7 @@ class ElementSum(ChannelPooling):
         waves = torch.complex(*image.flatten(2).unflatten(1, (2, -1)).unbind(1))
         steering = self._steering(int(query.receivers[0]), int(self.array_sign)).to(waves)
         channels = (waves.permute(1, 0, 2) @ steering).permute(1, 2, 0)
-        frequencies = self.scene.task.frequencies
-        direct = direct_waves(self.scene, query, frequencies, int(self.sign), at_elements=False)
+        direct = direct_waves(self.scene, query, self.frequencies, int(self.sign), at_elements=False)
         return channels * (self.strength.double() * direct).to(waves)
 
     def _steering(self, receiver: int, sign: int) -> Complex[Tensor, "s p e"]:
@@ -51,6 +50,6 @@ class ElementSum(ChannelPooling):
         array, directions = self.scene.receivers[receiver].array, self.grid.flatten().vectors().double()
         # A wave from the direction u reaches an element at x earlier by x . u / c than the middle.
         delays = directions @ array.elements.double().T / speed_of_light
-        phases = -sign * 2 * math.pi * self.scene.task.frequencies[:, None, None] * delays
+        phases = -sign * 2 * math.pi * self.frequencies[:, None, None] * delays
         weights = self.grid.solid_angles.flatten().double() * array.gain(directions)
         return torch.polar(weights[:, None].expand_as(phases), phases)

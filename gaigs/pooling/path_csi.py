@@ -23,12 +23,12 @@ class PathCsi(ChannelPooling, PathPooling):
 
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b e s"]:
         """Field at each element and subcarrier over the unit of 1 / distance."""
-        return element_fields(paths, self.scene.task.frequencies.to(paths.carriers)[None] - paths.carriers[:, None])
+        return element_fields(paths, self.frequencies.to(paths.carriers)[None] - paths.carriers[:, None])
 
     def read(
         self, received: Complex[Tensor, "b e s"], query: Query, directions: Directions | None = None
     ) -> Complex[Tensor, "b e s"]:
-        frequencies = self.scene.task.frequencies.to(received.real)
+        frequencies = self.frequencies.to(received.real)
         value = received * (self.strength.to(frequencies) * speed_of_light / (4 * math.pi * frequencies))
         if self.sign == 0:  # no common clock: the phase of the direct path is taken off
             value = value * direct_waves(self.scene, query, frequencies, 1, at_elements=False).sgn().to(value)

@@ -16,7 +16,7 @@ def default_device() -> str:
     return name_of(_choose(os.environ.get("GAIGS_OPENCL_DEVICE")))
 
 
-def _devices() -> list[cl.Device]:
+def _devices() -> list:
     """The devices of all drivers. A broken driver is an error only where no other lists a device."""
     found, causes = [], []
     try:

@@ -103,7 +103,7 @@ class Evaluation(JupyterMixin):
         return text.getvalue().rstrip()
 
 
-def evaluate(model: Model, links: Links, baselines: Sequence[str | Mapping] | None = None) -> Evaluation:
+def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> Evaluation:
     """Scores of a model on the test links, beside those of baselines that are fitted to the other links.
 
     Args:

@@ -53,7 +53,6 @@ class Task(ABC):
     dtype: torch.dtype = torch.float32
     is_noisy: bool = False
     directions: Grid | None = None
-    frequencies: Tensor
 
     @property
     @abstractmethod

@@ -27,6 +27,8 @@ GRID = Grid.degrees(range(10, 91, 10), range(0, 360, 15))
 class Untrained(Model):
     """A model with the Gaussians and the learnt room of a test, if any."""
 
+    primitives = None
+
     def __init__(self, scene, primitives=None, room=None):
         super().__init__(scene)
         self.primitives = primitives

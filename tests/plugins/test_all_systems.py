@@ -196,16 +196,16 @@ def seen_in(elevations):
         *((name, links_of("spectrum", CARRIERS[:2]).scene, "of one carrier, and these links have 2")
           for name in ("array_response", "nerf2", "nerf_apt", "gsrf")),
         ("newrf", links_of("csi", CARRIERS[:2]).scene, "of one carrier, and these links have 2"),
-        ("newrf", of_task("rssi"), "gives complex channels, and labels of task 'rssi' are none"),
+        ("newrf", of_task("rssi"), "gives complex channels, not labels of task 'rssi'"),
         ("newrf", replace(of_task("csi"), task=Csi(4, torch.tensor([2.4e9]))), "a single subcarrier"),
         ("array_response", of_task("csi"), "predicts spectra"),
-        ("rf_3dgs", of_task("rssi"), "learns from spectra, and labels of task 'rssi' are none"),
+        ("rf_3dgs", of_task("rssi"), "learns from spectra, not labels of task 'rssi'"),
         ("swift_wrf", of_task("rssi"), "labels of task 'rssi' have no directions; take another model"),
         ("swift_wrf", seen_in([0.5]), r"needs labels of two elevations or more, got \(1, \d+\) directions"),
         ("gsrf", of_task("rssi"), "labels of task 'rssi' have no directions"),
         ("gsrf", seen_in([0.5]), r"needs labels of two elevations or more, got them from 0\.5 to 0\.5 rad"),
         ("nerf2", replace(of_task("rssi"), task=Delay()), "these labels are of task 'delay'; take another model"),
-        ("ray_tracing", replace(of_task("rssi"), task=Delay()), "labels of task 'delay' are none"),
+        ("ray_tracing", replace(of_task("rssi"), task=Delay()), "not labels of task 'delay'"),
     ],
 )  # fmt: skip
 def test_labels_and_carriers_that_do_not_suit_are_refused(name, scene, message):
