@@ -10,7 +10,6 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gaigs.configuration import compose as compose_run
 from gaigs.configuration import conf_dir, differences, installed, known, launcher
 from gaigs.registry import registry
 
@@ -152,11 +151,3 @@ def test_two_jobs_run_at_a_time_if_joblib_is_installed(configure, monkeypatch):
 )
 def test_differences_name_the_part_and_leave_out_harmless_keys(there, here, expected):
     assert differences(there, here) == expected
-
-
-def test_a_plugin_that_cannot_be_imported_is_named_when_it_is_composed(tmp_path, monkeypatch):
-    (tmp_path / "plugins").mkdir()
-    (tmp_path / "plugins/broken.py").write_text("import nothing\n@register('model', 'broken')\nclass Broken: ...\n")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=r"model 'broken' of plugins.broken\.py cannot be loaded: ModuleNotFoundError"):
-        compose_run(model="broken")

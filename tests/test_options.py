@@ -39,9 +39,15 @@ from gaigs.testing import example_links
         ("tokenizer", "multiview", {"ga": {"name": "ga", "depth": 1}}, "rssi", "tokenizer 'ga' has no option 'depth'"),
         ("tokenizer", "multiview", {"euclidean": "euclid"}, "rssi", "unknown tokenizer 'euclid'"),
         ("deformation", "two_branch", {"heads": ["signal", "shift", "phase"]}, "rssi", "opacity, .* got phase, shift"),
-        ("deformation", "two_branch", {"width": 0}, "rssi", r"deformation\.width must be at least 1, .* got 0"),
-        ("deformation", "two_branch", {"attenuation_layers": -1}, "rssi", "got 64, -1 and 1"),
-        ("deformation", "two_branch", {"signal_layers": -2}, "rssi", "got 64, 2 and -2"),
+        ("deformation", "two_branch", {"width": 0}, "rssi", r"deformation\.width must be at least 1, got 0"),
+        (
+            "deformation",
+            "two_branch",
+            {"attenuation_layers": -1},
+            "rssi",
+            r"attenuation_layers must be at least 0, got -1",
+        ),
+        ("deformation", "two_branch", {"signal_layers": -2}, "rssi", r"signal_layers must be at least 0, got -2"),
     ],
 )
 def test_impossible_options_are_refused(kind, name, options, task, message):

@@ -92,12 +92,8 @@ class TwoBranch(Deformation):
         super().__init__()
         if unknown := set(heads) - set(HEADS):
             raise ValueError(f"deformation.heads must be among {', '.join(HEADS)}, got {', '.join(sorted(unknown))}")
-        sizes = {
-            "width": (width, 1),
-            "attenuation_layers": (attenuation_layers, 0),
-            "signal_layers": (signal_layers, 0),
-        }
-        for option, (value, least) in sizes.items():
+        layers = ("attenuation_layers", attenuation_layers, 0), ("signal_layers", signal_layers, 0)
+        for option, value, least in (("width", width, 1), *layers):
             if value < least:
                 raise ValueError(f"deformation.{option} must be at least {least}, got {value}")
         self.heads = nn.ModuleDict()

@@ -33,7 +33,7 @@ def _devices() -> list:
     return found
 
 
-def name_of(device: cl.Device) -> str:
+def name_of(device) -> str:
     """As ``devices`` lists it."""
     kinds = (kind for kind in ("CPU", "GPU", "ACCELERATOR") if device.type & getattr(cl.device_type, kind))
     return f"{device.platform.name}: {device.name} ({' '.join(kinds)})"
@@ -56,7 +56,7 @@ def _open(name: str | None) -> cl.CommandQueue:
         ) from error
 
 
-def _choose(name: str | None) -> cl.Device:
+def _choose(name: str | None):
     """The first device with this part of a name; for None the first CPU, or else the first device."""
     found = _devices()
     if name:

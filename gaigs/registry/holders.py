@@ -137,15 +137,14 @@ def _scan(kind: str, folder: Path, package: str, root: Path | None = None) -> tu
     for module, file in _files(folder, package):
         where = str(file.relative_to(root or PACKAGE.parent))
         try:
+            stat = file.stat()
+            claims = _claims(file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size)
+            own = [(name, target) for claimed, name, target in claims if claimed == kind]
             if file.name == "pyproject.toml":
                 (source,) = sources(folder, file.parent.name)
-                project = tomllib.loads(file.read_text(encoding="utf-8")).get("project", {})
-                points = project.get("entry-points", {}).get(f"gaigs.{kind}", {})
-                holders += [Holder(name, where, str(target), root=source) for name, target in points.items()]
+                holders += [Holder(name, where, target, root=source) for name, target in own]
             else:
-                stat = file.stat()
-                claims = _claims(file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size)
-                holders += [Holder(name, where, module, file, root) for own, name in claims if own == kind]
+                holders += [Holder(name, where, module, file, root) for name, _ in own]
         except Exception as error:  # any error of a parser
             unreadable.append(f"{where}: {str(error) or type(error).__name__}")
     return holders, unreadable
@@ -170,8 +169,16 @@ def sources(folder: Path, project: str = "[!_.]*") -> list[Path]:
 
 
 @functools.cache  # called for each kind
-def _claims(file: Path, *_state: int) -> list[tuple[str, str]]:
-    """Kinds and names that a file's top-level ``@register(kind, name)`` decorators claim."""
+def _claims(file: Path, *_state: int) -> list[tuple[str, str, str]]:
+    """Kind, name and target that a file's top-level ``@register(kind, name)`` decorators or entry points claim."""
+    if file.name == "pyproject.toml":
+        groups = tomllib.loads(file.read_text(encoding="utf-8")).get("project", {}).get("entry-points", {})
+        return [
+            (group.removeprefix("gaigs."), name, str(target))
+            for group, points in groups.items()
+            if group.startswith("gaigs.")
+            for name, target in points.items()
+        ]
     found = []
     for node in ast.parse(file.read_bytes(), file.name).body:
         for decorator in getattr(node, "decorator_list", ()):
@@ -180,7 +187,7 @@ def _claims(file: Path, *_state: int) -> list[tuple[str, str]]:
                     func=ast.Name(id="register") | ast.Attribute(attr="register"),
                     args=[ast.Constant(value=str(kind)), ast.Constant(value=str(name))],
                 ):
-                    found.append((kind, name))
+                    found.append((kind, name, ""))
     return found
 
 

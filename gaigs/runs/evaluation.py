@@ -34,7 +34,7 @@ Scores = dict[str, dict[str, Tensor]]
 """Scores of every link, by the names of model and score."""
 
 
-def build_baselines(configurations: Sequence[str | Mapping], own: str, scene: Scene) -> dict[str, Model]:
+def build_baselines(configurations: Sequence, own: str, scene: Scene) -> dict[str, Model]:
     """The baselines of a run by name, not fitted; the one with the name ``own`` of the run's model is left out.
 
     Raises:
