@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy import ndarray
 
-from gaigs.report.style import COLUMN, LINES, PAGE, STYLE
+from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE
 from gaigs.task import Metric
 
 LABEL = 48
@@ -112,6 +112,39 @@ def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:
             ax.legend()
             if group == "train" and any((values > 0).any() for _, values in names.values()):
                 ax.set_yscale("log")
+    return figure
+
+
+def speed_against_error(
+    names: Sequence[str],
+    scores: Float[ndarray, " runs"],
+    times: Mapping[str, Float[ndarray, " runs"]],
+    score_label: str,
+    baselines: Mapping[str, float],
+) -> Figure:
+    """Score of each run against each kind of time, one panel a kind; NaN if a time is unknown.
+
+    The baselines' scores are horizontal lines.
+    """
+    with rc_context(STYLE):
+        key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page
+        key_rows = (len(names) + len(baselines) + 1) // key_columns
+        figure = Figure(figsize=(PAGE, 2.4 + 0.15 * key_rows), layout="constrained")
+        axes = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]
+        for ax, (label, values) in zip(axes, times.items(), strict=True):
+            for run, (name, look) in enumerate(zip(names, cycle(MARKERS), strict=False)):
+                ax.plot(values[run], scores[run], linestyle="", markersize=5, label=name, **look)
+            for (name, score), (colour, dash) in zip(baselines.items(), cycle(LINES[1:]), strict=False):
+                ax.axhline(score, color=colour, linestyle=dash, linewidth=0.9, zorder=0, label=name)
+            ax.set_xlabel(label)
+            ax.grid()
+            known = values[np.isfinite(values)]
+            if len(known) and 0 < 10 * known.min() < known.max():
+                ax.set_xscale("log")
+                ticks = LogLocator(subs=(1, 2, 5))
+                ax.xaxis.set(major_locator=ticks, major_formatter="{x:g}", minor_locator=NullLocator())
+        axes[0].set_ylabel(score_label)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=key_columns)
     return figure
 
 

@@ -1,15 +1,19 @@
-"""The runs of a Hydra multirun, or of several: one table, and their spread over seeds."""
+"""The runs of a Hydra multirun, or of several: one table, their spread over seeds, their speed against their error."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 
 from gaigs.io.files import write_text
 from gaigs.report.claims import write_claims
+from gaigs.report.curves import speed_against_error
 from gaigs.report.runs import Run, by_seed, read_runs, train_seconds
+from gaigs.report.style import save
 from gaigs.report.systems import write_systems
 from gaigs.report.table import Spread, columns_of, markdown, task_class, terminal, write_csv, written
 
@@ -78,7 +82,7 @@ def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
 
 
 def report(folder: str | Path) -> Group:
-    """Writes ``ablation.csv`` and ``ablation.md`` into a folder.
+    """Writes ``ablation.csv``, ``ablation.md`` and, if a run has ended, ``speed_against_error.png`` into a folder.
 
     Runs of several models also get the files of ``gaigs.report.systems``, and runs of variants those of
     ``gaigs.report.claims``. Runs of several tasks get the latter only.
@@ -114,6 +118,8 @@ def report(folder: str | Path) -> Group:
     if groups:
         page += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
     write_text(folder / "ablation.md", page)
+    if known:
+        save(_speed(runs, rows, shared, titles), folder / "speed_against_error.png")
 
     hidden = {name for name, metric in known.items() if not metric.is_brief} | {"num_gaussians"}
     if not any(row["status"] == "unfinished" for row in rows):
@@ -129,6 +135,19 @@ def report(folder: str | Path) -> Group:
     baselines = [row for row in rows if row["status"] == "baseline"]
     systems = write_systems(folder, runs, baselines, shared, known)
     return Group(*tables, *(table for table in (systems, claims) if table is not None))
+
+
+def _speed(runs: list[Run], rows: list[dict], shared: Mapping, titles: Mapping[str, str]) -> Figure:
+    metric = next(iter(titles))
+    done = [(run, row) for run, row in zip(runs, rows, strict=False) if run.metrics is not None]
+    varied = [{key: value for key, value in run.overrides.items() if key not in shared} for run, _ in done]
+    names = [" ".join(f"{key}={value}" for key, value in overrides.items()) for overrides in varied]
+    if "" in names or len(set(names)) < len(names):
+        names = [run.name for run, _ in done]
+    numbers = lambda key: np.array([np.nan if row.get(key) is None else row[key] for _, row in done], float)
+    times = {"inference [ms a transmitter]": numbers("inference_ms"), "training [s]": numbers("train_seconds")}
+    baselines = {f"{row['model']} {row.get('split', '')}".strip(): row[metric] for row in rows[len(runs) :]}
+    return speed_against_error(names, numbers(metric), times, titles[metric], baselines)
 
 
 def _text(value: float | int | str | Spread | None, between: str) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import ecdf
 
-from gaigs.report.curves import cdf, loss_curves, read_curves
+from gaigs.report.curves import cdf, loss_curves, read_curves, speed_against_error
 
 
 @pytest.fixture
@@ -90,3 +90,16 @@ def test_a_diverged_loss_still_makes_a_figure():
     steps = np.arange(9.0)
     figure = loss_curves({"train/loss": (steps, np.full(9, np.nan)), "train/l1": (steps, np.zeros(9))})
     figure.draw_without_rendering()
+
+
+@pytest.mark.parametrize(("longest", "scale"), [(20.0, "linear"), (500.0, "log")])
+def test_speed_against_error(longest, scale):
+    times = {"inference": np.array([np.nan, 5, longest])}
+    figure = speed_against_error(["a", "b", "c"], np.array([0.7, 0.8, 0.9]), times, "median SSIM", {"knn": 0.85})
+    figure.draw_without_rendering()
+    (ax,) = figure.axes
+    points = {line.get_label(): line for line in ax.lines}
+    assert points["b"].get_xydata().tolist() == [[5, 0.8]]
+    assert points["c"].get_xydata().tolist() == [[longest, 0.9]]
+    assert set(points["knn"].get_ydata()) == {0.85}
+    assert (ax.get_xscale(), ax.get_ylabel()) == (scale, "median SSIM")
