@@ -20,7 +20,7 @@ ROUNDING = 1e-6
 
 
 def unit_hint(number: float) -> str:
-    """A question about the unit in which a number would be a carrier; empty if no unit makes it one."""
+    """The end of an error, such as ``; in MHz?``, if a number would be a carrier in that unit; else empty."""
     units = {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}
     low, high = CARRIERS
     return next((f"; in {unit}?" for unit, size in units.items() if low / size <= number <= high / size), "")

@@ -15,8 +15,8 @@ ENDLESS = 2**40
 class Budget(Callback):
     """Measures a training's time, ends it when its time is up, and has it validate by time.
 
-    The clock of the first process decides for all, after each step. It goes on while a training validates, and a
-    resumed training starts with the time spent before. It stands first among the callbacks, and the trainer has no
+    The clock of the first process decides for all, after each step. It runs during validations, and a
+    resumed training starts with the time spent before. This callback is the first, and the trainer has no
     ``max_time``. In Lightning's own validation by time each process follows its own clock.
 
     Args:
