@@ -23,7 +23,8 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
-from gaigs.registry import KINDS, check_type, find_holders, listed, registry, storable, suggest
+from gaigs.registry import KINDS, check_type, listed, registry, storable, suggest
+from gaigs.registry.holders import plugin_packages
 
 log = logging.getLogger(__name__)
 
@@ -65,9 +66,7 @@ def plugin_conf_dirs() -> list[Path]:
     They hold ``<kind>/<name>.yaml``; no plug-in is imported.
     """
     folders = [*Path.cwd().glob("plugins/conf"), *sorted(Path.cwd().glob("plugins/[!_.]*/conf"))]
-    for holder in (holder for kind in KINDS for holder in find_holders(kind)[0]):
-        if holder.file is None and holder.folder is not None:
-            folders.append(holder.folder / "conf")
+    folders += [package / "conf" for package in plugin_packages(KINDS)]
     return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
 
 

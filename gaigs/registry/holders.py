@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -74,17 +74,27 @@ def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list
 
     The second list has the unreadable files, each with the cause.
     """
-    cwd = Path.cwd()
     built_in, unreadable = _scan(kind, PACKAGE / kind, f"gaigs.{kind}")
-    # An installation changes a folder of sys.path.
-    path = tuple((folder, os.stat(folder or ".").st_mtime_ns) for folder in sys.path if os.path.isdir(folder or "."))
-    points = _installed(f"gaigs.{kind}", path)
-    installed = [Holder(p.name, f"distribution {p.dist.name} {p.dist.version}", p.value) for p in points]
-    dropped, causes = _scan(kind, cwd / "plugins", "plugins", root=cwd)
+    installed = _installed_holders(kind)
+    dropped, causes = _scan(kind, Path.cwd() / "plugins", "plugins", root=Path.cwd())
     targets = {(holder.name, holder.target) for holder in installed}
     # A package in ./plugins may be installed as well.
     holders = built_in + installed + [holder for holder in dropped if (holder.name, holder.target) not in targets]
     return [holder for holder in holders if name in (None, holder.name)], unreadable + causes
+
+
+def plugin_packages(kinds: Iterable[str]) -> list[Path]:
+    """Folders of the packages with an entry point of gaigs, installed or in ./plugins; none is imported."""
+    holders = [holder for kind in kinds for holder in _installed_holders(kind)]
+    holders += _scan(None, Path.cwd() / "plugins", "plugins", root=Path.cwd())[0]
+    return [holder.folder for holder in holders if holder.file is None and holder.folder is not None]
+
+
+def _installed_holders(kind: str) -> list[Holder]:
+    # An installation changes a folder of sys.path.
+    path = tuple((folder, os.stat(folder or ".").st_mtime_ns) for folder in sys.path if os.path.isdir(folder or "."))
+    points = _installed(f"gaigs.{kind}", path)
+    return [Holder(p.name, f"distribution {p.dist.name} {p.dist.version}", p.value) for p in points]
 
 
 @functools.lru_cache
@@ -131,15 +141,15 @@ def _with_imports(place: Path) -> set[Path]:
     return found
 
 
-def _scan(kind: str, folder: Path, package: str, root: Path | None = None) -> tuple[list[Holder], list[str]]:
-    """Holders in a folder's files, and the files that cannot be read."""
+def _scan(kind: str | None, folder: Path, package: str, root: Path | None = None) -> tuple[list[Holder], list[str]]:
+    """Holders of a kind, or of all kinds, in a folder's files, and the files that cannot be read."""
     holders, unreadable = [], []
     for module, file in _files(folder, package):
         where = str(file.relative_to(root or PACKAGE.parent))
         try:
             stat = file.stat()
             claims = _claims(file, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size)
-            own = [(name, target) for claimed, name, target in claims if claimed == kind]
+            own = [(name, target) for claimed, name, target in claims if kind in (None, claimed)]
             if file.name == "pyproject.toml":
                 (source,) = sources(folder, file.parent.name)
                 holders += [Holder(name, where, target, root=source) for name, target in own]
