@@ -64,8 +64,8 @@ def found_once():
     """The folders are looked through once, not for each value."""
     find = functools.cache(registry_module.find_holders)
     with pytest.MonkeyPatch.context() as patch, repository():
-        for module in (registry_module, configuration):
-            patch.setattr(module, "find_holders", lambda kind, name=None: find(kind, name))
+        patch.setattr(registry_module, "find_holders", lambda kind, name=None: find(kind, name))
+        patch.setattr(configuration, "plugin_packages", functools.cache(configuration.plugin_packages))
         yield
 
 
