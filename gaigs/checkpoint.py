@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 
 from gaigs.io.files import atomic_write
 from gaigs.processes import lacks_memory
-from gaigs.registry import configuration_of, name_of, registry
+from gaigs.registry import check_type, configuration_of, name_of, registry
 from gaigs.scene import Scene
 
 KEY = "gaigs"
@@ -46,8 +47,9 @@ def write(content: dict, path: Path) -> None:
 
 def read(path: str | Path) -> dict:
     """The content of a checkpoint, tensors and plain Python only; errors as of ``load``."""
+    check_type("path", path, str | Path)
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):  # False for a name that is too long
         raise FileNotFoundError(f"no checkpoint at {path}; a run writes best.ckpt and last.ckpt into its folder")
     data = path.read_bytes()
     try:

@@ -113,7 +113,9 @@ def as_directions(directions: Directions | None, own: Grid | None, task: str) ->
     # Azimuths are periodic: a few turns are accepted, a circle in degrees is more. 1e-4 allows for rounded angles.
     for name, most in (("elevations", math.pi / 2), ("azimuths", 20 * math.pi)):
         expected = f"a list of angles from {-most:.4f} to {most:.4f} rad"
-        angles[name] = values = as_numbers(name, getattr(directions, name), expected)
+        angles[name] = values = as_numbers(name, getattr(directions, name, None), expected)
+        if values.ndim != 1:
+            raise ValueError(f"{name} must be {expected}, got shape {tuple(values.shape)}")
         if len(wrong := values[~(values.abs() <= most + 1e-4)]):
             raise ValueError(f"{name} must be {expected}, got {wrong[0]:g}; Grid.degrees takes degrees")
     if isinstance(directions, Grid):

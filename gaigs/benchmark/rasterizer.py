@@ -52,6 +52,10 @@ class RasterizerBenchmark(Benchmark):
         known = registry("rasterizer").names()
         self.rasterizers = [name for name in known if name != "fastest"] if rasterizers is None else rasterizers
         self.scenes = {"common": common, "training": training}
+        if unknown := {*precisions} - {"float64", "float32", "bfloat16", "float16"}:
+            raise ValueError(f"benchmark.precisions must be among float64, float32, bfloat16, float16, got {', '.join(unknown)}")
+        if min([*common, *training, 1]) < 1 or any(len(grid) != 2 or min(grid) < 1 for grid in grids):
+            raise ValueError("benchmark.common, training and grids must be numbers of at least 1, and grids pairs")
         if repeats < 1:
             raise ValueError(f"benchmark.repeats must be at least 1, got {repeats}")
         self.grids, self.precisions, self.repeats = grids, precisions, repeats

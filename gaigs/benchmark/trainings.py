@@ -41,6 +41,8 @@ class Trainings(Benchmark):
     def __init__(self, trainer: dict, axes: dict[str, dict], factors: Sequence[float] = ()):
         self.trainer, self.axes, self.factors = trainer, axes, factors
         for name, axis in axes.items():
+            if axis.keys() | {"values"} != {"key", "of", "values"}:
+                raise ValueError(f"benchmark.axes.{name} must have key, of and values, got {', '.join(axis)}")
             for part, kind in (("key", str), ("of", list[str]), ("values", list | None)):
                 check_type(f"benchmark.axes.{name}.{part}", axis.get(part), kind)
 

@@ -1,5 +1,6 @@
 """Received signal strength in one table; docs/data.md describes its columns."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,8 @@ def read(
     if fixed not in (None, *ENDS):
         raise ValueError(f"fixed must be tx or rx, or null for the end with fewer places, got {fixed!r}")
     file = tables.find_file(file, "a table of readings")
+    if not math.isfinite(not_heard):
+        raise ValueError(f"not_heard must be a finite number [dBm], got {not_heard!r}; write such a number in the file")
     points, dbm, ignored = _read_table(file, not_heard)
     walls = torch.zeros(0, 2, 3) if layout is None else tables.read_walls(Path(layout).expanduser())
 

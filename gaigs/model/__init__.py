@@ -14,7 +14,7 @@ from gaigs.data import Links
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Directions, ExtrapolationWarning
 from gaigs.query import ROUNDING, Batch, Query, as_directions
-from gaigs.registry import registry
+from gaigs.registry import check_type, registry
 from gaigs.scene import Scene
 
 
@@ -71,20 +71,12 @@ class Model(nn.Module):
     penalty_weights: Mapping[str, float] = {}
     chunk: int | None = None
     revisions: tuple[float, ...] = ()
+    predicts_untrained: bool = False
+    primitives: Gaussians | None = None
 
     def __init__(self, scene: Scene):
         super().__init__()
         self.scene = scene
-
-    @property
-    def predicts_untrained(self) -> bool:
-        """True if ``fit`` alone makes it a predictor, so that the training's start is a candidate."""
-        return False
-
-    @property
-    def primitives(self) -> Gaussians | None:
-        """Gaussians that density control changes and figures draw; None for a model without."""
-        return None
 
     def fit(self, links: Links) -> None:
         """Learns from the training links without gradients; by default nothing.
@@ -188,6 +180,7 @@ class Model(nn.Module):
         self, transmitters, receiver, frequency, batch_size, directions
     ) -> tuple[Iterator[Batch], tuple[int, ...]]:
         """Checked batches for the arguments of ``predict``, on the model's device; and the positions' leading axes."""
+        check_type("batch_size", batch_size, int)
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
         scene = self.scene

@@ -138,8 +138,14 @@ class GaussianSplatting(Model):
             parts = self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
             context["tokenizer_widths"] = parts.scene_width, parts.gaussian_width, parts.transmitter_width
         self.deformation = registry("deformation").build(deformation, **context)
-        self.learning_rates = {**Gaussians.learning_rates, **self.placement.learning_rates, **Model.learning_rates}
-        self.penalty_weights = {"opacity": 0.01, **self.placement.penalty_weights}  # the paper's alpha, as released
+
+    @property
+    def learning_rates(self) -> dict[str, float]:  # type: ignore[override]
+        return {**Gaussians.learning_rates, **self.placement.learning_rates, **Model.learning_rates}
+
+    @property
+    def penalty_weights(self) -> dict[str, float]:  # type: ignore[override]
+        return {"opacity": 0.01, **self.placement.penalty_weights}  # the paper's alpha, as released
 
     @property
     def takes_paths(self) -> bool:
@@ -170,7 +176,7 @@ class GaussianSplatting(Model):
         self.level += (self(batch).value - self.trend(batch).value).mean()
 
     @property
-    def predicts_untrained(self) -> bool:
+    def predicts_untrained(self) -> bool:  # type: ignore[override]
         return self.trend is not None
 
     def forward(self, batch: Batch) -> Prediction:
@@ -216,7 +222,7 @@ class GaussianSplatting(Model):
         return groups | placing | ({"network": network} if network else {})
 
     @property
-    def primitives(self) -> Gaussians | None:
+    def primitives(self) -> Gaussians | None:  # type: ignore[override]
         return self.gaussians
 
     def facts(self) -> dict[str, object]:

@@ -162,7 +162,7 @@ class Kriging(Model):
         return Prediction(value if weight == 1 else trend + weight * (value - trend), {})
 
     @property
-    def primitives(self) -> Gaussians | None:
+    def primitives(self) -> Gaussians | None:  # type: ignore[override]
         return self.trend.primitives
 
     def facts(self) -> dict[str, Any]:

@@ -86,7 +86,7 @@ class MirroredSplatting(GaussianSplatting):
         self.placement.enable_phases(speed_of_light / frequencies.mean().item())
 
     @property
-    def predicts_untrained(self) -> bool:
+    def predicts_untrained(self) -> bool:  # type: ignore[override]
         return super().predicts_untrained or bool(self.placement.is_bare)
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Loss) -> str:

@@ -103,7 +103,10 @@ def rasterize(
         >>> means.grad.shape
         torch.Size([2, 3])
     """
-    n, c = opacities.shape[-1], signal.shape[-1]
+    given = (means, quats, scales, opacities, signal) + (() if attenuations is None else (attenuations,))
+    if not all(isinstance(values, Tensor) and values.ndim for values in given):
+        raise TypeError("means, quats, scales, opacities, signal and attenuations must be torch tensors with axes")
+    n, c = means.shape[-2] if means.ndim > 1 else 0, signal.shape[-1]
     inputs = {
         "means": (means, (n, 3)),
         "quats": (quats, (n, 4)),

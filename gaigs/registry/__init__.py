@@ -63,6 +63,8 @@ class Registry:
     def register(self, name: str) -> Callable:
         """The decorator of ``gaigs.register`` for this kind."""
 
+        check_type(f"the name of a {self.kind}", name, str)
+
         def decorate(component):
             if not callable(component):
                 raise TypeError(f"{self.kind} {name!r} must be a class or a function, got {component!r}")
@@ -244,7 +246,8 @@ def _noting(kind: str, name: str, component: Any) -> Any:
     signature = inspect.signature(make)
     itself, *_ = signature.parameters
     names = {parameter.kind: key for key, parameter in signature.parameters.items()}
-    given = {itself, names.get(inspect.Parameter.VAR_POSITIONAL), *GIVEN.get(kind, ())}
+    several = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+    given = {itself, *map(names.get, several), *GIVEN.get(kind, ())}
 
     @functools.wraps(make)
     def noting(self, *args, **kwargs) -> None:
@@ -252,8 +255,8 @@ def _noting(kind: str, name: str, component: Any) -> Any:
         if type(self) is component:  # a subclass has a name of its own, or none
             bound = signature.bind(self, *args, **kwargs)
             bound.apply_defaults()
-            options = {key: value for key, value in bound.arguments.items() if key not in given}
-            options |= options.pop(names.get(inspect.Parameter.VAR_KEYWORD), {})
+            options = bound.arguments | bound.arguments.get(names.get(inspect.Parameter.VAR_KEYWORD), {})
+            options = {key: value for key, value in options.items() if key not in given}
             with contextlib.suppress(AttributeError):  # e.g. of a tuple
                 object.__setattr__(self, "configuration", {**options, "name": name})
 

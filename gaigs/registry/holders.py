@@ -207,4 +207,5 @@ def is_plain(value: object) -> bool:
         return all(isinstance(key, str) and is_plain(entry) for key, entry in value.items())
     if isinstance(value, list | tuple):
         return all(map(is_plain, value))
-    return value is None or isinstance(value, bool | int | float) or (isinstance(value, str) and "${" not in value)
+    # A subclass, such as numpy's float64 or a text of an Enum, is no configuration's value.
+    return value is None or type(value) in (bool, int, float) or (type(value) is str and "${" not in value)

@@ -53,13 +53,21 @@ def by_seed(runs: Sequence[Run]) -> list[list[Run]]:
     return [*groups.values()]
 
 
+COSTS = "train_seconds", "inference_ms", "render_ms", "num_gaussians", "num_parameters", "checkpoint_bytes"
+
+
 def read_metrics(file: Path) -> dict:
     """Contents of a run's ``metrics.json``; a ValueError for a damaged file or a task that is not installed."""
     try:
         metrics = json.loads(file.read_text())
         first, *_ = task_class(metrics["task"]).metrics()
-        for scores in metrics["models"].values():
-            check_type(repr(first), scores[first], float)
+        for key, kind in ({"split": str, "seed": int, "device": str} | dict.fromkeys(COSTS, float | None)).items():
+            check_type(repr(key), metrics.get(key), kind)
+        for models in (metrics["models"], metrics.get("validation") or {}, *(metrics.get("receivers") or {}).values()):
+            for scores in models.values():
+                check_type(repr(first), scores[first], float)
+        if not metrics["models"]:
+            raise ValueError("no model")
     except (AttributeError, KeyError, TypeError, ValueError) as error:  # JSON and encodings raise a ValueError
         raise ValueError(
             f"cannot read {file} ({type(error).__name__}: {error})\n"

@@ -164,7 +164,10 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
         callbacks.append(ProgressLine())
     loggers: list[Logger] = [CSVLogger(folder, "log")]
     if config["tensorboard"]:
-        loggers.append(TensorBoardLogger(folder, "tensorboard"))
+        try:
+            loggers.append(TensorBoardLogger(folder, "tensorboard"))
+        except ModuleNotFoundError as error:
+            raise ImportError("tensorboard=true needs TensorBoard: pip install 'gaigs[tensorboard]'") from error
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
     for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -211,8 +214,11 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
 
 def resumable(last: Path, best: Path) -> dict:
     """The checkpoint to resume from; a ValueError if it or the best one is damaged."""
+    needed = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "epoch", "global_step", "split", "links")
     try:
         content = checkpoint.read(last)
+        if lacking := [key for key in needed if key not in content | content[checkpoint.KEY]]:
+            raise ValueError(f"{last} lacks {', '.join(lacking)} of a training")
         if best.is_file():
             checkpoint.read(best)
     except ValueError as error:

@@ -105,7 +105,7 @@ def test_a_full_disk_and_a_lack_of_memory_end_it(tmp_path, fake, error):
 @pytest.mark.parametrize(
     ("axis", "error", "message"),
     [
-        ({"key": "seed"}, TypeError, "benchmark.axes.a.of must be a list, got None"),
+        ({"key": "seed"}, ValueError, "benchmark.axes.a must have key, of and values, got key"),
         ({"key": "seed", "of": [], "values": 3}, TypeError, "benchmark.axes.a.values must be"),
         ({"key": "tokenizer", "of": []}, ValueError, "benchmark.axes.a needs values"),
         ({"key": "seed", "of": ["modl=gaigs"]}, ValueError, "~benchmark.axes.a leaves it out"),
