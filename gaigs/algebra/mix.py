@@ -8,9 +8,7 @@ from torch.autograd.function import once_differentiable
 class Mix(torch.autograd.Function):
     """Mixes components and channels of multivectors, and scalars.
 
-    The tensors are so small that autograd's own calls would take most of a training step. One matrix for each
-    component, (k, tokens, channels), is three times as fast on a CPU as one over channels and components, nine tenths
-    zeros. The result has that order in memory, so only the first layer copies.
+    The tensors are small: autograd's own calls would take most of a training step.
 
     Args:
         multivectors: (*tokens, c, k).

@@ -52,8 +52,9 @@ class RasterizerBenchmark(Benchmark):
         known = registry("rasterizer").names()
         self.rasterizers = [name for name in known if name != "fastest"] if rasterizers is None else rasterizers
         self.scenes = {"common": common, "training": training}
-        if unknown := {*precisions} - {"float64", "float32", "bfloat16", "float16"}:
-            raise ValueError(f"benchmark.precisions must be among float64, float32, bfloat16, float16, got {', '.join(unknown)}")
+        allowed = "float64", "float32", "bfloat16", "float16"
+        if unknown := {*precisions} - {*allowed}:
+            raise ValueError(f"benchmark.precisions must be among {', '.join(allowed)}, got {', '.join(unknown)}")
         if min([*common, *training, 1]) < 1 or any(len(grid) != 2 or min(grid) < 1 for grid in grids):
             raise ValueError("benchmark.common, training and grids must be numbers of at least 1, and grids pairs")
         if repeats < 1:

@@ -53,15 +53,12 @@ def by_seed(runs: Sequence[Run]) -> list[list[Run]]:
     return [*groups.values()]
 
 
-COSTS = "train_seconds", "inference_ms", "render_ms", "num_gaussians", "num_parameters", "checkpoint_bytes"
-
-
 def read_metrics(file: Path) -> dict:
     """Contents of a run's ``metrics.json``; a ValueError for a damaged file or a task that is not installed."""
     try:
         metrics = json.loads(file.read_text())
         first, *_ = task_class(metrics["task"]).metrics()
-        for key, kind in ({"split": str, "seed": int, "device": str} | dict.fromkeys(COSTS, float | None)).items():
+        for key, kind in (("split", str), ("seed", int), ("device", str), ("train_seconds", float | None)):
             check_type(repr(key), metrics.get(key), kind)
         for models in (metrics["models"], metrics.get("validation") or {}, *(metrics.get("receivers") or {}).values()):
             for scores in models.values():

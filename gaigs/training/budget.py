@@ -15,14 +15,12 @@ ENDLESS = 2**40
 class Budget(Callback):
     """Measures a training's time, ends it when its time is up, and has it validate by time.
 
-    The clock of the first process decides for all, after each step. It runs during validations, and a
-    resumed training starts with the time spent before. This callback is the first, and the trainer has no
-    ``max_time``. In Lightning's own validation by time each process follows its own clock.
+    The clock of the first process decides for all, after each step. It runs during validations, and a resumed training
+    starts with the time spent before. Lightning's own ``max_time`` gives each process its own clock.
 
     Args:
         max_time: Of the training [s]; None if steps alone end it.
-        every: Time from the end of a validation to the next [s], or more, so that slow validations take a fifth of the
-            training at the most; None if steps say when to validate.
+        every: Least time between validations [s], which take at most a fifth of the training; None: by steps.
 
     Attributes:
         share: Share of ``max_time`` spent, the same in all processes; 0 without it.

@@ -10,9 +10,8 @@ from gaigs.training import seeded
 class DensityControl(Callback):
     """Prunes, clones and splits Gaussians on a schedule.
 
-    Where the loss still pulls at converged Gaussians there are too few. The pull at a Gaussian is its mean positional
-    gradient since the last round times its distance to the receivers' middle: a gradient per radian seen from there.
-    Of those pulled harder than ``gradient``, wide ones split and narrow ones are cloned. Frozen positions end it.
+    The pull at a Gaussian is its mean positional gradient since the last round times its distance to the receivers'
+    middle. Of those pulled harder than ``gradient``, wide ones split and narrow ones are cloned.
 
     Args:
         every: Steps between two rounds.

@@ -27,12 +27,10 @@ class Descent(lightning.LightningModule):
         seed: Of the training's random numbers.
         batch_size: Places a step.
         thinning: Options of the task's thinning: the part of each label in a step.
-        jitter: Standard deviation by which each place is moved along each axis, anew in every step [m]: places are not
-            known to the centimetre, and readings fade within a wavelength.
+        jitter: Standard deviation of each place's random shift along each axis in every step [m].
         penalties: Weights of penalties by name, in place of ``Model.penalty_weights``.
         learning_rates: At the start, by parameter group, in place of ``Model.learning_rates``.
-        optimizer: As ``gaigs.training.schedule.make_optimizer`` takes it.
-        schedule: As ``gaigs.training.schedule.make_schedule`` takes it.
+        optimizer, schedule: As ``gaigs.training.schedule`` takes them.
         patience: Validations without a better score until the training stops; None: it goes on to the last step.
         density: Options of ``gaigs.training.density_control.DensityControl``; None: a fixed number of Gaussians.
 

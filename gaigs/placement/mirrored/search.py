@@ -22,18 +22,10 @@ Loss = Callable[[Batch], float]
 
 
 def find_planes(model, train: Batch, validation: Batch | None, loss: Loss) -> str:
-    """Adds one plane after the other, each where it lowers the loss most, as long as the loss falls.
+    """Adds one plane after the other, where its reflection lowers the loss most, as long as it lowers the loss.
 
-    Where powers add, so do lags: those of one more reflection are added to the model's own, for hundreds of planes at a
-    time.
-
-    Args:
-        model: ``gaigs.model.mirrored.MirroredSplatting``.
-        train, validation: Links to look at.
-        loss: As of ``Model.revise``.
-
-    Returns:
-        A sentence for the log.
+    If powers add, so do lags: those of one more reflection are added to the model's, for hundreds of planes at a time.
+    The result is a sentence for the log.
     """
     placement = model.placement
     batches = [batch for batch in (train, validation) if batch is not None]
@@ -65,11 +57,7 @@ def thinned(batch: Batch, rows: int = 12) -> Batch:
 
 
 def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
-    """The plane whose reflections lower the mean absolute error most.
-
-    First ``slants`` normals over the sphere, the axes, the present normals and those at right angles to them, each with
-    ``pitches`` offsets across the room; then three times random planes about the best one, each time nearer.
-    """
+    """The plane whose reflections lower the mean absolute error most: of a grid, then of planes about the best."""
     slants, pitches, closer, rounds = 24, 24, 96, 3
     placement = model.placement
     lower, upper = (corner.to(placement.origin) for corner in placement.box)
@@ -165,24 +153,14 @@ def _with_one_more(model, batch: Batch, lags, own, receiver: int, normals, offse
 def move_planes(placement: Mirrored, batch: Batch, wavelength: float, least: float, loss: Loss) -> list[float]:
     """Moves each used plane along its normal to the least loss, the strongest plane first.
 
-    Args:
-        batch: Links to look at.
-        wavelength: Of the carrier [m].
-        least: Least distance searched on either side [m].
-        loss: As of ``Model.revise``.
-
-    Returns:
-        The moves [m].
+    ``least`` is the least distance searched on either side [m]. The result are the moves [m].
     """
     some, reach = thinned(batch), max(4.0 * wavelength, least)
     return [_move(placement, plane, reach, wavelength, some, loss) for plane in by_strength(placement, batch)]
 
 
 def choose_bandwidth(placement: Mirrored, wavelength: float, batch: Batch, loss: Loss) -> None:
-    """Takes the bandwidth with which moving the two strongest planes lowers the loss most.
-
-    Plane offsets and bandwidth depend on each other, so both are tried together.
-    """
+    """Takes the bandwidth with which moving the two strongest planes lowers the loss most."""
     used = by_strength(placement, batch)
     origin, losses = placement.origin.clone(), {}
     # From a carrier, where all paths interfere, to a band in which hardly two do.
