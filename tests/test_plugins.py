@@ -10,8 +10,6 @@ from zipfile import ZipFile
 import pytest
 from hatchling.builders.wheel import WheelBuilder
 
-import gaigs
-
 ROOT = Path(__file__).parents[1]
 
 
@@ -167,11 +165,3 @@ print(json.dumps([str(conf_dir()), registry("projection").names()]))
     conf, projections = place.python(script, gaigs=unpacked)
     assert Path(conf) == unpacked / "gaigs" / "conf"
     assert "mercator" in projections
-
-
-def test_a_plugin_that_cannot_be_imported_is_named_when_it_is_composed(tmp_path, monkeypatch):
-    (tmp_path / "plugins").mkdir()
-    (tmp_path / "plugins/broken.py").write_text("import nothing\n@register('model', 'broken')\nclass Broken: ...\n")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=r"model 'broken' of plugins.broken\.py cannot be loaded: ModuleNotFoundError"):
-        gaigs.compose(model="broken")

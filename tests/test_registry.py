@@ -11,6 +11,7 @@ import torch
 from lightning import Trainer
 from torch.optim.lr_scheduler import StepLR
 
+from gaigs.configuration import compose
 from gaigs.registry import KINDS, Registry, call, configuration_of, register, registries, registry
 
 
@@ -392,3 +393,9 @@ def test_an_entry_point_names_an_attribute_or_a_module_that_registers(plugins, t
     plugins("cavity/cavity/box.py", "class Box:\n    @staticmethod\n    def open(value=1):\n        return Box()\n")
     plugins("cavity/cavity/horn.py", component("model", "opened"))
     assert type(registry("model").build({"name": "opened"})).__module__ == f"cavity.{file.removesuffix('.py')}"
+
+
+def test_a_plugin_that_cannot_be_imported_is_named_when_it_is_composed(plugins):
+    plugins("broken.py", "import nothing\n@register('model', 'broken')\nclass Broken: ...\n")
+    with pytest.raises(ValueError, match=r"model 'broken' of plugins.broken\.py cannot be loaded: ModuleNotFoundError"):
+        compose(model="broken")

@@ -24,7 +24,7 @@ class Gsrf(Model):
     S(u) = sum_i psi_i alpha_i(u) prod_{j<i} (1 - alpha_j(u)) exp(j phi_j w_j(u)), front to back by distance to the
     receiver; ``gaigs_gsrf.rendering`` has the footprint w and alpha, ``gaigs_gsrf.gaussians`` the radiance psi.
 
-    The Gaussians on a ray do not depend on the transmitter, and is computed once a receiver.
+    The Gaussians on a ray do not depend on the transmitter; they are computed once for each receiver.
 
     Args:
         scene: Receivers and task.
