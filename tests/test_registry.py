@@ -38,6 +38,8 @@ def plugins(tmp_path, monkeypatch):
     """Writes files below ./plugins of an empty working directory; imports from there are undone."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
+    for module in [name for name in sys.modules if name.split(".")[0] == "plugins"]:  # of other tests
+        monkeypatch.delitem(sys.modules, module)
 
     def write(path, text):
         file = tmp_path / "plugins" / path
