@@ -67,6 +67,11 @@ class Array:
         return len(self.elements)
 
     @functools.cached_property
+    def is_point(self) -> bool:
+        """True for one isotropic element in the middle, which hears alike in any orientation."""
+        return len(self) == 1 and self.pattern == "isotropic" and not self.elements.any()
+
+    @functools.cached_property
     def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
         """The distinct vectors between elements [m], the index of each pair's vector, and the pairs of each; float64.
 

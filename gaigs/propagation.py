@@ -1,4 +1,4 @@
-"""Free space, reflection, the beamformer of an array, and gains and phases of measured channels."""
+"""Free space, reflection, the beamformer of an array, and gains of measured channels."""
 
 import math
 
@@ -13,9 +13,6 @@ from gaigs.query import check_carrier
 
 NEAREST = 1e-2
 """Smallest distance of a spherical wave [m]; smaller ones count as this."""
-
-TELLING = 5
-"""Fewest links of a receiver that show a sign of the phases; with fewer, chance decides."""
 
 
 def free_space(
@@ -105,6 +102,22 @@ def fresnel(
     return te, tm
 
 
+def slab(
+    permittivity: complex | Complex[Tensor, "*#batch"],
+    cosines: Float[Tensor, "*#batch"],
+    thickness: float | Float[Tensor, "*#batch"],
+) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
+    """Reflection coefficients TE and TM of a slab in air, as ``fresnel``; a thick slab with losses is a half-space.
+
+    ``thickness`` is in wavelengths of air.
+
+    Source: ITU-R P.2040-3, section 2.2.2.2.
+    """
+    turns = torch.exp(-4j * math.pi * thickness * torch.sqrt(permittivity - (1 - cosines.square())))
+    te, tm = fresnel(permittivity, cosines)
+    return te * (1 - turns) / (1 - te.square() * turns), tm * (1 - turns) / (1 - tm.square() * turns)
+
+
 def fit_gain(channels: Complex[Tensor, " k *shape"], waves: Complex[Tensor, " k *shape"]) -> Complex[Tensor, ""]:
     """The complex gain of measured channels h over waves w predicted at a gain of 1; complex128.
 
@@ -130,46 +143,3 @@ def strength(
     gains = [fit_gain(channels[own], waves[own]).abs() for own in (receivers == k for k in receivers.unique())]
     heard = [gain.log() for gain in gains if gain > 0]
     return torch.stack(heard).mean().exp().item() if heard else 1.0
-
-
-def phase_sign(
-    channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, " k"]
-) -> int:
-    """The sign with which the phases of channels follow the direct distance: -1 or 1; 0 for neither.
-
-    Divided by free space, a direct path alone is the same number at all links of a receiver. For each sign, the mean
-    over links keeps a share of the power, by chance about 1 / links. The larger share wins if it exceeds 0.01 plus four
-    times that of chance: never with fewer than ``TELLING`` links a receiver. ``waves`` are ``direct_waves`` of the same
-    links with the sign -1.
-    """
-    relative, phases = _normalised(channels / waves.abs()), waves.angle()
-    kept = {-1: 0.0, 1: 0.0}
-    for receiver in receivers.unique().tolist():
-        own = receivers == receiver
-        for sign in kept:
-            still = relative[own] * torch.polar(torch.ones_like(phases[own]), sign * phases[own])
-            kept[sign] += int(own.sum()) * still.mean(0).abs().square().mean().item()
-    total = relative.abs().square().mean().item() * len(receivers)
-    best = max(kept, key=kept.__getitem__)
-    chance = len(receivers.unique()) / len(receivers)
-    return best if kept[best] > (0.01 + 4 * chance) * total else 0
-
-
-def array_sign(channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"]) -> int:
-    """The sign with which phases follow the direct distance from one element or subcarrier of a link to another.
-
-    It shows even where each link has a random phase in common. The sign, -1 or 1, keeps more power in the mean over
-    elements and subcarriers; -1 where neither does. Arguments are as for ``phase_sign``.
-    """
-    relative, phases = _normalised(channels / waves.abs()), waves.angle()
-    kept = [
-        (relative * torch.polar(torch.ones_like(phases), sign * phases)).mean((1, 2)).abs().square().sum()
-        for sign in (-1, 1)
-    ]
-    return 1 if kept[1] > kept[0] else -1
-
-
-def _normalised(channels: Complex[Tensor, "k e s"]) -> Complex[Tensor, "k e s"]:
-    """Channels of a mean power of 1 each; channels of 0 stay 0."""
-    powers = channels.abs().square().mean((1, 2), keepdim=True)
-    return channels / torch.where(powers > 0, powers, 1).sqrt()

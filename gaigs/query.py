@@ -98,6 +98,18 @@ def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, 
     return frequencies
 
 
+def as_subcarriers(values: object) -> Float[Tensor, " s"]:
+    """Subcarriers that a user asks for [Hz], one or several, in float64; raises a ``ValueError`` for anything else."""
+    expected = "different subcarriers (s,) in Hz"
+    as_numbers("frequencies", values, expected)
+    exact = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, dtype=float))
+    subcarriers = exact.double().reshape(-1) if exact.ndim < 2 else exact
+    if subcarriers.ndim != 1 or not len(subcarriers) or len(subcarriers.unique()) < len(subcarriers):
+        raise ValueError(f"frequencies must be {expected}, got shape {tuple(exact.shape)}: {reprlib.repr(values)}")
+    check_carrier("frequencies", subcarriers)
+    return subcarriers
+
+
 def as_directions(directions: Directions | None, own: Grid | None, task: str) -> Directions | None:
     """Directions that a user asks for, in float32, or for None the label's own of a task.
 

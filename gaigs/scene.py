@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from gaigs.antenna import Array, Receiver
 from gaigs.geometry import Pose
@@ -106,8 +107,10 @@ def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
     return scene.frequencies.to(query.transmitters).expand(len(query))
 
 
-def check_elements(owner: str, scene: Scene) -> Csi:
+def check_elements(owner: str, scene: Scene, pads: bool = False) -> Csi:
     """The task of channels with as many elements as each receiver's array; ``owner`` names a component in errors.
+
+    A component that ``pads`` takes smaller arrays too: it predicts 0 at the elements that they lack.
 
     Raises:
         ValueError: Labels are not channels, or an array has another number of elements.
@@ -115,8 +118,9 @@ def check_elements(owner: str, scene: Scene) -> Csi:
     task = scene.task
     if not isinstance(task, Csi):
         raise ValueError(f"{owner} gives complex channels, not labels of task {task.name!r}; take another")
-    for receiver in scene.receivers:
-        if len(receiver.array) != task.shape[0]:
+    largest = max(scene.receivers, key=lambda receiver: len(receiver.array))
+    for receiver in [largest] if pads else scene.receivers:
+        if len(receiver.array) != task.elements:
             own = f"the array of {receiver.name} {len(receiver.array)}"
             raise ValueError(f"the labels have {task.elements} elements, and {own}; give the data's elements")
     return task
@@ -127,16 +131,18 @@ def direct_waves(
 ) -> Complex[Tensor, "b e s"]:
     """Free space from each transmitter to the elements of its receiver, or to its middle alone (e = 1).
 
-    Arrays have the same number of elements. The sign is that of the phases, as for ``free_space``.
+    It is 0 at elements that other receivers' arrays have alone. The sign is that of the phases, as for ``free_space``.
     """
     # In float64: some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz 1e-4 rad.
-    places = []
+    own = []
     for receiver in scene.receivers:
         pose, elements = receiver.pose.to(torch.zeros((), dtype=torch.float64)), receiver.array.elements.double().cpu()
-        places.append(pose.world(elements) if at_elements else pose.position[None])
-    places = torch.stack(places).to(query.transmitters.device)[query.receivers]
+        own.append(pose.world(elements) if at_elements else pose.position[None])
+    counts = torch.tensor([*map(len, own)], device=query.transmitters.device)[query.receivers]
+    places = pad_sequence(own, batch_first=True).to(counts.device)[query.receivers]
     distances = (query.transmitters.double()[:, None] - places).norm(dim=-1)
-    return free_space(distances[..., None], frequencies.to(distances.device), sign)
+    waves = free_space(distances[..., None], frequencies.to(distances.device), sign)
+    return waves * (torch.arange(places.shape[1], device=counts.device) < counts[:, None])[..., None]
 
 
 def direct_gains(scene: Scene, query: Query) -> Float[Tensor, " b"]:

@@ -11,7 +11,8 @@ from scipy.constants import speed_of_light
 
 from gaigs.antenna import Array, Receiver
 from gaigs.geometry import Pose
-from gaigs.propagation import array_sign, free_space, fresnel, phase_sign
+from gaigs.phases import array_sign, phase_sign
+from gaigs.propagation import free_space, fresnel, slab
 from gaigs.query import Query
 from gaigs.scene import carriers, check_elements, direct_gains, direct_waves
 from gaigs.testing import example_links
@@ -113,6 +114,39 @@ def test_each_surface_may_have_its_own_permittivity_and_learns_it():
         for whole, alone in zip(together, fresnel(surface, cosines[:, 0]), strict=True):
             torch.testing.assert_close(whole[:, i], alone)
     torch.autograd.gradcheck(fresnel, (permittivities[[0, 1]], cosines))
+
+
+@pytest.mark.parametrize("surface", ["glass", "wet_brick", "foam"])
+def test_a_slab_adds_its_inner_reflections(surface):
+    cosines, thickness = np.linspace(0.05, 1, 12), 0.43
+    root = np.sqrt(SURFACES[surface] - 1 + cosines**2)
+    there_and_back = np.exp(-4j * np.pi * thickness * root)
+    found = slab(SURFACES[surface], torch.from_numpy(cosines), thickness)
+    for reflected, one in zip(found, fresnel(SURFACES[surface], torch.from_numpy(cosines)), strict=True):
+        r = one.numpy()
+        inner = sum((1 - r**2) * -r * there_and_back * (r**2 * there_and_back) ** k for k in range(400))
+        np.testing.assert_allclose(reflected.numpy(), r + inner, rtol=0, atol=1e-9)
+        assert (reflected.abs() <= 1).all(), "no slab gains power"
+
+
+def test_a_thick_slab_is_a_half_space_and_none_reflects_nothing():
+    cosines = torch.linspace(0.05, 1, 7).double()
+    for surface in ("wet_brick", "metal"):
+        for found, expected in zip(
+            slab(SURFACES[surface], cosines, 30.0), fresnel(SURFACES[surface], cosines), strict=True
+        ):
+            torch.testing.assert_close(found, expected)
+    assert not any(part.any() for part in slab(SURFACES["glass"], cosines, 0.0))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_thin_slabs_and_grazing_waves_have_finite_gradients(dtype):
+    cosines = torch.tensor([0.0, 1e-4, 1.0], dtype=dtype).requires_grad_()
+    thickness = torch.tensor([[1e-6], [1e-3], [0.5], [1e3]], dtype=dtype).requires_grad_()
+    permittivity = torch.tensor(4 - 0.3j, dtype=dtype.to_complex()).requires_grad_()
+    sum(part.abs().square().sum() for part in slab(permittivity, cosines, thickness)).backward()
+    for part in (cosines, thickness, permittivity):
+        assert part.grad.isfinite().all()
 
 
 def test_the_carrier_of_a_link_is_its_own_or_the_datas_only_one():

@@ -161,7 +161,7 @@ def results(metrics: Mapping, folder: Path) -> dict:
     if metrics.get("kriging") and curve and validation is not None:
         curve.append((train_seconds(metrics) or 0.0, validation))
     found = {key: metrics[key] for key in ("task", "split", "seed", *COSTS)} | {"train_seconds": train_seconds(metrics)}
-    found |= {"validation": validation, "test": test[score.mean], "compared": test[score.first]}
+    found |= {"validation": validation, "test": test[score.mean], "compared": test.get(score.first)}
     found["steps"] = points[-1][0] + 1 if points else None
     return found | {"curve": " ".join(f"{time:.1f}:{value:.5g}" for time, value in curve)}
 

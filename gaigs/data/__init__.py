@@ -1,7 +1,9 @@
 """Measured and simulated links, each from one transmitter position to one receiver, with their labels."""
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,10 +13,14 @@ from torch import Tensor
 
 from gaigs.antenna import Receiver
 from gaigs.io.images import GreyImages
+from gaigs.phases import unknown_phase
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
-from gaigs.scene import Scene
+from gaigs.scene import Scene, direct_waves
 from gaigs.task import Task
+from gaigs.task.csi import Csi
+
+log = logging.getLogger(__name__)
 
 Parts = tuple[Int[Tensor, " train"], Int[Tensor, " test"]]
 """Training and test links, ascending."""
@@ -49,6 +55,7 @@ class Links:
         split: Train, validation and test links; None until a split is chosen, see ``load``.
         bandwidth: Band around each carrier that a label's power is averaged over, 0 for a carrier alone [Hz]; None if
             unknown.
+        held_out: The same links at subcarriers that are held out, with the labels of the test; None if there are none.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
         remarks: Counts of links read and left out, with the reason.
         origin: Configurations of ``data`` and ``split``; empty for arrays in memory.
@@ -70,6 +77,7 @@ class Links:
     official: Callable[[], Parts] | None = None
     split: Split | None = None
     bandwidth: float | None = None
+    held_out: "Links | None" = None
     edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
     remarks: str = ""
     origin: Mapping = field(default_factory=dict)
@@ -124,4 +132,35 @@ def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
         found = f"the labels of data {data['name']!r} are of task {links.task.name!r}"
         raise ValueError(f"{found}, and the configuration is for {task!r}; add task={links.task.name}")
     origin = {"data": dict(data), "split": dict(split)}
-    return replace(links, split=registry("split").build(split, links=links), origin=origin)
+    return replace(divide(links, split), origin=origin)
+
+
+def divide(links: Links, split: Mapping) -> Links:
+    """Links with their split, by its configuration; a remark says where the phase of channels is unknown.
+
+    Raises:
+        ValueError: An option of the split has a defect.
+    """
+    parts = registry("split").build(split, links=links)
+    if links.held_out is not None:
+        tasks: Any = links.task, links.held_out.task
+        bands = [task.frequencies / 1e9 for task in tasks]
+        at = [f"at {band.min():.7g} .. {band.max():.7g} GHz" for band in bands]
+        parts = replace(parts, name=f"{parts.name}, trained {at[0]}, tested {at[1]}")
+    links = replace(links, split=parts)
+    task = links.task
+    if not isinstance(task, Csi):
+        return links
+    train = links.split.train[:: max(1, len(links.split.train) // 256)]
+    remark = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}.get(task.phase, "")
+    remark += " of each link unknown, and removed in every score"
+    if task.phase == "known":
+        query = links.query[train]
+        everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
+        waves = direct_waves(everywhere, query, task.frequencies)
+        phase = unknown_phase(links.labels[train], waves, query.receivers, task.frequencies)
+        if phase is None:
+            return links
+        remark = f"channels have no phase in common, as if each packet had its own; set data.phase={phase}"
+        log.warning(remark)
+    return replace(links, remarks="; ".join(filter(None, (links.remarks, remark))))

@@ -1,7 +1,6 @@
 """Links of a registered reader, or of arrays in memory."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +8,7 @@ import torch
 
 from gaigs import configuration
 from gaigs.antenna import Receiver
-from gaigs.data import Links, load
+from gaigs.data import Links, divide, load
 from gaigs.data.readings import gateway
 from gaigs.io.tables import number_places
 from gaigs.query import Query, as_numbers, as_positions, check_carrier
@@ -129,4 +128,4 @@ def from_arrays(
         rows=number_places(places.tolist())[1][rows][heard],
         remarks=f"{int((~heard).sum())} links were not heard and are left out" if not heard.all() else "",
     )
-    return replace(made, split=registry("split").build(config, links=made))
+    return divide(made, config)

@@ -82,12 +82,19 @@ def simulate_spectra(
 
 
 def simulate_channels(
-    room: SimulatedRoom, transmitters: int, frequency: float, bandwidth: float, subcarriers: int, seed: int
+    room: SimulatedRoom,
+    transmitters: int,
+    frequency: float,
+    bandwidth: float,
+    subcarriers: int,
+    seed: int,
+    phase: str = "known",
 ) -> Links:
     """Channels of transmitters at random places; ``gaigs.data.synthetic_csi`` describes the options.
 
     A channel's squared magnitude is the power that an element receives of unit power sent, between antennas of unit
-    gain. Its time dependence is exp(+j omega t). There is no noise.
+    gain. Its time dependence is exp(+j omega t). There is no noise. Unless ``phase`` is known, each link has a random
+    phase; with ``per_link_and_delay`` also a delay of at most two over the bandwidth, and a gain of -6 to 6 dB.
     """
     if not 0 < bandwidth < math.inf:
         raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
@@ -97,12 +104,20 @@ def simulate_channels(
     offsets = torch.linspace(-edge, edge, subcarriers, dtype=torch.float64)
     places = room.place(transmitters, seed)
     receiver = patch_array(room.pose, frequency)
-    rows = torch.arange(transmitters)
+    rows, task = torch.arange(transmitters), Csi(len(receiver.array), frequency + offsets, phase)
+    labels = torch.cat([*room.respond(places, receiver, frequency, offsets)])
+    if phase != "known":
+        generator = torch.Generator().manual_seed(hash((seed, 2)) % 2**63)  # the places use ``seed`` itself
+        angles, delays, gains = 2 * torch.rand(3, transmitters, 1, 1, generator=generator, dtype=torch.float64) - 1
+        angles = math.pi * angles
+        if phase == "per_link_and_delay":
+            angles, labels = angles + 4 * math.pi / bandwidth * delays * offsets, 10 ** (0.3 * gains) * labels
+        labels = labels * torch.polar(torch.ones_like(angles), angles)
     return Links(
         query=Query(places, torch.zeros_like(rows), torch.full((transmitters,), float(frequency))),
         receivers=(receiver,),
-        labels=torch.cat([*room.respond(places, receiver, frequency, offsets)]).to(torch.complex64),
-        task=Csi(len(receiver.array), frequency + offsets),
+        labels=labels.to(torch.complex64),
+        task=task,
         rows=rows,
         official=partial(last_fifth, transmitters, rows),
         edges=room.edges,

@@ -1,6 +1,9 @@
 """Complex channels of the ray tracer's rooms, as a wideband receiver with an antenna array estimates them."""
 
+from collections.abc import Sequence
+
 from gaigs.data import Links
+from gaigs.data.bands import hold_out_band
 from gaigs.data.simulation import simulate_channels
 from gaigs.data.sionna import find_room
 from gaigs.registry import register
@@ -14,9 +17,13 @@ def traced_room_csi(
     bandwidth: float = 499.2e6,
     subcarriers: int = 26,
     seed: int = 0,
+    phase: str = "known",
+    band_train: Sequence[float] | None = None,
+    band_test: Sequence[float] | None = None,
 ) -> Links:
     """Channels of transmitters at random places in a room, at each element of its 4 x 4 array.
 
     Rooms, places, array and errors are those of ``sionna``, channels and other options those of ``synthetic_csi``.
     """
-    return simulate_channels(find_room(room), transmitters, frequency, bandwidth, subcarriers, seed)
+    links = simulate_channels(find_room(room), transmitters, frequency, bandwidth, subcarriers, seed, phase)
+    return hold_out_band(links, band_train, band_test)

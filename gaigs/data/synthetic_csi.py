@@ -1,6 +1,9 @@
 """Complex channels of the built-in room, as a wideband receiver with an antenna array estimates them."""
 
+from collections.abc import Sequence
+
 from gaigs.data import Links
+from gaigs.data.bands import hold_out_band
 from gaigs.data.simulation import simulate_channels
 from gaigs.data.synthetic import default_room
 from gaigs.registry import register
@@ -14,6 +17,9 @@ def furnished_room_csi(
     subcarriers: int = 26,
     order: int = 2,
     seed: int = 0,
+    phase: str = "known",
+    band_train: Sequence[float] | None = None,
+    band_test: Sequence[float] | None = None,
 ) -> Links:
     """Channels of transmitters at random places in the default room, at each element of its 4 x 4 array.
 
@@ -23,8 +29,11 @@ def furnished_room_csi(
     Args:
         bandwidth: From the lowest subcarrier to the highest, about the carrier [Hz].
         subcarriers: Evenly over the band; a single one is the carrier.
+        phase: Of ``gaigs.task.csi.Csi``; other than ``known``, links get random phases.
+        band_train, band_test: Subcarriers to train and to test on, as for ``gaigs.data.bands.hold_out_band`` [Hz].
 
     Raises:
         ValueError: An option is out of range.
     """
-    return simulate_channels(default_room(order), transmitters, frequency, bandwidth, subcarriers, seed)
+    links = simulate_channels(default_room(order), transmitters, frequency, bandwidth, subcarriers, seed, phase)
+    return hold_out_band(links, band_train, band_test)

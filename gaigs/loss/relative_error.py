@@ -11,7 +11,7 @@ from gaigs.task import Task
 
 @register("loss", "relative_error")
 class RelativeError:
-    """The mean over the links of r = |h - h'|² / |h|².
+    """The mean over the links of r = |h - h'|² / |h|², with labels aligned by ``Task.align``.
 
     A link in deep shadow outweighs all others: predictions near zero minimise this mean over a room.
     ``log_relative_error`` does not have that fault.
@@ -24,11 +24,12 @@ class RelativeError:
     def __init__(self, task: Task):
         if not task.dtype.is_complex:
             raise ValueError(f"labels of task {task.name!r} are real, not complex channels; set loss=squared")
+        self.task = task
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, which is its only term."""
         # Scaled by the strongest entry, so that squares of weak channels do not underflow; denormals have no inverse.
-        labels = batch.labels.flatten(1)
+        labels = self.task.align(batch.labels, values).flatten(1)
         largest = labels.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
         errors, powers = ((part / largest).abs().square().sum(1) for part in (values.flatten(1) - labels, labels))
         loss = self.mean(errors / powers)

@@ -1,5 +1,6 @@
 """Models predict a task's value from transmitter, receiver, carrier and, for spectra, directions."""
 
+import copy
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -7,15 +8,17 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from gaigs import checkpoint
 from gaigs.data import Links
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Directions, ExtrapolationWarning
-from gaigs.query import ROUNDING, Batch, Query, as_directions
+from gaigs.query import ROUNDING, Batch, Query, as_directions, as_subcarriers
 from gaigs.registry import check_type, registry
 from gaigs.scene import Scene
+from gaigs.task.csi import Csi
 
 
 class Prediction(NamedTuple):
@@ -46,6 +49,7 @@ class Model(nn.Module):
         chunk: Largest number of pairs of a link and a direction evaluated at a time; None: whole labels. Training sees
             as many as ``training.thinning`` leaves.
         revisions: Fractions of the training after which ``OptionalMethods.revise`` is called.
+        any_frequency: True if channels are a function of frequency, read from ``scene.task.frequencies``.
         configuration: Options that a registered model was made with; ``save`` stores them.
 
     Example:
@@ -72,6 +76,7 @@ class Model(nn.Module):
     chunk: int | None = None
     revisions: tuple[float, ...] = ()
     predicts_untrained: bool = False
+    any_frequency: bool = False
     primitives: Gaussians | None = None
 
     def __init__(self, scene: Scene):
@@ -126,6 +131,7 @@ class Model(nn.Module):
         frequency: object = None,
         batch_size: int = 16,
         directions: Directions | None = None,
+        frequencies: object = None,
     ) -> Tensor:
         """Values for transmitters anywhere: a query, or a point, a list of points, or a grid.
 
@@ -136,6 +142,8 @@ class Model(nn.Module):
                 only carrier.
             batch_size: Links computed at a time.
             directions: Directions to predict; None: the label's own, if it has directions.
+            frequencies: Subcarriers of channels to predict (s,) [Hz], also ones that no label had; None: the label's
+                own. A model without ``any_frequency``, such as ``knn``, gives the values of its nearest subcarriers.
 
         Returns:
             A value of the task's shape for each position, scaled as the training labels
@@ -143,10 +151,12 @@ class Model(nn.Module):
 
         Warns:
             ExtrapolationWarning: A position is farther from the training transmitters' box than the diagonal of this
-                box and the receivers, or a frequency is outside the training links' band. Not for a query.
+                box and the receivers, or a frequency is outside the training links' band, or the values are those of
+                other subcarriers. Not for a query.
 
         Raises:
-            ValueError: The batch size is less than 1, or a position, receiver, frequency or direction is impossible.
+            ValueError: The batch size is less than 1, or a position, receiver, frequency or direction is impossible; or
+                the labels have no subcarriers.
 
         Example:
             >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
@@ -155,9 +165,12 @@ class Model(nn.Module):
             >>> few = gaigs.Grid.degrees(elevations=range(10, 90, 10), azimuths=range(0, 360, 10))
             >>> model.predict([1.0, 2.0, 1.5], directions=few).shape
             torch.Size([8, 36])
+            >>> channels = gaigs.train("friis", gaigs.links("synthetic_csi", transmitters=20, order=0))
+            >>> channels.predict([1.0, 2.0, 1.5], frequencies=[5.0e9, 5.1e9]).shape
+            torch.Size([16, 2])
         """
-        batches, shape = self._batches(transmitters, receiver, frequency, batch_size, directions)
-        values = torch.cat([self._answer(batch) for batch in batches])
+        parts, shape = self._values(transmitters, receiver, frequency, batch_size, directions, frequencies)
+        values = torch.cat([*parts])
         return values.reshape(shape + values.shape[1:])
 
     def predict_batches(
@@ -167,19 +180,29 @@ class Model(nn.Module):
         frequency: object = None,
         batch_size: int = 16,
         directions: Directions | None = None,
+        frequencies: object = None,
     ) -> Iterator[Tensor]:
         """The values of ``predict`` (b, *shape) a batch at a time, each computed when it is asked for.
 
         Arguments, warnings and errors are those of ``predict``, and come at once. The positions of a grid are in the
         order of ``reshape(-1, 3)``; the last batch may be smaller.
         """
-        batches, _ = self._batches(transmitters, receiver, frequency, batch_size, directions)
-        return (self._answer(batch) for batch in batches)
+        values, _ = self._values(transmitters, receiver, frequency, batch_size, directions, frequencies)
+        return values
 
-    def _batches(
-        self, transmitters, receiver, frequency, batch_size, directions
-    ) -> tuple[Iterator[Batch], tuple[int, ...]]:
-        """Checked batches for the arguments of ``predict``, on the model's device; and the positions' leading axes."""
+    def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Model":
+        """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
+        scene = replace(self.scene, task=Csi(self.scene.task.shape[0], frequencies))
+        other = copy.deepcopy(self)
+        for part in other.modules():
+            if hasattr(part, "scene"):
+                part.scene = scene
+        return other
+
+    def _values(
+        self, transmitters, receiver, frequency, batch_size, directions, frequencies
+    ) -> tuple[Iterator[Tensor], tuple[int, ...]]:
+        """Values for the checked arguments of ``predict``, a batch at a time; and the positions' leading axes."""
         check_type("batch_size", batch_size, int)
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
@@ -187,11 +210,25 @@ class Model(nn.Module):
         directions = as_directions(directions, scene.task.directions, scene.task.name)
         names = [receiver.name for receiver in scene.receivers]
         query, shape = Query.from_positions(transmitters, receiver, frequency, names, scene.frequencies)
+        model, chosen, messages = self, None, []
+        if frequencies is not None:
+            if not isinstance(scene.task, Csi):
+                raise ValueError(f"labels of task {scene.task.name!r} have no subcarriers; leave frequencies out")
+            asked = as_subcarriers(frequencies)
+            apart, chosen = (scene.task.frequencies - asked[:, None]).abs().min(1)
+            is_known = (apart <= 1e-9 * asked).all()  # float64 computes them no better
+            if not is_known and self.any_frequency:
+                model, chosen = self.at_frequencies(asked), None
+            elif not is_known:
+                messages = [f"values are those of the nearest subcarriers with labels, up to {apart.max():.7g} Hz away"]
         if not isinstance(transmitters, Query):
-            warn_of_extrapolation(query, scene)
+            for message in messages + extrapolations(query, scene):
+                warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # names the line that called ``predict``
         device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
         query, directions = query.to(device), None if directions is None else directions.to(device)
-        return (Batch(part, directions) for part in query.parts(batch_size)), shape
+        batches = (Batch(part, directions) for part in query.parts(batch_size))
+        values = map(model._answer, batches)
+        return values if chosen is None else (part[..., chosen] for part in values), shape
 
     @torch.no_grad()
     def _answer(self, batch: Batch) -> Tensor:
@@ -232,12 +269,9 @@ def call_optional(model: Model, method: str, *arguments: object) -> Any:
     return getattr(model, method)(*arguments) if hasattr(model, method) else None
 
 
-def warn_of_extrapolation(query: Query, scene: Scene) -> None:
-    """Warns of positions farther from the training transmitters' box than the scene's extent, and of carriers outside
-    the training links' band.
-
-    The warning names the line that called ``predict``.
-    """
+def extrapolations(query: Query, scene: Scene) -> list[str]:
+    """Sentences on positions farther from the training transmitters' box than the scene's extent, and on carriers
+    outside the training links' band."""
     messages, points = [], query.transmitters
     distances = (points - points.clamp(scene.lower.to(points), scene.upper.to(points))).norm(dim=-1)
     if count := int((distances > scene.extent).sum()):
@@ -254,8 +288,7 @@ def warn_of_extrapolation(query: Query, scene: Scene) -> None:
                 f"{len(outside)} of {len(asked)} positions are asked at {span} Hz, outside the training links' band of "
                 f"{low:.7g} to {high:.7g} Hz: nothing was measured there"
             )
-    for message in messages:
-        warnings.warn(message, ExtrapolationWarning, stacklevel=4)
+    return messages
 
 
 def build_trend(trend: str | Mapping | Model, scene: Scene) -> Model:

@@ -1,13 +1,16 @@
 """Free space: the direct wave alone."""
 
+from typing import Any
+
 import torch
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.kriging.links import known_links
 from gaigs.model import Model, Prediction
-from gaigs.propagation import TELLING, fit_gain, phase_sign
+from gaigs.phases import TELLING
+from gaigs.propagation import fit_gain
 from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.scene import Scene, check_elements, direct_gains, direct_waves
@@ -19,7 +22,7 @@ class Friis(Model):
 
     a is the elements' pattern towards the transmitter. The gain, ``fit_gain`` of the known links, contains transmit
     power, cables and the clock's phase. The sign of the phase is estimated from the known links, as both time
-    conventions are in use. If they show no sign, as without a common clock, the gain is 0. With fewer than ``TELLING``
+    conventions are in use. If phases are declared known but show no sign, the gain is 0. With fewer than ``TELLING``
     links a receiver the sign is -1. NaN before ``fit``.
 
     Raises:
@@ -28,11 +31,19 @@ class Friis(Model):
     Source: Friis, A note on a simple transmission formula, 1946.
     """
 
+    any_frequency = True
+
     def __init__(self, scene: Scene):
         super().__init__(scene)
-        self.frequencies = check_elements("model 'friis'", scene).frequencies
+        self.task = check_elements("model 'friis'", scene, pads=True)
         self.register_buffer("gains", torch.full((len(scene.receivers),), torch.nan, dtype=torch.complex64))
         self.register_buffer("sign", torch.tensor(-1))
+
+    @property
+    def frequencies(self) -> Float[Tensor, " s"]:
+        """The subcarriers [Hz]; ``Model.at_frequencies`` exchanges the scene."""
+        task: Any = self.scene.task
+        return task.frequencies
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
@@ -41,7 +52,7 @@ class Friis(Model):
         index = torch.cat(known)
         labels, query = links.labels[index].to(torch.complex128), links.query[index]
         waves = direct_waves(self.scene, query, self.frequencies)
-        sign = phase_sign(labels, waves, query.receivers)
+        sign = self.task.phase_sign(labels, waves, query.receivers)
         self.sign.fill_(sign or -1)
         self.gains.zero_()
         has_gain = sign != 0 or len(index) < TELLING * len(known)

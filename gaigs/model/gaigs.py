@@ -17,6 +17,7 @@ from gaigs.geometry import Directions, magnitudes, semi_axes, spherical_harmonic
 from gaigs.model import Model, Prediction, build_trend
 from gaigs.placement import Placement
 from gaigs.pooling import Pooling
+from gaigs.pooling.channels import ChannelPooling
 from gaigs.pooling.paths import PathPooling, ReceivedPaths
 from gaigs.projection import Projection
 from gaigs.query import Batch, Query
@@ -189,8 +190,10 @@ class GaussianSplatting(Model):
         places, which = query.unique(with_receivers=any(getattr(part, "sees_receivers", False) for part in parts))
         excited = self.excite(places)
         links, values = [], []
-        for receiver in query.receivers.unique().tolist() or [0]:  # no links have a label's shape too
-            links.append((query.receivers == receiver).nonzero()[:, 0])
+        together = self.takes_paths and self.pooling.is_same_for_all
+        group = torch.zeros_like(query.receivers) if together else query.receivers
+        for receiver in group.unique().tolist() or [0]:  # no links have a label's shape too
+            links.append((group == receiver).nonzero()[:, 0])
             own, rows = query[links[-1]], which[links[-1]]
             if self.takes_paths:
                 received = self.paths(excited, rows, receiver, own)
@@ -210,6 +213,10 @@ class GaussianSplatting(Model):
     def on_trend(self, value: Tensor, batch: Batch) -> Tensor:
         """The pooled value on top of the trend."""
         return value if self.trend is None else self.trend(batch).value + value - self.level
+
+    @property
+    def any_frequency(self) -> bool:  # type: ignore[override]
+        return isinstance(self.pooling, ChannelPooling) and (self.trend is None or self.trend.any_frequency)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {}

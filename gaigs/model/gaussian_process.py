@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
@@ -70,6 +70,14 @@ class GaussianProcess(Model):
         self.process, _ = fit_hyperparameters(self.scene, links, residuals)
         self.solved = [self._solve(index) for index in self.known]
 
+    @property
+    def any_frequency(self) -> bool:  # type: ignore[override]
+        return self.trends[0].any_frequency
+
+    def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
+        """The trend alone: its residuals at other frequencies do not correlate with the known ones."""
+        return self.trends[0].at_frequencies(frequencies)
+
     def facts(self) -> dict[str, float]:
         """``length_m``, ``nugget``, and with several carriers ``frequency_scale_m``."""
         return self.process.facts()
@@ -101,10 +109,10 @@ class GaussianProcess(Model):
         return torch.cholesky_solve(residuals.to(wide), factor.to(wide)), None
 
     def _residuals(self, index: Int[Tensor, " k"]) -> Iterator[Tensor]:
-        """Labels of some links less their trend, ``PART`` links at a time."""
+        """Labels of some links, aligned to their trend, less this trend; ``PART`` links at a time."""
         for some in index.split(PART):
             trend = self.trends[0](Batch(self.links.query[some], self.scene.task.directions)).value
-            residuals = self.links.labels[some] - trend
+            residuals = self.scene.task.align(self.links.labels[some], trend) - trend
             if self.factors is not None:
                 residuals = residuals * self.factors[some, None, None]
             yield residuals

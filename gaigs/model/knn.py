@@ -18,8 +18,8 @@ from gaigs.scene import Scene
 class KNearestNeighbours(Model):
     """The mean of the k known labels nearest to the transmitter, weighted by 1 / distance^power.
 
-    Links as near as the k-th count too, so that the order of links does not matter. The look-up keeps all links, one
-    byte a pixel for images.
+    Links as near as the k-th count too, so that the order of links does not matter. Channels of unknown phase are
+    aligned to the nearest. The look-up keeps all links, one byte a pixel for images.
 
     Where the training links have several carriers, the distance is that in place and frequency,
     d² = |dx|² + (s d ln f)². ``fit`` takes the scale s [m] with the least squared error of known links that are
@@ -75,8 +75,12 @@ class KNearestNeighbours(Model):
         weights = near * (apart.amin(1, keepdim=True) / apart) ** self.power  # ratios stay finite
         weights = weights / weights.sum(1, keepdim=True)
         used = near.any(0)
-        labels = self.links.labels[index[used]]
-        return torch.tensordot(weights[:, used].to(labels), labels, 1)
+        labels, align = self.links.labels[index[used]], self.scene.task.align
+        rows = []
+        for own, first in zip(weights[:, used], apart[:, used].argmin(1).tolist(), strict=True):
+            near = own.nonzero()[:, 0]
+            rows.append(torch.tensordot(own[near].to(labels), align(labels[near], labels[first : first + 1]), 1))
+        return torch.stack(rows)
 
     def _leave_one_out(self, scale: float) -> float:
         """Mean squared error of known links that are predicted from those at other places, as test links are."""
@@ -88,7 +92,8 @@ class KNearestNeighbours(Model):
                 apart = self._distances(asked, index, scale).masked_fill(here, math.inf)
                 found = apart.isfinite().any(1)  # a place may be the only one
                 part = part[found]
-                error = self._look_up(apart[found], index) - self.links.labels[part]
+                values = self._look_up(apart[found], index)
+                error = values - self.scene.task.align(self.links.labels[part], values)
                 errors += error.abs().double().square().sum().item()
                 count += len(part)
         return errors / max(count, 1)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Links, Split
@@ -17,11 +17,13 @@ from gaigs.kriging.field import Field
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, thin_labels
 from gaigs.kriging.kernel import LIMIT
 from gaigs.kriging.links import PART, coordinates, thinned
+from gaigs.kriging.paths import Equations, PathField, candidates
 from gaigs.model import Model, Prediction, call_optional
 from gaigs.placement.learnt_room import LearntRoom
 from gaigs.query import Batch
 from gaigs.registry import name_of, register, registry
 from gaigs.scene import Scene
+from gaigs.task import Task
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +42,8 @@ class Kriging(Model):
     Trend weight, length and nugget maximise the likelihood of the validation links given the training links around
     them. The weight is the one with which the validation links, predicted from the training links, score best: the
     likelihood alone would trust kriging too far where cubes of space are held out.
+
+    Of a trend whose paths have ``margins``, strengths are kriged path by path, and phases stay those of the geometry.
 
     A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal components. Of a receiver
     with more than ``LIMIT`` known links an even part is used.
@@ -72,7 +76,8 @@ class Kriging(Model):
         self.register_buffer("trend_weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("hyperparameters", torch.full((3,), math.nan, dtype=torch.float64))
-        self.fields = nn.ModuleList(Field(scene) for _ in scene.receivers)
+        self.by_paths = getattr(self.trend, "has_margins", False)
+        self.fields = nn.ModuleList(PathField() if self.by_paths else Field(scene) for _ in scene.receivers)
 
     def fit(self, links: Links) -> None:
         """Kriges the residuals of the trend, which must be trained."""
@@ -85,6 +90,8 @@ class Kriging(Model):
         split = links.split
         values = predicted(self.trend, links, known(links))
         self.fallback.fit(links)
+        if self.by_paths:
+            return self._krige_paths(links, values)
         self._fit_trend_weight(links, values)
         self._solve(links, values)
         training = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
@@ -98,26 +105,105 @@ class Kriging(Model):
             labels, trend = links.labels[split.validation], values[len(split.train) :]
             kriged = predicted(validation_model, links, split.validation)
             task, sign = links.task, 1 if links.task.higher_is_better else -1
-            score = lambda weight: task.scores(labels, trend + weight * (kriged - trend))[task.monitor].mean().item()
+            score = lambda weight: task.scores(labels, blend(task, kriged, trend, weight))[task.monitor].mean().item()
             best = max(WEIGHTS, key=lambda weight: sign * score(weight))
             self.weight.fill_(best)
             validation_model.weight.fill_(best)
+            self._is_learnt(links, trend, validation_model.fallback)
         log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))
         return validation_model
+
+    def _krige_paths(self, links: Links, values: Tensor) -> "Kriging":
+        """``krige`` for a trend of paths; hyperparameters are those with which the validation links score best.
+
+        The weight is 1 where the mean score rises by more than a standard error and the median does not fall; else 0.
+        """
+        split, task, index = links.split, links.task, known(links)
+        query, labels = links.query[index], links.labels[index]
+        residuals = task.align(labels, values) - values
+        trend: Any = self.trend
+        device = self.weight.device
+        equations, own = [], [(query.receivers == receiver).nonzero()[:, 0] for receiver in range(len(self.fields))]
+        for rows in own:
+            margins = lambda part, rows=rows: trend.margins(query[rows[part]].to(device)).cpu()
+            equations.append(Equations.of(query.transmitters[rows], margins, labels[rows], residuals[rows]))
+        validation_model = Kriging(self.scene, self.trend, self.fallback_options)
+        training = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
+        validation_model.fallback.fit(training)
+        held = torch.arange(len(split.train), len(index))
+        fields = {int(row): trend.margins(query[row : row + 1].to(device)).cpu()[0] for row in held}
+        plain, best = values[held], (-math.inf, next(candidates(self.scene.spacing)))
+        before = task.scores(labels[held], plain)[task.monitor] if len(held) else plain.real
+        for process in candidates(self.scene.spacing) if len(held) else ():
+            kriged = plain.clone()
+            for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
+                field.solve(known_ones[rows < len(split.train)], process)
+                for row in rows[rows >= len(split.train)].tolist():
+                    strengths = field(query.transmitters[row : row + 1].double(), process)[0]
+                    kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), fields[row], 1)
+            after = task.scores(labels[held], kriged)[task.monitor]
+            gain = after - before if task.higher_is_better else before - after
+            is_sure = gain.mean() > gain.std() / math.sqrt(len(gain)) and after.median() >= before.median()
+            if is_sure and gain.mean().item() > best[0]:
+                best = gain.mean().item(), process
+        self.trend_weight.fill_(0)
+        if len(held) == 0 or self._is_learnt(links, plain, validation_model.fallback):
+            self.trend_weight.fill_(1)
+        for model in (self, validation_model):
+            model.trend_weight.copy_(self.trend_weight)
+            model.weight.fill_(float(best[0] > 0) if self.trend_weight else 1.0)
+            model.hyperparameters.copy_(torch.tensor(best[1], dtype=torch.float64))
+            for rows, field, known_ones in zip(own, model.fields, equations, strict=True):
+                field.solve(known_ones if model is self else known_ones[rows < len(split.train)], best[1])
+        log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))
+        self.fields.to(device)
+        return validation_model.to(device)
+
+    def variance(self, batch: Batch) -> Float[Tensor, "b e s"]:
+        """Variance of complex channels predicted by kriged paths: that of their strengths, and the nugget's."""
+        query, process = batch.query, Hyperparameters(*self.hyperparameters.tolist())
+        value = self(batch).value
+        found = process.nugget * value.abs().square().mean((1, 2), keepdim=True).expand(value.shape).clone()
+        trend: Any = self.trend
+        for receiver in query.receivers.unique().tolist():
+            own = query.receivers == receiver
+            variances = self.fields[receiver].variances(query.transmitters[own].double(), process)
+            squares = trend.margins(query[own]).abs().square()
+            found[own] = found[own] + (variances.to(squares)[..., None, None] * squares).sum(1)
+        return found
+
+    def _is_learnt(self, links: Links, trend: Tensor, fallback: Model) -> bool:
+        """False if the trend's values of the validation links score worse than the fallback's by more than chance."""
+        task, held = links.task, links.split.validation
+        own, other = (
+            task.scores(links.labels[held], values)[task.monitor].double()
+            for values in (trend, predicted(fallback, links, held))
+        )
+        behind = (other - own) * (1 if task.higher_is_better else -1)
+        is_learnt = len(held) < 2 or bool(behind.mean() <= 2 * behind.std() / math.sqrt(len(held)))  # standard errors
+        if not is_learnt:
+            name = self.fallback_options["name"]
+            log.warning(
+                "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
+                "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
+                *(task.monitor, own.mean(), name, other.mean(), name),
+                100 * (1 - self.weight * (1 - self.trend_weight)),
+            )
+        return is_learnt
 
     def _fit_trend_weight(self, links: Links, values: Tensor) -> None:
         """Fits the trend weight and the hyperparameters; ``values`` are the trend's predictions of known links."""
         index = known(links)
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
-        over, apart = [], []  # labels and trend, less the fallback
+        residuals: dict[float, Any] = {trend_weight: [] for trend_weight in WEIGHTS}
         for part in torch.arange(len(index)).split(PART):
-            fallback = predicted(self.fallback, links, index[part])
-            over.append(thin_labels(links.labels[index[part]] - fallback))
-            apart.append(thin_labels(values[part] - fallback))
-        over, apart = torch.cat(over), torch.cat(apart)
+            labels, fallback = links.labels[index[part]], predicted(self.fallback, links, index[part])
+            for trend_weight, parts in residuals.items():
+                mean = blend(links.task, values[part], fallback, trend_weight)
+                parts.append(thin_labels(links.task.align(labels, mean) - mean))
 
         def fitted(trend_weight: float, **options: int) -> tuple[Hyperparameters, float]:
-            left = over - trend_weight * apart
+            left = torch.cat(residuals[trend_weight])
             if left.is_complex():
                 left = left * damping(left, thin_labels(links.labels[index]), links.query.receivers[index])[:, None]
             return fit_hyperparameters(self.scene, links, lambda some: left[rows[some]], **options)
@@ -138,8 +224,8 @@ class Kriging(Model):
             residuals = torch.empty(len(rows), *self.scene.task.shape, dtype=self.scene.task.dtype)
             for part in torch.arange(len(rows)).split(PART):
                 some = index[rows[part]]
-                rest = (1 - trend_weight) * predicted(self.fallback, links, some)
-                residuals[part] = links.labels[some] - trend_weight * values[rows[part]] - rest
+                mean = blend(links.task, values[rows[part]], predicted(self.fallback, links, some), trend_weight)
+                residuals[part] = links.task.align(links.labels[some], mean) - mean
             if residuals.is_complex():
                 residuals = residuals * damping(residuals, links.labels[index[rows]], receivers[rows])[:, None, None]
             process = Hyperparameters(*self.hyperparameters.tolist())
@@ -152,14 +238,26 @@ class Kriging(Model):
         trend = self.trend(batch).value if trend_weight > 0 or weight < 1 else None
         if weight == 0:
             return Prediction(trend, {})
-        value = 0 if trend_weight == 0 else trend_weight * trend
-        if trend_weight < 1:
-            value = value + (1 - trend_weight) * self.fallback(batch).value
-        places = coordinates(self.scene, query, scale)
-        for receiver in query.receivers.unique().tolist():
+        task, fallback = self.scene.task, self.fallback(batch).value if trend_weight < 1 else None
+        value = blend(task, trend, fallback, trend_weight)
+        places = query.transmitters if self.by_paths else coordinates(self.scene, query, scale)
+        for receiver in query.receivers.unique().tolist() if trend_weight or not self.by_paths else ():
             own = query.receivers == receiver
-            value[own] = value[own] + self.fields[receiver](places[own], length, batch)
-        return Prediction(value if weight == 1 else trend + weight * (value - trend), {})
+            if self.by_paths:
+                strengths = self.fields[receiver](query.transmitters[own].double(), Hyperparameters(length.item()))
+                margins = self.trend.margins(query[own])
+                value[own] = value[own] + (strengths.to(value)[..., None, None] * margins).sum(1)
+            else:
+                value[own] = value[own] + self.fields[receiver](places[own], length, batch)
+        return Prediction(blend(task, value, trend, weight), {})
+
+    @property
+    def any_frequency(self) -> bool:  # type: ignore[override]
+        return self.trend.any_frequency
+
+    def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
+        """The trend alone: its residuals at other frequencies do not correlate with the known ones."""
+        return self.trend.at_frequencies(frequencies)
 
     @property
     def primitives(self) -> Gaussians | None:  # type: ignore[override]
@@ -167,10 +265,14 @@ class Kriging(Model):
 
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
-        facts = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
+        facts: dict[str, Any] = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
         facts |= Hyperparameters(*self.hyperparameters.tolist()).facts()
-        places, components = ([len(getattr(field, name)) for field in self.fields] for name in ("places", "components"))
-        facts |= {"links": sum(places), "components": max(components)}
+        places = [len(field.places) for field in self.fields]
+        facts["links"] = sum(places)
+        if self.by_paths:
+            facts["deviation"] = facts.pop("frequency_scale_m")
+        else:
+            facts["components"] = max(len(field.components) for field in self.fields)
         return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
@@ -181,6 +283,15 @@ class Kriging(Model):
 
     def export(self, folder: Path) -> None:
         call_optional(self.trend, "export", folder)
+
+
+def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -> Tensor:
+    """weight one + (1 - weight) other, a tensor of its own; of channels of unknown phase, ``one`` is aligned to
+    ``other``. A part without weight may be None: it is not read, since a NaN of it would count.
+    """
+    if weight in (0, 1):
+        return (one if weight else other).clone()
+    return weight * task.align(one, other) + (1 - weight) * other
 
 
 def known(links: Links) -> Int[Tensor, " k"]:

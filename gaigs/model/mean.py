@@ -12,7 +12,10 @@ from gaigs.scene import Scene
 
 @register("model", "mean")
 class Mean(Model):
-    """Predicts each receiver's mean label for any transmitter; NaN before ``fit``."""
+    """Predicts each receiver's mean label for any transmitter; NaN before ``fit``.
+
+    Channels of unknown phase are aligned to that of the first known link.
+    """
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
@@ -23,7 +26,8 @@ class Mean(Model):
         """Computes the means."""
         for receiver, index in enumerate(known_links(links)):
             wide = torch.promote_types(self.scene.task.dtype, torch.float64)
-            total = sum(links.labels[part].sum(0, dtype=wide) for part in index.split(256))
+            first, align = links.labels[index[:1]], self.scene.task.align
+            total = sum(align(links.labels[part], first).sum(0, dtype=wide) for part in index.split(256))
             self.means[receiver] = (total / len(index)).to(self.means)
 
     def forward(self, batch: Batch) -> Prediction:

@@ -1,11 +1,13 @@
 """Mirrored Gaussians: our own predictor, which learns the walls of the room."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Complex
 from scipy.constants import speed_of_light
-from torch import nn
+from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.deformation import Deformation
@@ -14,6 +16,7 @@ from gaigs.model.gaigs import GaussianSplatting
 from gaigs.placement import Placement
 from gaigs.placement.learnt_room import LearntRoom
 from gaigs.placement.mirrored import export
+from gaigs.placement.mirrored.channel_search import FEWEST, ChannelSearch
 from gaigs.placement.mirrored.search import Loss, choose_bandwidth, find_planes, move_planes, prune, thinned
 from gaigs.pooling import Pooling
 from gaigs.pooling.channels import ChannelPooling
@@ -32,7 +35,8 @@ class MirroredSplatting(GaussianSplatting):
     """The splatting pipeline with Gaussians at mirror images, learnt from coarse to fine.
 
     Powers come first: they locate planes to some centimetres. Then phases count too: each plane moves along its normal
-    to the least loss, by steps of a fraction of the wavelength, and descent goes on.
+    to the least loss, by steps of a fraction of the wavelength, and descent goes on. ``ChannelSearch`` locates planes
+    of channels before the training.
 
     Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that suits it.
 
@@ -68,8 +72,9 @@ class MirroredSplatting(GaussianSplatting):
     def fit(self, links: Links) -> None:
         """Fits the pipeline, and keeps some links for the report of the paths' powers.
 
-        Channels without a trend start from free space with each receiver's gain over its training links, as of
-        ``friis``, or 0.1 where phases say nothing: a louder start would be worse than nothing.
+        Channels without a trend start from planes that ``ChannelSearch`` finds in them; those of fewer than ``FEWEST``
+        numbers from free space, and then the faces of the box. Each receiver's gain is that over its training links, as
+        of ``friis``, or 0.1 where phases say nothing: a louder start would be worse than nothing.
         """
         super().fit(links)
         self.places = export.some(links.query[links.split.train])
@@ -82,8 +87,26 @@ class MirroredSplatting(GaussianSplatting):
         own = [query.receivers == receiver for receiver in range(len(self.scene.receivers))]
         gains = torch.stack([fit_gain(labels[some], waves[some]) for some in own]) / self.pooling.strength
         gains = torch.where((gains != 0) & (sign != 0), gains, 0.1)
-        self.placement.start_from_free_space(gains.conj() if sign > 0 else gains)
-        self.placement.enable_phases(speed_of_light / frequencies.mean().item())
+        placement = self.placement
+        known = placement.used if placement.walls else placement.used[:0]
+        normals = placement.normals[known]
+        start = torch.cat((normals, (placement.offsets[known] + normals @ placement.middle)[:, None]), 1)
+        placement.start_from_free_space(gains.conj() if sign > 0 else gains)
+        placement.enable_phases(speed_of_light / frequencies.mean().item())
+        if placement.fixed or not placement.order or labels[0].numel() < FEWEST:
+            return
+        common = task.phase == "known" and sign != 0
+        options = int(self.pooling.array_sign), common, placement.order, len(placement.origin)
+        aligned = links.labels.clone()
+        aligned[train] = task.align(labels, waves)  # takes off delays that are not those of paths
+        planes, slabs = ChannelSearch(replace(links, labels=aligned), *options, start).run()
+        for number, (plane, slab) in enumerate(zip(planes, slabs, strict=True)):
+            placement.place(number, plane[:3].float(), float(plane[3] - plane[:3] @ placement.middle.double()), slab)
+        placement.planned.copy_(placement.sequences_of(torch.arange(len(planes))))
+        placement.most.copy_(placement.planned.sum())
+        placement.enable_reflections()
+        placement.step.mul_(0.1)  # the search is exact to millimetres
+        placement.found.fill_(True)
 
     @property
     def predicts_untrained(self) -> bool:  # type: ignore[override]
@@ -96,7 +119,7 @@ class MirroredSplatting(GaussianSplatting):
         adds_waves = not isinstance(self.pooling, LagPooling)
         if placement.is_bare:
             placement.enable_reflections()
-        if number < 2 and placement.fixed:
+        if number < 2 and (placement.fixed or placement.found):
             return "planes stay where they were put"
         if number < 2 and not adds_waves:
             found = find_planes(self, train, validation, loss)
@@ -119,6 +142,31 @@ class MirroredSplatting(GaussianSplatting):
         least = 0.03 * placement.diagonal if number == (0 if adds_waves else 2) else 0.0
         moves = ", ".join(f"{move:+.3f}" for move in move_planes(placement, train, wavelength, least, loss))
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
+
+    @property
+    def has_margins(self) -> bool:
+        """True for ``margins``: channels are sums of mirrored paths alone."""
+        return isinstance(self.pooling, ChannelPooling) and self.takes_paths and self.trend is None
+
+    @torch.no_grad()
+    def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:
+        """Channels by which each path of links to one receiver may deviate, for kriging; see ``Mirrored.margins``."""
+        with self.placement.holding():
+            self.placement.held = self.placement.margins(query)
+            which = torch.arange(len(query), device=query.transmitters.device)
+            paths = self.paths(self.excite(query), which, int(query.receivers[0]), query)
+        count, n = paths.amplitudes.shape
+        apart = lambda values: values.expand(count, *values.shape[1:]).flatten(0, 1)[:, None]
+        each = replace(
+            paths,
+            means=apart(paths.means),
+            semi_axes=apart(paths.semi_axes),
+            amplitudes=apart(paths.amplitudes),
+            lengths=apart(paths.lengths),
+            coherences=paths.coherences[:1],
+            carriers=paths.carriers.repeat_interleave(n),
+        )
+        return self.pooling(each, query[which.repeat_interleave(n)]).unflatten(0, (count, n))
 
     def facts(self) -> dict[str, object]:
         """Numbers of planes and paths, and the part of each plane, beside the rasterizer."""

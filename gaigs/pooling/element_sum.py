@@ -23,6 +23,7 @@ class ElementSum(ChannelPooling):
     m_f is the map at subcarrier f, complex: its real parts are the map's channels before all imaginary ones. x_e is an
     element's place, a its pattern, w the share of the direction's solid angle. F is the wave of free space over the
     direct distance d (without a common clock its amplitude), g the channels' ``strength`` over it. s is ``array_sign``.
+    At other subcarriers than the labels' the map is that of the nearest one.
 
     Args:
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
@@ -30,7 +31,8 @@ class ElementSum(ChannelPooling):
 
     def __init__(self, scene: Scene, grid: Sequence[int] = (8, 16)):
         super().__init__(scene, "element_sum")
-        self.channels = 2 * len(self.frequencies)
+        self.learnt = self.frequencies
+        self.channels = 2 * len(self.learnt)
         self.grid = sphere("pooling.grid", grid)
 
     def forward(
@@ -39,11 +41,12 @@ class ElementSum(ChannelPooling):
         """Channels at the elements of the receiver of these links."""
         if not len(query):
             return torch.zeros(0, *self.scene.task.shape, dtype=image.dtype.to_complex(), device=image.device)
-        waves = torch.complex(*image.flatten(2).unflatten(1, (2, -1)).unbind(1))
+        nearest = (self.learnt - self.frequencies[:, None]).abs().argmin(1)
+        waves = torch.complex(*image.flatten(2).unflatten(1, (2, -1)).unbind(1))[:, nearest]
         steering = self._steering(int(query.receivers[0]), int(self.array_sign)).to(waves)
         channels = (waves.permute(1, 0, 2) @ steering).permute(1, 2, 0)
         direct = direct_waves(self.scene, query, self.frequencies, int(self.sign), at_elements=False)
-        return channels * (self.strength.double() * direct).to(waves)
+        return self.pad(channels * (self.strength.double() * direct).to(waves))
 
     def _steering(self, receiver: int, sign: int) -> Complex[Tensor, "s p e"]:
         """Contribution of a wave from each direction of the map to each element, float64."""

@@ -27,9 +27,9 @@ class PathCsi(ChannelPooling, PathPooling):
 
     def read(
         self, received: Complex[Tensor, "b e s"], query: Query, directions: Directions | None = None
-    ) -> Complex[Tensor, "b e s"]:
+    ) -> Complex[Tensor, "b most s"]:
         frequencies = self.frequencies.to(received.real)
         value = received * (self.strength.to(frequencies) * speed_of_light / (4 * math.pi * frequencies))
         if self.sign == 0:  # no common clock: the phase of the direct path is taken off
             value = value * direct_waves(self.scene, query, frequencies, 1, at_elements=False).sgn().to(value)
-        return value.conj() if self.array_sign > 0 else value
+        return self.pad(value.conj() if self.array_sign > 0 else value)

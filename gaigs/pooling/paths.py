@@ -45,7 +45,13 @@ class ReceivedPaths:
 
 
 class PathPooling(Pooling):
-    """Base of poolings that read paths, so that nothing is projected or rasterized."""
+    """Base of poolings that read paths, so that nothing is projected or rasterized.
+
+    Attributes:
+        is_same_for_all: True if no receiver's pose or array matters, so that paths to several may be summed at once.
+    """
+
+    is_same_for_all = False
 
     def forward(self, paths: ReceivedPaths, query: Query, directions: Directions | None = None) -> Tensor:
         return self.read(self.sum_paths(paths), query, directions)
@@ -68,6 +74,7 @@ class LagPooling(PathPooling):
 
     def __init__(self, scene: Scene):
         super().__init__()
+        self.is_same_for_all = all(receiver.array.is_point for receiver in scene.receivers)
         for receiver in scene.receivers:
             height = receiver.array.elements[:, 2].abs().max()
             if height > 1e-6:  # [m]; float32 places metres no better
@@ -78,8 +85,14 @@ class LagPooling(PathPooling):
 
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b l"]:
         """Covariance of the elements at each of ``array.lags``; a path is at least as wide as a pixel of 24 x 48."""
-        plane = DirectionCosine(Grid.sphere(24, 48).pitch)
-        splats = plane.project(paths.means, paths.semi_axes, paths.receiver.pose)
+        if paths.receiver.array.is_point:  # a power has no directions
+            nowhere = torch.zeros_like(paths.means)
+            splats = Splats(
+                nowhere[..., :2], nowhere[:1], paths.lengths, torch.ones_like(paths.lengths, dtype=torch.bool)
+            )
+        else:
+            plane = DirectionCosine(Grid.sphere(24, 48).pitch)
+            splats = plane.project(paths.means, paths.semi_axes, paths.receiver.pose)
         own = paths.amplitudes, paths.lengths, paths.coherences, paths.bandwidth
         return self.covariances(splats, *own, paths.receiver.array, paths.carriers)
 

@@ -14,7 +14,7 @@ from scipy.stats import t
 from gaigs.configuration import HARMLESS, conf_dir
 from gaigs.io.files import write_text
 from gaigs.report.runs import Run
-from gaigs.report.table import markdown, task_class, terminal, write_csv, written
+from gaigs.report.table import headline, markdown, terminal, write_csv, written
 
 CONFIDENCE = 0.95
 """Of the intervals."""
@@ -86,7 +86,7 @@ def compare(runs: Sequence[Run], claims: Sequence[Claim]) -> list[dict]:
 
 def _row(claim: Claim, setting: str, *sides: Sequence[Mapping]) -> dict:
     task = sides[0][0]["task"]
-    name, metric = next(iter(task_class(task).metrics().items()))
+    name, metric = headline(task, sides[0][0]["models"])
     better, than = ([next(iter(metrics["models"].values()))[name] for metrics in side] for side in sides)
     sign = 1 if metric.higher_is_better else -1
     gains = [sign * (a - b) for a, b in zip(better, than, strict=True)]

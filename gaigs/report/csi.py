@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Complex, Float
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -29,17 +30,22 @@ class CsiFigures(TaskFigures):
     """Example channels, the distribution of SNR, and the power of errors."""
 
     def of_run(self, task: Csi, folder: Path, links: Links) -> dict[str, Figure]:
-        file, split = folder / "predictions.npz", links.split.name
-        scores, errors, powers = (own_scores(file, kind) for kind in ("snr_db", "error_power", "label_power"))
-        shown, frequencies = read_examples(file, "snr_db"), task.frequencies.numpy()
+        file, split, kind = folder / "predictions.npz", links.split.name, task.compared_by
+        scores, errors, powers = (own_scores(file, name) for name in (kind, "error_power", "label_power"))
+        shown, frequencies = read_examples(file, kind), task.frequencies.numpy()
+        labels = task.align(*(torch.from_numpy(part) for part in (shown.labels, shown.predictions)))
+        shown = shown._replace(labels=labels.numpy())
         figures = {"channels": magnitudes_and_phases(shown, frequencies)}
         if len(frequencies) > 1:
             figures["impulse_response"] = impulse_responses(shown, frequencies)
         figures["error_power"] = error_against_power(next(iter(powers.values())), errors, split)
-        return figures | {"snr_cdf": cdf(scores, "SNR [dB]", "channels", split, (None, None))}
+        return figures | {"snr_cdf": cdf(scores, task.pair_score, "channels", split, (None, None))}
 
     def of_systems(self, task: type[Csi], files: Mapping[str, Path], split: str) -> dict[str, Figure]:
-        return {"cdf": cdf(scores_of_systems(files, "snr_db"), "SNR [dB]", "channels", split, (None, None))}
+        kind, title = "snr_db", "SNR [dB]"
+        if not own_scores(next(iter(files.values())), kind):  # of unknown phase
+            kind, title = "snr_aligned_db", "SNR, phase removed [dB]"
+        return {"cdf": cdf(scores_of_systems(files, kind), title, "channels", split, (None, None))}
 
 
 def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) -> Figure:

@@ -36,7 +36,7 @@ def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
         drawn["paths"] = paths(links, learnt)
     if losses := read_log(folder):
         drawn["loss"] = loss_curves(losses)
-    drawn |= figures_of(type(links.task)).of_run(links.task, folder, links)
+    drawn |= figures_of(type(links.task)).of_run((links.held_out or links).task, folder, links)
     (folder / "figures").mkdir(exist_ok=True)
     files = {folder / "figures" / f"{name}.png": figure for name, figure in drawn.items()}
     for file, figure in files.items():

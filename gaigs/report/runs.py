@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gaigs.configuration import differences
 from gaigs.registry import check_type
-from gaigs.report.table import task_class
+from gaigs.report.table import headline
 
 
 class Run(NamedTuple):
@@ -57,14 +57,15 @@ def read_metrics(file: Path) -> dict:
     """Contents of a run's ``metrics.json``; a ValueError for a damaged file or a task that is not installed."""
     try:
         metrics = json.loads(file.read_text())
-        first, *_ = task_class(metrics["task"]).metrics()
+        task, models = metrics["task"], metrics["models"]
+        if not models:
+            raise ValueError("no model")
+        first, _ = headline(task, models)
         for key, kind in (("split", str), ("seed", int), ("device", str), ("train_seconds", float | None)):
             check_type(repr(key), metrics.get(key), kind)
         for models in (metrics["models"], metrics.get("validation") or {}, *(metrics.get("receivers") or {}).values()):
             for scores in models.values():
                 check_type(repr(first), scores[first], float)
-        if not metrics["models"]:
-            raise ValueError("no model")
     except (AttributeError, KeyError, TypeError, ValueError) as error:  # JSON and encodings raise a ValueError
         raise ValueError(
             f"cannot read {file} ({type(error).__name__}: {error})\n"

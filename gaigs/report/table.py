@@ -34,6 +34,13 @@ def task_class(name: str) -> type[Task]:
     return kind
 
 
+def headline(task: str, models: Mapping[str, Mapping]) -> tuple[str, Metric]:
+    """The first of a task's metrics that the first model has: channels of unknown phase have no plain SNR."""
+    known, scores = task_class(task).metrics(), next(iter(models.values()))
+    name = next((name for name in known if name in scores), next(iter(known)))
+    return name, known[name]
+
+
 def monitor_names(task: str) -> tuple[str, str | None]:
     """The score that picks a task's best checkpoints, and the metric that is its mean, if there is one."""
     kind = task_class(task)
@@ -107,6 +114,7 @@ def metrics_table(metrics: Mapping) -> Group:
     """Models down, metrics across, the best of each metric in bold; below it the same models at each receiver."""
     known, models = task_class(metrics["task"]).metrics(), metrics["models"]
     validation = metrics.get("validation") or {}
+    first, metric = headline(metrics["task"], models)
     has = lambda name: all(name in scores for scores in models.values())
     # A terminal has room for five metrics; of more, only the brief ones are shown.
     names = [name for name, metric in known.items() if has(name) and (metric.is_brief or len(known) <= 5)]
@@ -120,17 +128,15 @@ def metrics_table(metrics: Mapping) -> Group:
         table.add_column(stacked(known[name].title), justify="right")
         columns.append(_cells(models, name, known[name].higher_is_better))
     if validation:
-        first, metric = next(iter(known.items()))
         table.add_column(stacked(f"{metric.title}, validation"), justify="right")
         columns.append(_cells(validation, first, metric.higher_is_better))
     for model in models:
         table.add_row(escape(model), *(cells.get(model, "") for cells in columns))
-    return Group(table, *([_receivers_table(metrics["receivers"], known)] if metrics.get("receivers") else []))
+    return Group(table, *([_receivers_table(metrics["receivers"], first, metric)] if metrics.get("receivers") else []))
 
 
-def _receivers_table(receivers: Mapping, known: Mapping[str, Metric]) -> Table:
-    """Receivers down, models across: the first metric."""
-    name, metric = next(iter(known.items()))
+def _receivers_table(receivers: Mapping, name: str, metric: Metric) -> Table:
+    """Receivers down, models across: one metric."""
     table = Table("receiver", title=f"{escape(metric.title)} at each receiver")
     for model in next(iter(receivers.values())):
         table.add_column(escape(model), justify="right")
@@ -149,7 +155,7 @@ def _cells(models: Mapping, name: str, higher_is_better: bool) -> dict[str, str]
 def verdict(metrics: Mapping) -> str:
     """A sentence that compares the run's own model, the first of ``models``, with the baselines by the first metric."""
     (model, own), *others = metrics["models"].items()
-    name, metric = next(iter(task_class(metrics["task"]).metrics().items()))
+    name, metric = headline(metrics["task"], metrics["models"])
     quantity, _, unit = metric.title.removesuffix("]").partition(" [")
     digits, unit = (2, f" {unit}") if unit else (3, "")
     stands = []

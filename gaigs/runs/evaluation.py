@@ -8,10 +8,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from rich.console import Console, Group
 from rich.jupyter import JupyterMixin
 from torch import Tensor
@@ -67,9 +68,12 @@ def fitted(look_up: Model, links: Links) -> Model:
     return model
 
 
-def predict(model: Model, links: Links, index: Int[Tensor, " k"]) -> Tensor:
-    """Predictions for some links, on the CPU."""
-    return torch.cat([model.predict(links.query[part], batch_size=BATCH).cpu() for part in index.split(BATCH)])
+def predict(
+    model: Model, links: Links, index: Int[Tensor, " k"], frequencies: Float[Tensor, " s"] | None = None
+) -> Tensor:
+    """Predictions for some links, on the CPU; of channels at other subcarriers, if they are given [Hz]."""
+    values = model.predict_batches(links.query[index], batch_size=BATCH, frequencies=frequencies)
+    return torch.cat([part.cpu() for part in values])
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
     check_fit(links, model.scene)
     if not len(links.split.test):
         raise ValueError("links must have some to test on; take another split")
-    task = links.task
+    task = (links.held_out or links).task
     own = name_of(model.trend if isinstance(model, Kriging) else model)
     models = {own: model} | ({f"{own}_trend": model.trend} if isinstance(model, Kriging) else {})
     if baselines is None:
@@ -144,9 +148,14 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
 def score(
     models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links, folder: Path | None = None
 ) -> Scores:
-    """Scores of every test link by fitted models and by look-ups; a folder gets predictions of the first."""
-    task, index = links.task, links.split.test
-    labels = torch.cat([links.labels[part] for part in index.split(BATCH)])
+    """Scores of every test link by fitted models and by look-ups; a folder gets predictions of the first.
+
+    If subcarriers are held out, ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as
+    an uplink is taken for a downlink.
+    """
+    asked, index = links.held_out or links, links.split.test
+    task: Any = asked.task
+    labels = torch.cat([asked.labels[part] for part in index.split(BATCH)])
     query = links.query[index]
     content = {
         "link": index.numpy(),
@@ -159,11 +168,19 @@ def score(
     if task.directions is not None:
         content |= {"elevations": task.directions.elevations.numpy(), "azimuths": task.directions.azimuths.numpy()}
     scores = {}
-    for key in [*models, *look_ups]:
-        values = predict(models[key] if key in models else fitted(look_ups[key], links), links, index)
+
+    def add(key: str, values: Tensor) -> None:
         scores[key] = task.scores(labels, values)
         content.setdefault("prediction", task.packed(values))
-        content |= {f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()}
+        content.update({f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()})
+
+    frequencies = None if links.held_out is None else task.frequencies
+    for key in [*models, *look_ups]:
+        add(key, predict(models[key] if key in models else fitted(look_ups[key], links), links, index, frequencies))
+    if links.held_out is not None:
+        own: Any = links.task
+        nearest = (own.frequencies - frequencies[:, None]).abs().argmin(1)
+        add("nearest_frequency", links.labels[index][..., nearest])
     if folder is not None:
         with atomic_write(folder / "predictions.npz") as part:
             np.savez_compressed(part, **content)
@@ -175,9 +192,8 @@ def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: 
     split = links.split
     if not len(split.validation):
         return {}
-    return score(
-        models, look_ups, replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
-    )
+    split = Split(split.name, split.train, split.validation[:0], split.validation)
+    return score(models, look_ups, replace(links, split=split, held_out=None))
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:

@@ -89,7 +89,7 @@ class Task(ABC):
 
     @abstractmethod
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
-        """The numbers of a table by name, as ``metrics`` lists them, from the result of ``scores``.
+        """The numbers of a table by name, in the order of ``metrics``, from the result of ``scores``.
 
         Raises:
             ValueError: There is no sample.
@@ -109,7 +109,7 @@ class Task(ABC):
     @classmethod
     @abstractmethod
     def metrics(cls) -> dict[str, Metric]:
-        """The numbers that ``summarise`` gives; runs are compared by the first."""
+        """The numbers that ``summarise`` may give; runs are compared by the first that it gives."""
 
     def options(self) -> dict:
         """Arguments of the constructor, as plain tensors, lists, numbers and strings; by default none."""
@@ -118,6 +118,13 @@ class Task(ABC):
     def state(self) -> dict:
         """The task as a checkpoint stores it: ``registry("task").build(state)`` makes it anew."""
         return {"name": self.name, **self.options()}
+
+    def align(self, labels: Tensor, values: Tensor) -> Tensor:
+        """Labels turned onto predictions by all that is unknown of each link; by default as they are.
+
+        Losses, kriging and look-ups compare the result with the predictions. Shapes are (k, *shape); either k may be 1.
+        """
+        return labels
 
     def thinning(self) -> Thinning:
         """The part of a batch that a step reads, by default all; parameters are options of ``training.thinning``."""

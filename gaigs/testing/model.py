@@ -14,6 +14,7 @@ from gaigs.model import Model, Prediction, call_optional
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.scene import Scene
+from gaigs.task.csi import Csi
 from gaigs.testing import checks
 from gaigs.testing.checks import require, require_close, require_tensor
 
@@ -68,6 +69,14 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
         rays = task.directions.flatten()[3::7]
         rule = "predict must give the directions of its argument"
         require_close(predict(places, directions=rays), values.flatten(1)[:, 3::7], 1e-4, rule)
+    if isinstance(task, Csi):
+        own = task.frequencies
+        require(
+            torch.equal(predict(places, frequencies=own[-1:]), values[..., -1:]), "own subcarriers must keep values"
+        )
+        # In another order, and so little beside their own that values hardly change.
+        beside = predict(places, frequencies=own.flip(0) * (1 + 1e-8))
+        require_close(beside, values.flip(-1), 2e-3, "predict must give the subcarriers of its argument")
     checks.require_refusal(lambda: predict(places * torch.nan), "NaN as a position must be a ValueError")
     unknown = lambda: model.predict(places, -1, frequency)
     checks.require_refusal(unknown, "an unknown receiver must be a ValueError")

@@ -33,6 +33,7 @@ class Descent(lightning.LightningModule):
         optimizer, schedule: As ``gaigs.training.schedule`` takes them.
         patience: Validations without a better score until the training stops; None: it goes on to the last step.
         density: Options of ``gaigs.training.density_control.DensityControl``; None: a fixed number of Gaussians.
+        links: Most links a step, drawn at random from those of its places; None: all.
 
     Raises:
         ValueError: An option is out of range, or parameter groups and penalties are not those of the model.
@@ -57,18 +58,27 @@ class Descent(lightning.LightningModule):
         schedule: dict,
         patience: int | None,
         density: dict | None,
+        links: int | None = None,
     ):
         super().__init__()
         if model.trained_by != self.name:
             raise ValueError(f"this model is trained by {model.trained_by!r}; set training={model.trained_by}")
         if not jitter >= 0:
             raise ValueError(f"training.jitter must be at least 0 m, got {jitter}")
+        if links is not None and links < 1:
+            raise ValueError(f"training.links must be at least 1 link or null, got {links}")
         self.penalties = _overridden("training.penalties", model.penalty_weights, penalties)
         self.learning_rates = _overridden("training.learning_rates", model.learning_rates, learning_rates)
         if unset := model.parameter_groups().keys() - self.learning_rates.keys():
             raise ValueError(f"the model has no learning rate for {', '.join(sorted(unset))}; add it to learning_rates")
         self.model, self.loss, self.identity, self.seed = model, loss, identity, seed
-        self.batch_size, self.jitter, self.patience, self.density = batch_size, jitter, patience, density
+        self.links, self.batch_size, self.jitter, self.patience, self.density = (
+            links,
+            batch_size,
+            jitter,
+            patience,
+            density,
+        )
         self.optimizer, self.schedule = optimizer, schedule
         self.task = model.scene.task
         self.thin = call("training.thinning", self.task.thinning, thinning)
@@ -85,8 +95,11 @@ class Descent(lightning.LightningModule):
         return self.add_up(loss, terms, penalties, batch)
 
     def prepare(self, batch: Batch) -> Batch:
-        """A batch as a step sees it: thinned, its places moved."""
+        """A batch as a step sees it: of some links, thinned, its places moved."""
         generator = seeded(self.seed, self.global_step)
+        if self.links is not None and len(batch) > self.links:
+            some = torch.randperm(len(batch), generator=generator)[: self.links].sort().values.to(batch.labels.device)
+            batch = replace(batch, query=batch.query[some], labels=batch.labels[some])
         batch = self.thin(batch, generator)
         if self.jitter:
             places, which = batch.query.unique(with_receivers=False)

@@ -4,8 +4,10 @@ import re
 import warnings
 import zipfile
 
+import h5py
 import numpy as np
 import pytest
+import scipy.io
 import torch
 
 from gaigs.data import csi_npz, load
@@ -128,7 +130,7 @@ DEFECTS = [
     ({"h": np.ones((9, 3, 4), complex)}, "h: expected the shape (10, e, 4), got (9, 3, 4)"),
     ({"elements": np.ones((4, 3))}, "elements: expected the shape (3, 3), got (4, 3)"),
     ({"h": np.ones((10, 4), complex)}, "(10, e, 4), got (10, 4); for one antenna add an axis, h[:, None, :]"),
-    ({"h": np.ones((10, 3, 4))}, "h: expected complex numbers, got float64; join real and imaginary parts by re + 1j"),
+    ({"h": np.ones((10, 3, 4))}, "h: expected complex numbers, got float64; data.arrays={h: [RE, IM]} names"),
     ({"rx_index": np.zeros(10)}, "rx_index: expected whole numbers, got float64"),
     ({"h": np.ones((10, 0, 4), complex)}, "h: expected the shape (10, e, 4), got (10, 0, 4)"),
     (put("rx_index", [3, 5], 3), "rx_index[3]: expected a row of rx, 0..2, got 3 (in 2 of 10 rows)"),
@@ -204,3 +206,114 @@ def test_damaged_archives_are_refused(file, break_file, message):
     break_file(file)
     with pytest.raises(ValueError, match=re.escape(message)):
         read(file)
+
+
+def save_mat(file, content):
+    scipy.io.savemat(file, content)
+
+
+def save_hdf5(file, content):
+    with h5py.File(file, "w") as stored:
+        for name, array in content.items():
+            stored[f"room/{name}"] = array
+
+
+def save_mat73(file, content):
+    """As MATLAB does: reversed axes, matrices alone, doubles alone, a compound type for complex numbers."""
+    with h5py.File(file, "w", userblock_size=512) as stored:
+        for name, array in content.items():
+            array = np.atleast_2d(array).T
+            if array.dtype.kind == "c":
+                pairs = np.empty(array.shape, [("real", "f8"), ("imag", "f8")])
+                pairs["real"], pairs["imag"] = array.real, array.imag
+                array = pairs
+            else:
+                array = array.astype("f8")
+            stored[name] = array
+            stored[name].attrs["MATLAB_class"] = np.bytes_("double")
+
+
+@pytest.mark.parametrize(
+    ("save", "name", "group"),
+    [(save_mat, "a.mat", ""), (save_mat73, "a.mat", ""), (save_hdf5, "a.h5", "room/"), (save_hdf5, "a.hdf5", "room/")],
+)
+def test_matlab_and_hdf5_files_have_the_same_links(file, tmp_path, save, name, group):
+    save(tmp_path / name, arrays() | {"notes": np.ones(3)})
+    names = {name: group + name for name in arrays()} if group else {}
+    links = csi_npz.read(tmp_path / name, names)
+    expected = csi_npz.read(file)
+    assert torch.equal(links.labels, expected.labels)
+    assert torch.equal(links.query.transmitters, expected.query.transmitters)
+    assert torch.equal(links.query.receivers, expected.query.receivers)
+    assert torch.equal(links.task.frequencies, expected.task.frequencies)
+    assert links.remarks == f"{expected.remarks}; arrays ignored: {group}notes"
+
+
+@pytest.mark.parametrize("save", [save_mat, save_mat73])
+def test_matlab_drops_the_axis_of_a_single_subcarrier(tmp_path, save):
+    content = arrays() | {"frequencies": 2.4e9, "h": arrays()["h"][..., 0]}
+    save(tmp_path / "room.mat", content)
+    labels = csi_npz.read(tmp_path / "room.mat").labels
+    np.testing.assert_array_equal(labels, arrays()["h"][..., :1].astype(np.complex64))
+
+
+def test_parts_of_complex_numbers_are_joined(file):
+    h, expected = arrays()["h"], csi_npz.read(file).labels
+    changed(file, h=None, re=h.real, im=h.imag)
+    assert torch.equal(csi_npz.read(file, {"h": ["re", "im"]}).labels, expected)
+    for axis in (0, -1):
+        changed(file, h=np.stack((h.real, h.imag), axis))
+        assert torch.equal(csi_npz.read(file).labels, expected)
+
+
+def test_a_single_receiver_needs_no_index(file):
+    changed(file, rx=arrays()["rx"][:1], rx_index=None)
+    assert csi_npz.read(file).query.receivers.tolist() == [0] * 10
+    changed(file, rx_index=None)
+    with pytest.raises(ValueError, match="rx_index: expected one array of whole numbers"):
+        csi_npz.read(file)
+
+
+def test_wrong_names_of_arrays_are_refused(file):
+    for names, message in (
+        ({"H": "CSI"}, "data.arrays has no array 'H'; it has: tx, rx, rx_index, frequencies, h, elements"),
+        ({"h": "CSI"}, "h: expected one array of complex numbers of (n, e, s), got 0 called 'CSI' among ['tx',"),
+        ({"tx": ["x", "y"]}, "tx: data.arrays has 2 names"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            csi_npz.read(file, names)
+
+
+@pytest.mark.parametrize("save", [save_mat, save_mat73])
+def test_damaged_matlab_files_are_refused(tmp_path, save):
+    path = tmp_path / "room.mat"
+    save(path, arrays())
+    content = path.read_bytes()
+    for part in (content[: len(content) // 2], content[:600], b"no file of MATLAB"):
+        path.write_bytes(part)
+        with pytest.raises(ValueError, match=r"cannot parse .*room\.mat"):
+            csi_npz.read(path)
+
+
+def test_the_reader_declares_the_phase(file):
+    assert load({"name": "csi_npz", "file": str(file), "phase": "per_link"}, RANDOM).task.phase == "per_link"
+
+
+def test_receivers_may_have_different_numbers_of_elements(file):
+    """The third receiver lacks its first element."""
+    content = arrays()
+    elements, h = np.stack([content["elements"]] * 3), content["h"]
+    elements[2, 0] = np.nan
+    at_third = content["rx_index"] == 2
+    with pytest.raises(ValueError, match=r"h\[1, 0\]: expected 0 at an element without a position"):
+        csi_npz.read(changed(file, elements=elements))
+    h[at_third, 0] = 0
+    links = read(changed(file, elements=elements, h=h))
+    assert [len(receiver.array) for receiver in links.receivers] == [3, 2]
+    np.testing.assert_array_equal(links.receivers[1].array.elements, elements[2, 1:].astype(np.float32))
+    np.testing.assert_array_equal(links.labels[at_third][:, :2], h[at_third][:, 1:].astype(np.complex64))
+    assert not links.labels[at_third][:, 2].any()
+    check_data(links)
+    elements[1] = np.nan
+    with pytest.raises(ValueError, match=r"elements\[1\]: expected an element of each receiver, got NaN alone"):
+        read(changed(file, elements=elements, h=h))

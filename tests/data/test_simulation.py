@@ -35,7 +35,7 @@ def simulate(data, **options):
         ("synthetic_rssi", {"sensitivity": 0.0}, "sensitivity must let each .* 'west' hears none of 4 at 0 dBm; lower"),
         ("synthetic_csi", {"subcarriers": 0}, "subcarriers must be at least 1, got 0"),
         ("synthetic_csi", {"bandwidth": 0.0}, r"bandwidth must be positive \[Hz\], got 0.0"),
-        ("synthetic_csi", {"bandwidth": 14e9}, "frequencies must be positive"),
+        ("synthetic_csi", {"bandwidth": 14e9}, "must have positive, finite frequencies"),
         ("sionna", {"room": "round"}, "room must be one of l_shape, slanted, furnished, got 'round'"),
         ("sionna", {"transmitters": 1}, "transmitters must be at least 2"),
     ],

@@ -130,26 +130,43 @@ def test_nothing_changes_for_gaigs_where_all_is_moved(dtype, task, tokenizer):
 @pytest.mark.parametrize("task", DATA)
 @pytest.mark.parametrize("is_coherent", [False, True])
 def test_nothing_changes_for_mirrored_gaussians_where_all_is_moved(task, is_coherent):
-    """In float64: float32 rounds a plane 1e6 m from the origin to a tenth of a metre."""
+    """In float64: float32 rounds an image 1e6 m from the origin to a tenth of a metre."""
     overrides = (*MIRRORED, f"pooling=path_{task}")
     links, far = links_of(task, True), links_of(task, True, FAR)
     model = model_of(links, overrides, torch.float64)
     there = model_of(far, overrides, torch.float64)
-    here, moved, shift = model.placement, there.placement, FAR.double()
     there.load_state_dict(model.state_dict())
-    with torch.no_grad():
-        moved.origin[:, :3] = here.normals
-        moved.origin[:, 3] = here.offsets + here.normals @ shift
-        moved.shifts.zero_()
-        moved.middles.add_(shift)
-        moved.obstacles.origin.add_(shift)
     if is_coherent:
-        here.enable_phases(0.06)
-        moved.enable_phases(0.06)
+        model.placement.enable_phases(0.06)
+        there.placement.enable_phases(0.06)
     with torch.no_grad():
         values = [answer(part, own, torch.float64) for part, own in ((model, links), (there, far))]
     assert (values[0].abs() > 0).any()
     require_close(values[1], values[0], 1e-4)
+
+
+@pytest.mark.parametrize("task", DATA)
+def test_mirrored_gaussians_learn_alike_wherever_the_worlds_origin_is(task):
+    """In float32: a turn of a plane moves it as far, and no image is rounded."""
+    losses = []
+    for shift in (0.0, 16.0, 5000.0):
+        links = links_of(task, True, torch.tensor([shift, -shift, 0.0]))
+        model = model_of(links, (*MIRRORED, f"pooling=path_{task}"), torch.float32)
+        model.placement.enable_phases(0.06)
+        if task == "csi":
+            model.placement.enable_reflections()
+        batch, losses = links.batch(links.split.train), [*losses, []]
+        optimizer = torch.optim.Adam(model.parameters(), 1e-2)
+        for _ in range(12):
+            loss = (model(batch).value - batch.labels).abs().mean() / batch.labels.abs().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses[-1].append(loss.item())
+    here, *there = torch.tensor(losses)
+    assert here[-1] < 0.99 * here[0]
+    for far in there:
+        torch.testing.assert_close(far, here, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("placement", registry("placement").names())

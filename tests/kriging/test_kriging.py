@@ -211,6 +211,16 @@ def test_a_trend_without_information_leaves_the_plain_process(task, monkeypatch)
     assert torch.equal(model.predict(query), blind.predict(query)), "test labels count"
 
 
+@TASKS
+@pytest.mark.parametrize("trained", [0.0, 1.0])
+def test_a_trend_that_scores_worse_than_its_fallback_is_reported(task, trained, caplog):
+    links = make(task, smooth=1.0 - trained, trained=trained, noise=0.1)
+    Kriging(links.scene, Trained(links.scene)).fit(links)
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert [message.split(":")[0] for message in said] == ([] if trained else ["the room was not learnt"])
+    assert trained or "falls back on kriging of mean" in said[0]
+
+
 @pytest.mark.parametrize(("task", "weight"), [("spectrum", 0.25), ("csi", 0.75)])
 def test_the_trend_weight_is_that_of_the_labels(task, weight):
     assert kriged(make(task, smooth=0.3, trained=weight, noise=0.05))[0].trend_weight == weight

@@ -14,6 +14,7 @@ TASK = Csi(3, 1e9 + 1e6 * torch.arange(5))
 
 FLOOR = 1e-3
 LOSSES = RelativeError(TASK), LogRelativeError(TASK, FLOOR)
+ALIGNED = [LogRelativeError(Csi(3, TASK.frequencies, phase), FLOOR) for phase in ("per_link", "per_link_and_delay")]
 both = pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: loss.name)
 
 
@@ -51,7 +52,7 @@ def test_each_link_counts_alike_however_weak_its_channel_is(pair):
     assert values.grad.flatten(1).any(1).all()
 
 
-@both
+@pytest.mark.parametrize("loss", [*LOSSES, *ALIGNED])
 def test_gradients_are_the_derivatives(pair, loss):
     values, labels = pair
     assert torch.autograd.gradcheck(lambda values: loss_of(values, labels, loss)[0], values.clone().requires_grad_())
@@ -83,3 +84,22 @@ def test_a_link_pulls_the_less_the_deeper_its_shadow_is(pair, shadow):
     assert pulls(labels)[0].item() == pytest.approx(expected, rel=1e-4)
     assert expected < change / 6
     assert pulls(labels)[1:] == pytest.approx(pulls(pair[1])[1:])
+
+
+@pytest.mark.parametrize("loss", ALIGNED)
+def test_unknown_phases_leave_loss_and_gradient_as_they_are(pair, loss):
+    values, labels = (part.requires_grad_() for part in pair)
+    phases = torch.linspace(-3, 3, 6, dtype=torch.float64)
+    turned = labels.detach() * torch.polar(torch.ones_like(phases), phases)[:, None, None]
+    found = [loss_of(values, part, loss)[0] for part in (labels.detach(), turned)]
+    assert found[1].item() == pytest.approx(found[0].item())
+    torch.testing.assert_close(*(torch.autograd.grad(each, values)[0] for each in found), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("loss", ALIGNED)
+def test_a_prediction_of_silence_has_a_loss_and_a_gradient(pair, loss):
+    values = torch.zeros_like(pair[0], requires_grad=True)
+    each, _ = loss_of(values, pair[1], loss)
+    each.backward()
+    assert each.item() == pytest.approx(np.log((1 + 1 / FLOOR) / (1 + FLOOR)))
+    assert values.grad.isfinite().all()

@@ -49,7 +49,8 @@ def walled(model):
     with torch.no_grad():
         for wall, material in enumerate(EMPTY.walls):
             axis, side = divmod(wall, 2)
-            placement.place(wall, torch.eye(3)[axis] * (1 if side else -1), EMPTY.size[axis] if side else 0.0)
+            normal, offset = torch.eye(3)[axis] * (1 if side else -1), EMPTY.size[axis] if side else 0.0
+            placement.place(wall, normal, float(offset - normal @ placement.middle))
             epsilon = permittivity(material, CARRIER)
             placement.log_permittivities[wall] = math.log(epsilon.real - 1)
             placement.log_conductivities[wall] = math.log(-epsilon.imag)
@@ -99,26 +100,27 @@ BENT = Array(torch.tensor([[0, 0, 0], [0.02, -0.01, 0.03], [-0.3, 0.2, 0.1], [0.
 
 @pytest.mark.parametrize("array", [Array.planar(2, 2, speed_of_light / CARRIER / 2), BENT], ids=["planar", "bent"])
 def test_with_the_rooms_walls_it_predicts_channels(array):
+    """Also 100 MHz away, at subcarriers that no label had."""
     receiver = Receiver("gateway1", POSE, array)
-    offsets = FREQUENCIES - CARRIER
-    labels = respond(EMPTY, place(12, 0), receiver, CARRIER, offsets, 2).to(torch.complex64)
-    links = links_of(labels, Csi(4, FREQUENCIES), receiver)
+    both = FREQUENCIES, FREQUENCIES[1:] + 1e8
+    labels = [respond(EMPTY, place(12, 0), receiver, CARRIER, part - CARRIER, 2).to(torch.complex64) for part in both]
+    links = links_of(labels[0], Csi(4, FREQUENCIES), receiver)
     model = walled(build(links, pooling="path_csi"))
     model.placement.enable_phases(speed_of_light / CARRIER)
-    with torch.no_grad():
-        found = model(links.batch(torch.arange(12))).value
-    assert found.dtype == torch.complex64
-    noise = (found - labels).abs().square().sum((1, 2)) / labels.abs().square().sum((1, 2))
-    assert -10 * noise.log10().mean() > 45
+    for expected, frequencies in zip(labels, both, strict=True):
+        found = model.predict(links.query, frequencies=frequencies)
+        assert found.dtype == torch.complex64
+        noise = (found - expected).abs().square().sum((1, 2)) / expected.abs().square().sum((1, 2))
+        assert -10 * noise.log10().mean() > 45
 
 
 @pytest.mark.parametrize("conjugated", [False, True])
 @pytest.mark.parametrize("array", [Array.planar(2, 2, 0.02, "cosine"), BENT], ids=["planar", "bent"])
 def test_channels_start_from_free_space(array, conjugated):
-    """As ``friis`` has it on the training links: gain and phase of each of two receivers, in either time convention."""
+    """Those of few numbers, as ``friis`` has it: gain and phase of each of two receivers, in either time convention."""
     poses = POSE, replace(POSE, position=torch.tensor([4.0, 3.0, 2.0]))
     receivers = tuple(Receiver(f"gateway{k}", pose, array) for k, pose in enumerate(poses))
-    offsets, places, gains = FREQUENCIES - CARRIER, place(60, 0), (3e-3j, 50.0 - 20j)
+    offsets, places, gains = FREQUENCIES[:1] - CARRIER, place(60, 0), (3e-3j, 50.0 - 20j)
     each = [respond(EMPTY, places, receiver, CARRIER, offsets, 1) for receiver in receivers]
     each = [gain * waves for gain, waves in zip(gains, each, strict=True)]
     labels = torch.stack(each, 1).flatten(0, 1).to(torch.complex64)
@@ -126,7 +128,7 @@ def test_channels_start_from_free_space(array, conjugated):
         query=Query(places.repeat_interleave(2, 0), torch.arange(2).repeat(60)),
         receivers=receivers,
         labels=labels.conj().resolve_conj() if conjugated else labels,
-        task=Csi(4, FREQUENCIES),
+        task=Csi(4, FREQUENCIES[:1]),
         split=Split("most", torch.arange(80), torch.arange(80, 100), torch.arange(100, 120)),
     )
     model = build(links, pooling="path_csi", placement=MIRRORED | {"obstacles": 9})
@@ -141,6 +143,13 @@ def test_channels_start_from_free_space(array, conjugated):
     model.placement.enable_reflections()
     with torch.no_grad():
         assert (model(links.batch(split.test)).value - expected).abs().max() > 0.1 * expected.abs().max()
+
+
+def test_channels_of_order_0_need_no_planes():
+    links = example_links("csi")
+    model = build(links, pooling="path_csi", placement=MIRRORED | {"order": 0})
+    model.fit(links)
+    assert model.predict(links.query).isfinite().all()
 
 
 def test_with_the_rooms_walls_it_predicts_signal_strength():
@@ -185,6 +194,17 @@ def test_levels_need_no_carrier():
     index = torch.arange(6)
     torch.testing.assert_close(model(unknown.batch(index)).value, other(known.batch(index)).value)
     check_model(lambda scene: build(replace(unknown, receivers=scene.receivers), pooling=pooling), unknown)
+
+
+def test_paths_to_several_gateways_are_summed_at_once():
+    links = example_links("rssi", 5e9)
+    model = build(links, pooling="path_rssi")
+    model.placement.enable_phases(0.06)
+    batch = links.batch(torch.arange(12))
+    assert model.pooling.is_same_for_all
+    together = model(batch).value
+    model.pooling.is_same_for_all = False
+    torch.testing.assert_close(model(batch).value, together)
 
 
 def test_gradients_reach_all_that_paths_have():
@@ -261,6 +281,17 @@ def test_phases_come_with_a_band_that_is_chosen_and_planes_that_move(monkeypatch
     assert abs(moved + 0.02) < speed_of_light / CARRIER / 10
     assert loss(batch) < 0.2 * wrong
     assert model.revise(4, batch, batch, loss).endswith(f"-> {loss(batch):.4f}")
+
+
+def test_a_search_by_phases_is_bounded_in_a_large_room(monkeypatch, caplog):
+    links = room_spectra("band", 6)
+    placement, reaches = build(links).placement, []
+    monkeypatch.setattr(search, "_move", lambda *arguments: reaches.append(arguments[2]) or 0.0)
+    caplog.set_level("INFO")
+    for least in (0.2, 1000.0):
+        search.move_planes(placement, links.batch(torch.arange(4)), 0.06, least, lambda batch: 0.0)
+    assert {*reaches} == {4 * 0.06, 50 * 0.06}
+    assert "planes are searched within 3 m, not 1e+03 m" in caplog.text
 
 
 def test_fixed_planes_do_not_move_and_unknown_carriers_have_no_phases():

@@ -22,7 +22,8 @@ def is_found(placement, wall):
     """To 5 degrees and 0.25 m, from which descent goes on; a plane has two normals."""
     *normal, offset = WALLS[wall]
     along = placement.normals[wall] @ torch.tensor(normal)
-    return abs(along) > math.cos(math.radians(5)) and abs(placement.offsets[wall] * along.sign() - offset) < 0.25
+    found = placement.offsets[wall] + placement.normals[wall] @ placement.middle
+    return abs(along) > math.cos(math.radians(5)) and abs(found * along.sign() - offset) < 0.25
 
 
 def without(model, wall):

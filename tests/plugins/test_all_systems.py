@@ -24,12 +24,19 @@ SMALL = {
     "nerf2": "model.samples=4 model.rays=[2,4] model.octaves=2 model.width=8 model.layers=3",
     "nerf_apt": "model.samples=4 model.rays=[3,8] model.octaves=2 model.widths=[2,3,4]",
     "newrf": "model.arrivals=3 model.samples=4 model.octaves=2 model.width=8 model.layers=5",
+    "ngrf": "model.count=3 model.width=8 model.layers=2",
     "gsrf": "model.count=60",
     "rf_3dgs": "gaussians.count=40 rasterizer=torch",
     "swift_wrf": "model.count=40 model.width=16 model.layers=3",
     **dict.fromkeys(("wide_gs", "wrf_gs", "wrf_gs_plus"), SPLATS),
 }
-TASKS = {"array_response": ["spectrum"], "rf_3dgs": ["spectrum"], "swift_wrf": ["spectrum"], "newrf": ["csi"]}
+TASKS = {
+    "array_response": ["spectrum"],
+    "rf_3dgs": ["spectrum"],
+    "swift_wrf": ["spectrum"],
+    "newrf": ["csi"],
+    "ngrf": ["csi"],
+}
 CARRIERS = (2.4e9, 5.0e9, 5.8e9)
 
 
@@ -115,6 +122,7 @@ LEAST = {
     "nerf2": {"samples": 2, "octaves": 0, "width": 2, "layers": 2},
     "nerf_apt": {"octaves": 0},
     "newrf": {"arrivals": 1, "samples": 2, "octaves": 0, "view_octaves": 0, "width": 1, "layers": 1},
+    "ngrf": {"count": 1, "width": 1, "layers": 1},
     "fire": {"latent": 1},
     "dcgan": {"width": 1, "noise": 1},
     "wrf_kan": {"intervals": 1},
@@ -161,6 +169,7 @@ def test_sizes_of_deformations_below_the_least_are_refused(name, option, least):
         ("mlp", {"dropout": 1.0}, r"model\.dropout must be in \[0, 1\), got 1\.0"),
         ("fire", {"widths": [4, 0, 4]}, r"model\.widths must be of at least 1"),
         ("gsrf", {"radius": 0.0}, "model.radius must be positive"),
+        ("ngrf", {"scale": 0.0}, "model.scale must be positive, got 0"),
         ("gsrf", {"count": 1}, "a point for each of the 2 receivers"),
         ("gsrf", {"margin": 0.0}, "model.margin must be positive"),
         ("gsrf", {"pooling": {"name": "spectrum", "channels": 1}}, "pooling 'spectrum' takes 1 real channel"),
@@ -177,8 +186,9 @@ def test_sizes_of_deformations_below_the_least_are_refused(name, option, least):
     ],
 )
 def test_options_out_of_range_are_refused(name, options, message):
+    task = TASKS.get(name, ["spectrum"])[0]
     with pytest.raises(ValueError, match=message):
-        make(name, links_of("spectrum").scene, **options)
+        make(name, links_of(task).scene, task, **options)
 
 
 def of_task(task):
@@ -196,6 +206,8 @@ def seen_in(elevations):
         *((name, links_of("spectrum", CARRIERS[:2]).scene, "of one carrier, and these links have 2")
           for name in ("array_response", "nerf2", "nerf_apt", "gsrf")),
         ("newrf", links_of("csi", CARRIERS[:2]).scene, "of one carrier, and these links have 2"),
+        ("ngrf", links_of("csi", CARRIERS[:2]).scene, "of one carrier, and these links have 2"),
+        ("ngrf", of_task("rssi"), "gives complex channels, not labels of task 'rssi'"),
         ("newrf", of_task("rssi"), "gives complex channels, not labels of task 'rssi'"),
         ("newrf", replace(of_task("csi"), task=Csi(4, torch.tensor([2.4e9]))), "a single subcarrier"),
         ("array_response", of_task("csi"), "predicts spectra"),
@@ -210,7 +222,7 @@ def seen_in(elevations):
 )  # fmt: skip
 def test_labels_and_carriers_that_do_not_suit_are_refused(name, scene, message):
     with pytest.raises(ValueError, match=message):
-        make(name, scene, "csi" if name == "newrf" else "spectrum")
+        make(name, scene, *TASKS.get(name, ["spectrum"]))
 
 
 @pytest.mark.parametrize("name", ["nerf2", "gsrf"])

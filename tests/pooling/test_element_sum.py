@@ -128,7 +128,7 @@ def test_the_fit_reads_no_test_label():
 
 def test_other_labels_and_arrays_are_refused():
     links = make()
-    receivers = links.receivers[0], replace(links.receivers[1], array=Array.single())
+    receivers = links.receivers[0], replace(links.receivers[1], array=Array.planar(3, 3, 0.06))
     cases = [
         (example_links("rssi").scene, [4, 8], "pooling 'element_sum' gives complex channels"),
         (replace(links, receivers=receivers).scene, [4, 8], "gateway1"),

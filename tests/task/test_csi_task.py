@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from gaigs.task.csi import HIGHEST, Csi
+from gaigs.testing import check_task
 
 FREQUENCIES = 2.4e9 + 312.5e3 * torch.arange(6, dtype=torch.float64)
 TASK = Csi(3, FREQUENCIES)
@@ -99,10 +100,9 @@ def test_the_summary_is_that_of_numpy(pairs):
         p10, p90 = np.percentile(score, [10, 90])
         numbers = {"median": np.median(score), "mean": score.mean(), "p10": p10, "p90": p90}
         expected |= {f"{name}_{what}": number for what, number in numbers.items()}
-        if name == "snr_db":
-            labels, values = (part.numpy().astype(np.complex128) for part in pairs)
-            error, power = (abs(labels - values) ** 2).sum(), (abs(labels) ** 2).sum()
-            expected |= {"sinad_db_mean": scores["sinad_db"].mean().item(), "nmse_db": 10 * np.log10(error / power)}
+    labels, values = (part.numpy().astype(np.complex128) for part in pairs)
+    error, power = (abs(labels - values) ** 2).sum(), (abs(labels) ** 2).sum()
+    expected |= {"sinad_db_mean": scores["sinad_db"].mean().item(), "nmse_db": 10 * np.log10(error / power)}
     summary = TASK.summarise(scores)
     assert [*summary] == [*expected] == [*Csi.metrics()]
     assert summary == pytest.approx(expected, rel=1e-6)
@@ -152,3 +152,80 @@ def test_frequencies_are_kept_to_the_hertz():
     assert task.frequencies.tolist() == [2_437_000_001, 2_437_000_002]
     assert task.shape == (1, 2)
     assert task.directions is None
+
+
+OTHERS = [Csi(3, FREQUENCIES, phase) for phase in ("per_link", "per_link_and_delay")]
+others = pytest.mark.parametrize("task", OTHERS, ids=lambda task: task.phase)
+
+
+@others
+def test_the_contract_holds(task):
+    check_task(task)
+
+
+def as_measured(task, channels, seed=1):
+    """Channels with a random phase a link, and with a delay and a gain where the task says so."""
+    random = np.random.default_rng(seed)
+    phases, delays, gains = random.uniform(-1, 1, (3, len(channels), 1, 1))
+    turned = channels.numpy() * np.exp(1j * np.pi * phases)
+    if task.phase == "per_link_and_delay":
+        offsets = FREQUENCIES.numpy() - FREQUENCIES.numpy().mean()
+        turned = turned * np.exp(2j * np.pi * offsets * 1e-6 * delays) * 10**gains
+    return torch.from_numpy(turned)
+
+
+def best_likeness(task, h, guess):
+    """|<h', h>| / (|h| |h'|) of one link at the best of many phases and delays."""
+    offsets = FREQUENCIES.numpy() - FREQUENCIES.numpy().mean()
+    delays = np.linspace(-1.6e-6, 1.6e-6, 40_001) if task.phase == "per_link_and_delay" else np.zeros(1)
+    cross = (h.conj() * guess).sum(0) @ np.exp(2j * np.pi * np.outer(offsets, delays))
+    return abs(cross).max() / np.linalg.norm(h) / np.linalg.norm(guess)
+
+
+@others
+def test_labels_are_aligned_as_well_as_a_search_can(task, pairs):
+    labels, values = (part.to(torch.complex128) for part in pairs)
+    turned = task.align(labels, values)
+    scores = task.scores(labels, values)
+    assert "snr_db" not in scores
+    for k, (h, guess, found) in enumerate(zip(*(part.numpy() for part in (labels, values, turned)), strict=True)):
+        best = best_likeness(task, h, guess)
+        sizes = np.linalg.norm(found), np.linalg.norm(guess)
+        likeness = np.vdot(found, guess) / sizes[0] / sizes[1]
+        assert likeness.real == pytest.approx(best, abs=1e-6)
+        assert likeness.imag == pytest.approx(0, abs=1e-9)
+        if task.phase == "per_link_and_delay":
+            assert sizes[0] == pytest.approx(sizes[1])
+            expected = -10 * np.log10(1 - best**2)
+        else:
+            turned = torch.from_numpy(guess * np.exp(-1j * np.angle(np.vdot(h, guess))))
+            expected = snr(labels[k : k + 1], turned[None]).item()
+        assert scores["snr_aligned_db"][k].item() == pytest.approx(expected, abs=2e-3)
+
+
+@others
+def test_what_is_unknown_of_a_link_changes_no_score(task, pairs):
+    labels, values = (part.to(torch.complex128) for part in pairs)
+    here, there = task.scores(labels, values), task.scores(as_measured(task, labels), values)
+    for name in ("snr_aligned_db", "sinad_db"):
+        torch.testing.assert_close(there[name], here[name], rtol=1e-6, atol=1e-6)
+    numbers = task.summarise(here)
+    assert next(iter(numbers)) == "snr_aligned_db_median"
+    assert not any(name.startswith("snr_db") for name in numbers)
+    torch.testing.assert_close(
+        task.scores(as_measured(task, values), values)["snr_aligned_db"], torch.full((7,), HIGHEST).double()
+    )
+
+
+def test_subcarriers_in_any_order_and_unevenly_spaced_have_one_delay():
+    frequencies = torch.tensor([5.18e9, 5.2e9, 5.1801e9, 5.19e9, 5.1903e9, 5.185e9, 5.1951e9])
+    task = Csi(1, frequencies, "per_link_and_delay")
+    channel = torch.randn(4, 1, 7, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    delays = torch.tensor([-40e-9, -3e-9, 0, 33e-9], dtype=torch.float64)
+    turns = torch.exp(2j * torch.pi * (task.frequencies - 5.2e9) * delays[:, None])[:, None]
+    torch.testing.assert_close(task.align(turns * channel, channel), channel, rtol=1e-6, atol=1e-6)
+
+
+def test_a_misspelt_phase_is_refused():
+    with pytest.raises(ValueError, match=r"data\.phase must be known or per_link or per_link_and_delay, got 'perlink'"):
+        Csi(1, FREQUENCIES, "perlink")

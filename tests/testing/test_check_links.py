@@ -205,7 +205,7 @@ SPECTRUM = LINKS.task.directions.elevations, LINKS.task.directions.azimuths, "no
         (having(Rssi, summarise=cheerful), "a summary of no samples must be a ValueError"),
         (
             broken(Rssi, lambda numbers, *_: {f"{name}_db": number for name, number in numbers.items()}, "summarise"),
-            "summarise must give mae_db, median_ae_db, rmse_db, got mae_db_db",
+            "summarise must give some of mae_db, median_ae_db, rmse_db, got mae_db_db",
         ),
         (broken(Spectrum, lambda o: o | {"normalisation": "forgotten"}, "options"), "task's state must restore it"),
         (Parted, "labels and directions must be thinned together"),

@@ -140,6 +140,22 @@ def test_rays_are_random_pixels_of_all_links_alike(links, tmp_path):
     assert "validation/ssim" in trainer.callback_metrics, "of whole spectra"
 
 
+def test_a_step_takes_some_links_anew(links, monkeypatch):
+    batch, seen = links.batch(torch.arange(12)), []
+    module = make_module(links)
+    module.links = 5
+    for step in range(40):
+        monkeypatch.setattr(type(module), "global_step", step)
+        part = module.prepare(batch)
+        rows = (part.query.transmitters[:, None] == batch.query.transmitters).all(-1).nonzero()[:, 1].tolist()
+        assert len(part) == len(part.labels) == len({*rows}) == 5
+        seen.append(tuple(rows))
+    assert len({*seen}) > 30
+    assert {*sum(seen, ())} == {*range(12)}
+    module.links = 12
+    assert len(module.prepare(batch)) == 12
+
+
 def test_jitter_moves_all_links_of_a_place_alike_and_anew_in_every_step(links, tmp_path, monkeypatch):
     """Links by threes at one place; the third of them has another carrier."""
     places, carriers = torch.arange(12) // 3, torch.tensor([1e9, 1e9, 1.1e9]).repeat(4)

@@ -92,11 +92,12 @@ def survey(placement: Mirrored, query: Query) -> Survey:
         part = part.to(device)
         powers.append(placement(None, part).gains.abs().square())
         receivers.append(positions[part.receivers])
-        seen = images(part.transmitters, sequences, normals, offsets)
-        folded = fold(seen, receivers[-1], sequences, normals, offsets)
+        middle = placement.middle
+        seen = images(part.transmitters - middle, sequences, normals, offsets)
+        folded = fold(seen, receivers[-1] - middle, sequences, normals, offsets)
         points = normals.new_full((len(part), *sequences.shape, 3), torch.nan)
         for back, met in enumerate(folded.bounces, 1):
-            points[:, met.first :, -back] = met.points
+            points[:, met.first :, -back] = met.points + middle
         bounces.append(points)
     parts = sequences, torch.cat(powers).double(), torch.cat(bounces), query.transmitters, torch.cat(receivers)
     return Survey(*(part.cpu().numpy() for part in parts))
@@ -135,7 +136,9 @@ def _planes(placement: Mirrored, found: Survey) -> Planes:
     permittivities = torch.complex(1 + placement.log_permittivities.exp(), -placement.log_conductivities.exp())
     reflected, _ = fresnel(permittivities, torch.ones_like(permittivities.real))
     gains = reflected.abs().log() + placement.plane_gains
-    parts = placement.normals, placement.offsets, gains, placement.middles, placement.log_extents.exp()
+    middle = placement.middle.double()
+    offsets, middles = placement.offsets + placement.normals.double() @ middle, placement.middles + middle
+    parts = placement.normals, offsets, gains, middles, placement.log_extents.exp()
     normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
     # The middle of the reflecting area need not lie on the plane: take the plane's point with the least loss.
     steep = extents**2 * normals
@@ -241,7 +244,7 @@ def learnt_room(placement: Mirrored, links: Links) -> LearntRoom:
     matter = None
     if placement.obstacles is not None:
         blobs = placement.obstacles
-        parts = blobs.centres, blobs.widths, NEPER * blobs.densities
+        parts = blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities
         matter = Matter(*(part.cpu().double().numpy() for part in parts))
     heard = survey(placement, test[first])
     powers = heard.powers / heard.powers.max(initial=np.finfo(float).tiny)
@@ -264,7 +267,7 @@ def export(placement: Mirrored, query: Query, folder: Path) -> None:
     # Grey, and as opaque as the share of power lost through the middle of an obstacle of its mean width.
     depths = blobs.densities * math.sqrt(2 * math.pi) * blobs.widths.log().mean(1).exp()
     parts = {
-        "means": blobs.centres,
+        "means": blobs.centres + placement.middle,
         "quats": torch.tensor([1.0, 0, 0, 0]).expand(len(blobs), 4),
         "log_scales": blobs.log_widths,
         # log((1 - t) / t) with t = exp(-2 depth), without a difference of nearly equal numbers.

@@ -17,9 +17,9 @@ from gaigs.data import Links
 from gaigs.gaussians import SH_DC, Gaussians, Placed
 from gaigs.placement import Placement
 from gaigs.placement.mirrored.obstacles import Obstacles
-from gaigs.placement.mirrored.reflections import Folded, all_sequences, fold, images
+from gaigs.placement.mirrored.reflections import Folded, all_sequences, fold, images, largest_order
 from gaigs.placement.mirrored.walls import read_planes
-from gaigs.propagation import NEAREST, fresnel
+from gaigs.propagation import NEAREST, fresnel, slab
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene, carriers
@@ -35,6 +35,12 @@ TILT = 0.05
 PERMITTIVITY, CONDUCTIVITY = 4.0, 0.3
 """Real and imaginary part of the planes' relative permittivity at the start: between wood and concrete."""
 
+MOST = 100_000
+"""Largest number of sequences of planes: of 10 planes those of order 5."""
+
+FAINT = 1e-3
+"""Largest share of a link's power, obstacles apart, of a path that skips the obstacles: two of three paths."""
+
 UNIT = 0.12
 """Unit of the parameters of plane offsets [diagonals of the box]: learning rates suit rooms of any size."""
 
@@ -44,24 +50,27 @@ class Mirrored(Placement):
     """Gaussians at p_k = V_k x ~V_k, with the transmitter x and the product V_k of at most ``order`` plane vectors.
 
     In projective geometric algebra a plane is a vector, and its sandwich product mirrors. All paths and receivers share
-    the planes, so direction, path length L and spreading follow from geometry. The field of path k is
+    the planes, so direction, path length L and spreading follow from geometry. Planes, their middles and obstacles are
+    held about the ``middle`` of the room: neither rounding nor a turn of a plane depends on the world's origin. The
+    field of path k is
 
         a_k = F(u_k) / L_k  exp(g_k + g_r + j phi_k + j phi_r - tau_k - j 2 pi L_k / lambda)
               prod_w exp(g_w) Gamma_w(theta)
 
-    with the element's pattern F towards the image, times a learnt power of the cosine; the gain g and phase phi of a
-    path; the gain g_r and, of channels, the phase phi_r of a receiver; the gain g_w of a plane, which falls off as a
-    Gaussian about the plane's middle; Fresnel's reflection Gamma_w with a learnt permittivity; and the optical depth
-    tau_k of the obstacles along the folded path. Polarisation is vertical: TE at upright planes, TM at level ones,
-    weighted by n_z² in between. A path that does not meet its planes in their order does not exist.
+    with the element's pattern F towards the image, times a learnt power of the cosine; the gain g of a path and, except
+    of channels, its phase phi; the gain g_r and, of channels, the phase phi_r of a receiver; the gain g_w of a plane,
+    which falls off as a Gaussian about the plane's middle; Fresnel's reflection Gamma_w with a learnt permittivity, of
+    channels that of a slab with a learnt thickness; and the optical depth tau_k of the obstacles along the folded path.
+    Polarisation is vertical: TE at upright planes, TM at level ones, weighted by n_z² in between. A path that does not
+    meet its planes in their order does not exist.
 
     Paths add as powers until ``enable_phases``. Channels start from free space until ``enable_reflections``.
 
     Args:
         scene: Its box and receivers give the first planes.
         channels: Of the signal, 1 (amplitude) or 2 (complex).
-        planes: Largest number of planes; six at the start, the search finds the others.
-        order: Largest number of reflections of a path.
+        planes: Largest number of planes; six at the start, the search finds the others, and all planes of channels.
+        order: Largest number of reflections of a path; at most ``MOST`` sequences of planes.
         obstacles: Number of Gaussians of matter in the room; 0 for none.
         walls: File whose largest planes are the first ones: a floor plan ``.csv`` of consecutive vertices x,y [m], or a
             Wavefront ``.obj`` [m]. None: the box's faces. A checkpoint does not need the file.
@@ -76,7 +85,7 @@ class Mirrored(Placement):
     model = "mirrored"
     learning_rates: Mapping[str, float] = {"planes": 1e-2, "paths": 2e-2, "obstacles": 2.5e-2}
     penalty_weights: Mapping[str, float] = {"obstacles": 4e-4}  # matter only where paths are attenuated
-    pivot: Tensor
+    middle: Tensor
     origin: Tensor
     step: Tensor
     sequences: Tensor
@@ -84,6 +93,7 @@ class Mirrored(Placement):
     most: Tensor
     coherent: Tensor
     is_bare: Tensor
+    found: Tensor
     planned: Tensor
 
     def __init__(
@@ -100,6 +110,11 @@ class Mirrored(Placement):
         for option, value, least in (("planes", planes, BOX), ("order", order, 0), ("obstacles", obstacles, 0)):
             if value < least:
                 raise ValueError(f"placement.{option} must be at least {least}, got {value}")
+        if order > (fits := largest_order(planes, MOST)):
+            raise ValueError(
+                f"placement.order={order} gives more than {MOST:,} sequences of {planes} planes, each with parameters\n"
+                f"set placement.order={fits} or less, or fewer placement.planes"
+            )
         if channels not in (1, 2):
             raise ValueError(f"placement 'mirrored' has 1 or 2 channels, amplitude or complex, got {channels}")
         self.scene, self.channels, self.order = scene, channels, order
@@ -109,14 +124,13 @@ class Mirrored(Placement):
         lower = torch.cat((scene.lower[None], receivers)).amin(0)
         upper = torch.cat((scene.upper[None], receivers)).amax(0)
         self.box = lower, upper
-        self.diagonal = float((upper - lower).norm())
+        half = (upper - lower) / 2
+        self.register_buffer("middle", lower + half, persistent=False)
+        self.diagonal = 2 * float(half.norm())
         margin = 0.04 * self.diagonal
         faces = torch.cat((torch.eye(3), -torch.eye(3), torch.eye(3).repeat(-(-(planes - BOX) // 3), 1)))[:planes]
-        offsets = torch.cat((upper + margin, margin - lower, torch.zeros(planes - BOX)))
-        # Planes turn about a point within a diagonal of the box, wherever the world's origin is; 0 where that is near.
-        self.register_buffer("pivot", ((lower + upper) / (2 * self.diagonal)).trunc() * self.diagonal)
+        offsets = torch.cat((half + margin, half + margin, torch.zeros(planes - BOX)))
         normals = faces + TILT * torch.randn(planes, 3)
-        offsets = offsets + (functional.normalize(normals, dim=1) - faces) @ self.pivot
         self.register_buffer("origin", torch.cat((normals, offsets[:, None]), 1))
         self.register_buffer("step", torch.ones(()))
         sequences = all_sequences(planes, order)
@@ -125,6 +139,7 @@ class Mirrored(Placement):
         self.register_buffer("most", self.kept.sum())
         self.register_buffer("coherent", torch.tensor(False))
         self.register_buffer("is_bare", torch.tensor(False), persistent=is_complex)
+        self.register_buffer("found", torch.tensor(False), persistent=is_complex)
         self.register_buffer("planned", self.kept.clone(), persistent=is_complex)
 
         def filled(value: float, *shape: int) -> nn.Parameter:
@@ -135,9 +150,12 @@ class Mirrored(Placement):
         self.log_permittivities = filled(math.log(PERMITTIVITY - 1), planes)
         self.log_conductivities = filled(math.log(CONDUCTIVITY), planes)
         self.plane_gains = filled(0.0, planes)
-        self.middles = nn.Parameter(((lower + upper) / 2).repeat(planes, 1))
+        self.middles = filled(0.0, planes, 3)
         self.log_extents = filled(math.log(2.0 * self.diagonal), planes, 3)  # so wide that planes have no edges
-        self.path_gains, self.path_phases = filled(0.0, paths), filled(0.0, paths)
+        self.path_gains = filled(0.0, paths)
+        # Channels have phases enough to locate planes: a free phase would only hide a plane half a wavelength off.
+        self.path_phases = None if is_complex else filled(0.0, paths)
+        self.log_thicknesses = filled(0.0, planes) if is_complex else None  # [m]; a metre is a half-space
         self.log_spreads = filled(math.log(0.03), paths)  # [rad], far below the resolution of small arrays
         self.log_blurs = filled(math.log(0.3), paths)  # standard deviation of a path's phase [rad]
         self.receiver_gains, self.directivity = filled(0.0, antennas), filled(0.0)
@@ -145,10 +163,12 @@ class Mirrored(Placement):
         self.log_bandwidth = None
         if scene.bandwidth != 0 and not is_complex:
             self.log_bandwidth = filled(math.log(scene.bandwidth or speed_of_light / self.diagonal))
-        self.obstacles = Obstacles(obstacles, lower, upper) if obstacles else None
+        self.obstacles = Obstacles(obstacles, -half, half) if obstacles else None
         self.boresights = [torch.tensor([0.0, 0.0, 1.0])] * antennas
         if is_complex:
-            self.boresights = [boresight(receiver, (lower + upper) / 2) for receiver in scene.receivers]
+            self.boresights = [boresight(receiver, self.middle) for receiver in scene.receivers]
+        # Of a spectrum even faint paths show: where obstacles block the others.
+        self.skips_faint = not is_complex and scene.task.directions is None
         self.holds, self.held = False, None
 
     def fit(self, links: Links) -> None:
@@ -161,7 +181,7 @@ class Mirrored(Placement):
             log.warning("placement.planes: %s has %d planes, the first %d are taken", self.walls, len(planes), most)
         planes = planes[:most]
         for plane, (*normal, offset) in enumerate(planes):
-            self.place(plane, torch.stack(normal), offset.item())
+            self.place(plane, torch.stack(normal), (offset - torch.stack(normal) @ self.middle).item())
         self.kept.copy_(self.sequences_of(torch.arange(len(planes), device=self.kept.device)))
 
     @property
@@ -171,9 +191,8 @@ class Mirrored(Placement):
 
     @property
     def offsets(self) -> Float[Tensor, " w"]:
-        """Offsets of all planes along their normals, from the world's origin [m]."""
-        moved = self.origin[:, 3] + self.step * UNIT * self.diagonal * self.shifts[:, 3]
-        return moved + (self.normals - functional.normalize(self.origin[:, :3], dim=1)) @ self.pivot
+        """Offsets of all planes along their normals, from the middle of the room [m]."""
+        return self.origin[:, 3] + self.step * UNIT * self.diagonal * self.shifts[:, 3]
 
     @property
     def used(self) -> Int[Tensor, " k"]:
@@ -182,9 +201,18 @@ class Mirrored(Placement):
         return found[found >= 0]
 
     @torch.no_grad()
-    def place(self, plane: int, normal: Float[Tensor, "3"], offset: float) -> None:
+    def place(
+        self, plane: int, normal: Float[Tensor, "3"], offset: float, material: Float[Tensor, "3"] | None = None
+    ) -> None:
+        """Puts a plane at an offset along its normal, from the middle of the room [m].
+
+        A material is that of a slab: logarithms of the permittivity's real part over 1, of its imaginary part, and of
+        the thickness [m].
+        """
         self.origin[plane] = torch.cat((functional.normalize(normal, dim=0), normal.new_tensor([offset])))
         self.shifts[plane] = 0
+        if material is not None:
+            self.log_permittivities[plane], self.log_conductivities[plane], self.log_thicknesses[plane] = material
 
     def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
         """True for each sequence of these planes alone."""
@@ -227,20 +255,22 @@ class Mirrored(Placement):
         """Gaussians at the images of each transmitter, followed by the free ones."""
         sequences = self.sequences[self.kept]
         normals, offsets = self.normals, self.offsets
-        seen = images(query.transmitters, sequences, normals, offsets)
-        receivers = self.scene.positions(query.transmitters)[query.receivers]
+        seen = images(query.transmitters - self.middle, sequences, normals, offsets)
+        receivers = (self.scene.positions(query.transmitters) - self.middle)[query.receivers]
         lengths = (seen[-1] - receivers[:, None]).norm(dim=-1).clamp_min(NEAREST)
         strengths = self.held
         if strengths is None:
             strengths = self.strengths(query, fold(seen, receivers, sequences, normals, offsets))
-            strengths = strengths * self._patterns(query, seen[-1])
+            strengths = strengths * self._patterns(query, seen[-1] - receivers[:, None])
             if self.holds:
                 self.held = strengths
         gains = strengths / lengths
         coherences = torch.zeros_like(self.log_blurs[self.kept])
         if self.coherent:
             turns = lengths / (speed_of_light / carriers(self.scene, query).to(lengths))[:, None]
-            phases = self.path_phases[self.kept] - 2 * math.pi * (turns - turns.detach().round())
+            phases = -2 * math.pi * (turns - turns.detach().round())
+            if self.path_phases is not None:
+                phases = phases + self.path_phases[self.kept]
             if self.receiver_phases is not None:
                 phases = phases + self.receiver_phases[query.receivers, None]
             gains = gains * torch.polar(torch.ones_like(phases), phases)
@@ -254,24 +284,50 @@ class Mirrored(Placement):
         quats = signal.new_tensor([1.0, 0, 0, 0]).expand(len(sequences), 4)
         bandwidth = None if self.log_bandwidth is None else self.log_bandwidth.exp()
         ones = signal.new_ones(len(sequences))
-        placed = Placed(seen[-1], lengths, quats, scales, ones, signal, gains, coherences, bandwidth)
+        placed = Placed(seen[-1] + self.middle, lengths, quats, scales, ones, signal, gains, coherences, bandwidth)
         return placed if gaussians is None else _beside(placed, gaussians)
 
-    def strengths(self, query: Query, folded: Folded) -> Complex[Tensor, "b n"]:
+    def strengths(self, query: Query, folded: Folded, blocked: bool = True) -> Complex[Tensor, "b n"]:
         """Field of each kept path over free space, after reflections and obstacles; 0 for no path."""
         left = self.path_gains[self.kept] + self.receiver_gains[query.receivers, None]
-        if self.obstacles is not None and not self.is_bare:
-            left = left.index_add(1, folded.path, -self.obstacles(folded.start, folded.end))
         left = torch.complex(left.exp() * folded.exists, torch.zeros_like(left))
         normals = self.normals
         permittivities = torch.complex(1 + self.log_permittivities.exp(), -self.log_conductivities.exp())
         for first, planes, points, cosines in folded.bounces:
-            te, tm = fresnel(permittivities[planes], cosines)
+            if self.log_thicknesses is None:
+                te, tm = fresnel(permittivities[planes], cosines)
+            else:
+                wavelengths = speed_of_light / carriers(self.scene, query).to(cosines)[:, None]
+                te, tm = slab(permittivities[planes], cosines, self.log_thicknesses[planes].exp() / wavelengths)
             level = normals[planes, 2].square()
             aside = (points - self.middles[planes]) * (-self.log_extents[planes]).exp()
             reflected = ((1 - level) * te + level * tm) * (self.plane_gains[planes] - aside.square().sum(-1) / 2).exp()
             left = torch.cat((left[:, :first], left[:, first:] * reflected), 1)
+        if blocked and self.obstacles is not None and not self.is_bare:
+            left = left * (-self._depths(self.obstacles, folded, left)).exp()
         return left
+
+    def _depths(self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+        """Optical depth of each path through the obstacles [Np]; 0 for no path and, of levels, for a ``FAINT`` one."""
+        depths = torch.zeros_like(strengths.real)
+        with torch.no_grad():
+            lengths = depths.index_add(1, folded.path, (folded.end - folded.start).norm(dim=-1)).clamp_min(NEAREST)
+            powers = (strengths.abs() / lengths).square()
+            least = FAINT * powers.sum(1, keepdim=True) if self.skips_faint else 0
+            legs = (powers > least)[:, folded.path].flatten().nonzero()[:, 0]
+        ends = (end.flatten(0, 1).index_select(0, legs) for end in (folded.start, folded.end))
+        count, n = strengths.shape
+        paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
+        return depths.flatten().index_add(0, paths.flatten()[legs], obstacles(*ends)).view(count, n)
+
+    def margins(self, query: Query) -> Complex[Tensor, "b n"]:
+        """Field over free space by which each kept path may deviate: its own, and a tenth of that without obstacles."""
+        sequences, normals, offsets = self.sequences[self.kept], self.normals, self.offsets
+        seen = images(query.transmitters - self.middle, sequences, normals, offsets)
+        receivers = (self.scene.positions(normals) - self.middle)[query.receivers]
+        folded = fold(seen, receivers, sequences, normals, offsets)
+        free = self.strengths(query, folded, blocked=False)
+        return (self.strengths(query, folded) + 0.1 * free) * self._patterns(query, seen[-1] - receivers[:, None])
 
     def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Field gain of a receiver's elements in its frame; of arrays times the learnt cos^q."""
@@ -283,12 +339,14 @@ class Mirrored(Placement):
         cosines = (directions @ normal.to(directions)).clamp_min(0.05)  # the logarithm has no bound at 0
         return gain * cosines**self.directivity
 
-    def _patterns(self, query: Query, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
-        """Field gain of the receivers' elements towards points."""
-        gains = torch.ones_like(points[..., 0])
+    def _patterns(self, query: Query, ways: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
+        """Field gain of the receivers' elements towards points, ``ways`` from the receivers [m]."""
+        gains = torch.ones_like(ways[..., 0])
         for receiver in query.receivers.unique().tolist():
-            own, pose = query.receivers == receiver, self.scene.receivers[receiver].pose.to(points)
-            gains[own] = self.pattern(receiver, functional.normalize(pose.local(points[own]), dim=-1))
+            if self.scene.receivers[receiver].array.is_point:
+                continue
+            own, rotation = query.receivers == receiver, self.scene.receivers[receiver].pose.rotation.to(ways)
+            gains[own] = self.pattern(receiver, functional.normalize(ways[own] @ rotation, dim=-1))
         return gains
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

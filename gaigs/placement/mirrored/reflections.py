@@ -42,6 +42,14 @@ class Folded(NamedTuple):
     exists: Bool[Tensor, "b n"]
 
 
+def largest_order(planes: int, most: int) -> int:
+    """Largest order for which ``all_sequences`` of two planes or more has at most ``most`` of them."""
+    order, count, longest = 0, 1, planes
+    while count + longest <= most:
+        order, count, longest = order + 1, count + longest, longest * (planes - 1)
+    return order
+
+
 def all_sequences(planes: int, order: int) -> Int[Tensor, "n order"]:
     """All sequences of at most ``order`` planes as a wave meets them, no plane twice in a row; shorter ones first.
 

@@ -1,5 +1,6 @@
 """Search for planes: new planes, their offsets by the phases, and planes and paths to drop."""
 
+import logging
 import math
 from collections.abc import Callable
 
@@ -16,6 +17,11 @@ from gaigs.placement.mirrored.reflections import reflect
 from gaigs.projection import Splats
 from gaigs.propagation import NEAREST, fresnel
 from gaigs.query import Batch
+
+log = logging.getLogger(__name__)
+
+WIDEST = 50.0
+"""Largest distance over which a plane is searched by phases [wavelengths]: a thousand losses for each plane."""
 
 Loss = Callable[[Batch], float]
 """Loss of the model as it stands, on a batch."""
@@ -42,7 +48,8 @@ def find_planes(model, train: Batch, validation: Batch | None, loss: Loss) -> st
         if any(new > 0.99 * old for new, old in zip(after, losses, strict=True)):
             placement.kept.copy_(kept)
             break
-        numbers = ", ".join(f"{value:.2f}" for value in (*normal.tolist(), offset))
+        world = offset + float(normal @ placement.middle)
+        numbers = ", ".join(f"{value:.2f}" for value in (*normal.tolist(), world))
         found.append(f"plane ({numbers})")
     return f"{' and '.join(found) or 'no plane'} found; loss {before:.4f} -> {loss(train):.4f}"
 
@@ -51,7 +58,7 @@ def thinned(batch: Batch, rows: int = 12) -> Batch:
     """A batch with about ``rows`` of its labels' rows, and columns in proportion."""
     labels, directions = batch.labels, batch.directions
     if isinstance(directions, Grid):
-        every = slice(None, None, max(1, directions.shape[0] // rows))
+        every = slice(None, None, max(1, round(directions.shape[0] / rows)))
         labels, directions = labels[:, every, every], directions.thin(every, every)
     return Batch(batch.query, directions, labels)
 
@@ -60,7 +67,7 @@ def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
     """The plane whose reflections lower the mean absolute error most: of a grid, then of planes about the best."""
     slants, pitches, closer, rounds = 24, 24, 96, 3
     placement = model.placement
-    lower, upper = (corner.to(placement.origin) for corner in placement.box)
+    lower, upper = (corner.to(placement.origin) - placement.middle for corner in placement.box)
     corners = torch.cartesian_prod(*torch.stack((lower, upper), 1))
     axes = torch.eye(3).to(corners)
     found = placement.normals[placement.used]
@@ -86,9 +93,7 @@ def _best(model, batch: Batch) -> tuple[Float[Tensor, "3"], float]:
         best = int(errors.argmin())
         normal, offset = normals[best], offsets[best]
         normals = functional.normalize(normal + turn * torch.randn(closer, 3).to(normal), dim=1)
-        # About the middle of the room, not about the world's origin.
-        middle = (lower + upper) / 2
-        offsets = offset - middle @ normal + normals @ middle + pitch * (torch.rand(closer).to(normal) - 0.5) * 2
+        offsets = offset + pitch * (torch.rand(closer).to(normal) - 0.5) * 2
         normals[0], offsets[0] = normal, offset
         turn, pitch = turn / 3, pitch / 3
     return normal, offset.item()
@@ -122,12 +127,12 @@ def _with_one_more(model, batch: Batch, lags, own, receiver: int, normals, offse
     placement, count = model.placement, len(normals)
     antenna = model.scene.receivers[receiver]
     pose = antenna.pose.to(normals)
-    places = batch.query.transmitters[own]
+    places, here = batch.query.transmitters[own] - placement.middle, pose.position - placement.middle
     points = reflect(places[:, None].expand(-1, count, -1), normals, offsets)
-    seen = points - pose.position
+    seen = points - here
     lengths = seen.norm(dim=-1).clamp_min(NEAREST)
     # A reflection takes both ends on one side.
-    sides = (places @ normals.T - offsets) * (pose.position @ normals.T - offsets)
+    sides = (places @ normals.T - offsets) * (here @ normals.T - offsets)
     directions = (seen / lengths[..., None]) @ pose.rotation
     te, tm = fresnel(complex(PERMITTIVITY, -CONDUCTIVITY), (seen * normals).sum(-1).abs() / lengths)
     level = normals[:, 2].square()
@@ -153,9 +158,12 @@ def _with_one_more(model, batch: Batch, lags, own, receiver: int, normals, offse
 def move_planes(placement: Mirrored, batch: Batch, wavelength: float, least: float, loss: Loss) -> list[float]:
     """Moves each used plane along its normal to the least loss, the strongest plane first.
 
-    ``least`` is the least distance searched on either side [m]. The result are the moves [m].
+    ``least`` is the least distance searched on either side [m], up to ``WIDEST`` wavelengths. The result are the moves
+    [m].
     """
-    some, reach = thinned(batch), max(4.0 * wavelength, least)
+    some, reach = thinned(batch), max(4.0 * wavelength, min(least, WIDEST * wavelength))
+    if least > reach:  # steps cannot be coarser than a fraction of the wavelength
+        log.info("planes are searched within %.3g m, not %.3g m; placement.walls can start nearer", reach, least)
     return [_move(placement, plane, reach, wavelength, some, loss) for plane in by_strength(placement, batch)]
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.geometry import Directions, Grid, magnitudes
-from gaigs.propagation import array_sign, phase_sign
+from gaigs.phases import array_sign
 from gaigs.query import Query, check_carrier
 from gaigs.scene import Scene, check_elements, direct_waves
 
@@ -126,7 +126,7 @@ class Channel(Reading):
         train = links.split.train
         labels, query = links.labels[train].to(torch.complex128), links.query[train]
         waves = direct_waves(self.scene, query, self.carriers)
-        self.sign.fill_(phase_sign(labels, waves, query.receivers))
+        self.sign.fill_(self.scene.task.phase_sign(labels, waves, query.receivers))
         self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))
 
     def amplitudes(self, labels: Tensor, query: Query) -> Tensor:

@@ -9,7 +9,8 @@ from torch.nn.functional import normalize, pad, softplus
 
 from gaigs.data import Links
 from gaigs.model import Model, Prediction
-from gaigs.propagation import array_sign, free_space, phase_sign
+from gaigs.phases import array_sign
+from gaigs.propagation import free_space
 from gaigs.query import Batch
 from gaigs.scene import Scene, check_elements, direct_waves
 from gaigs.tokenizer.euclidean import MAX_OCTAVE, fourier_features
@@ -117,6 +118,7 @@ class NeWrf(Model):
     """
 
     learning_rates: Mapping[str, float] = {"network": 1e-3}
+    any_frequency = True
 
     def __init__(
         self, scene: Scene, arrivals: int, samples: int, octaves: int, view_octaves: int, width: int, layers: int
@@ -160,7 +162,8 @@ class NeWrf(Model):
         train, frequencies = links.split.train, self.scene.task.frequencies
         labels, query = links.labels[train].to(torch.complex128), links.query[train]
         waves = direct_waves(self.scene, query, frequencies)
-        self.sign.fill_(phase_sign(labels, waves, query.receivers) or array_sign(labels, waves))
+        sign = self.scene.task.phase_sign(labels, waves, query.receivers)
+        self.sign.fill_(sign or array_sign(labels, waves))
         ratios = (labels.abs().square().sum((1, 2)) / waves.abs().square().sum((1, 2))).sqrt()
         self.unit.copy_(ratios.quantile(LOUD))
         falling = labels if self.sign < 0 else labels.conj()

@@ -15,7 +15,7 @@ from gaigs.data.sionna.tracing import frequency_offsets, respond
 from gaigs.data.synthetic.image_source import MATERIALS, Paths
 from gaigs.model import Model, Prediction
 from gaigs.pooling.beamformer import Beamformer
-from gaigs.propagation import fit_gain, free_space, phase_sign
+from gaigs.propagation import fit_gain, free_space
 from gaigs.query import Batch, Query, check_carrier
 from gaigs.scene import Scene, carriers, check_elements, direct_waves
 
@@ -67,6 +67,7 @@ class RayTracing(Model):
 
     # Of logarithms [1], and of gains [Np, rad]: slower, so that materials explain most.
     learning_rates: Mapping[str, float] = {"materials": 5e-2, "gains": 5e-3}
+    any_frequency = True
 
     def __init__(
         self,
@@ -157,7 +158,8 @@ class RayTracing(Model):
         is_complex = labels.is_complex()
         if is_complex:
             waves = direct_waves(self.scene, query, self.scene.task.frequencies)
-            self.sign.fill_(phase_sign(labels.to(torch.complex128), waves, query.receivers) or -1)
+            sign = self.scene.task.phase_sign(labels.to(torch.complex128), waves, query.receivers)
+            self.sign.fill_(sign or -1)
         self.log_gains.zero_()
         values = torch.cat([self(Batch(part)).value for part in query.parts(BATCH)])
         for receiver in query.receivers.unique().tolist():

@@ -40,8 +40,8 @@ def build(links):
         placement = Mirrored(links.scene, 2, planes, order, obstacles)
         with torch.no_grad():
             for k, axis in enumerate(torch.eye(3)):
-                placement.place(k, axis, float(SIZE[k]))
-                placement.place(k + 3, axis, 0.0)
+                placement.place(k, axis, float(SIZE[k] - placement.middle[k]))
+                placement.place(k + 3, axis, float(-placement.middle[k]))
             placement.log_permittivities.fill_(np.log(PERMITTIVITY.real - 1))
             placement.log_conductivities.fill_(np.log(-PERMITTIVITY.imag))
             placement.log_extents.fill_(np.log(1e3))
@@ -53,7 +53,7 @@ def build(links):
 def add(placement, normal, offset):
     """Puts the seventh plane somewhere, and keeps all paths."""
     with torch.no_grad():
-        placement.place(6, torch.tensor(normal), offset)
+        placement.place(6, torch.tensor(normal), offset - float(torch.tensor(normal) @ placement.middle))
         placement.kept.fill_(True)
     return placement
 
@@ -113,7 +113,7 @@ def test_a_loss_is_that_where_the_plane_reflects_best(links, build):
     placement = add(build(planes=7), [0.6, 0.0, 0.8], 2.0)
     middle, extents = np.array([1.0, 2.0, 0.5]), np.array([0.7, 0.9, 1.2])
     with torch.no_grad():
-        placement.middles[6] = torch.tensor(middle)
+        placement.middles[6] = torch.tensor(middle) - placement.middle
         placement.log_extents[6] = torch.tensor(np.log(extents))
     planes = {plane["number"]: plane for plane in room_export.facts(placement, training(links))["planes"]}
     u, v = np.array([0.8, 0, -0.6]), np.array([0, 1.0, 0])
@@ -173,7 +173,7 @@ def test_a_plane_within_the_room_spans_its_bounces(links, build):
 def test_a_window_ends_a_wall(links, build):
     placement = build()
     with torch.no_grad():
-        placement.middles[0] = torch.tensor([6.0, 1.5, 1.0])
+        placement.middles[0] = torch.tensor([6.0, 1.5, 1.0]) - placement.middle
         placement.log_extents[0, 1] = np.log(0.4)
     planes = room_export.outlines(placement, room_export.survey(placement, training(links)))
     (wall,) = (plane for plane in planes if plane.number == 0)
@@ -264,7 +264,7 @@ def test_obstacles_are_written_as_splats(links, build, tmp_path):
     file = PlyData.read(str(tmp_path / "obstacles.ply"))
     vertices = file["vertex"]
     columns = lambda *names: torch.from_numpy(np.stack([vertices[name] for name in names], -1))
-    torch.testing.assert_close(columns("x", "y", "z"), blobs.centres.data)
+    torch.testing.assert_close(columns("x", "y", "z"), blobs.centres.data + placement.middle)
     axes = semi_axes(columns("rot_0", "rot_1", "rot_2", "rot_3"), columns("scale_0", "scale_1", "scale_2").exp())
     torch.testing.assert_close(axes @ axes.mT, torch.diag_embed(blobs.widths.data.square()))
     logits = columns("opacity")[:, 0]

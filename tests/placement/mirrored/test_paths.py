@@ -11,6 +11,7 @@ from gaigs.antenna import Array, Receiver
 from gaigs.data.synthetic import POSE, REGION
 from gaigs.data.synthetic.image_source import Room, permittivity, trace
 from gaigs.gaussians import SH_DC
+from gaigs.placement.mirrored import paths
 from gaigs.placement.mirrored.paths import Mirrored
 from gaigs.query import Query
 from gaigs.scene import Scene
@@ -42,7 +43,8 @@ def walled(placement):
         for wall, material in enumerate(ROOM.walls):
             axis, side = divmod(wall, 2)
             normal = torch.eye(3)[axis] * (1 if side else -1)
-            placement.place(wall, normal, ROOM.size[axis] if side else 0.0)
+            offset = ROOM.size[axis] if side else 0.0
+            placement.place(wall, normal, float(offset - normal @ placement.middle))
             epsilon = permittivity(material, FREQUENCY)
             placement.log_permittivities[wall] = math.log(epsilon.real - 1)
             placement.log_conductivities[wall] = math.log(-epsilon.imag)
@@ -134,7 +136,7 @@ def test_initial_planes_lie_beyond_the_faces_of_the_box():
     for plane in range(6):
         axis, sign = plane % 3, 1 if plane < 3 else -1
         assert placement.normals[plane, axis] * sign > 0.95
-        beyond = placement.offsets[plane] - sign * corners[0 if sign < 0 else 1, axis]
+        beyond = placement.offsets[plane] - sign * (corners[0 if sign < 0 else 1] - placement.middle)[axis]
         assert 0 < beyond < 0.1 * placement.diagonal
 
 
@@ -188,13 +190,14 @@ def test_obstacles_attenuate_paths_along_their_legs():
     losses = -(dimmed.gains / clear.gains).abs().log()
     heard = clear.gains.abs() > 0
     # The direct path has one leg, a reflected one two, which meet on the wall.
-    direct = placement.obstacles(query.transmitters, POSE.position.expand_as(query.transmitters))
+    depth = lambda *ends: placement.obstacles(*(end - placement.middle for end in ends))
+    direct = depth(query.transmitters, POSE.position.expand_as(query.transmitters))
     torch.testing.assert_close(losses[heard[:, 0], 0], direct[heard[:, 0]], rtol=1e-3, atol=1e-5)
     wall = 1 + 2  # y = 0
     image = query.transmitters * torch.tensor([1, -1, 1])
     share = POSE.position[1] / (POSE.position[1] - image[:, 1])
     stop = torch.lerp(POSE.position.expand_as(image), image, share[:, None])
-    both = placement.obstacles(query.transmitters, stop) + placement.obstacles(stop, POSE.position.expand_as(stop))
+    both = depth(query.transmitters, stop) + depth(stop, POSE.position.expand_as(stop))
     own = heard[:, wall]
     assert own.any()
     torch.testing.assert_close(losses[own, wall], both[own], rtol=1e-3, atol=1e-5)
@@ -203,10 +206,23 @@ def test_obstacles_attenuate_paths_along_their_legs():
     assert bare.penalties() == {}
 
 
+@pytest.mark.parametrize("task", [Rssi(), Csi(16, torch.tensor([FREQUENCY]))])
+def test_obstacles_dim_all_paths_but_faint_ones_of_levels(task, monkeypatch):
+    query, placement = ask(), walled(make(obstacles=4, task=task))
+    found, clear = placement(None, query).gains, walled(make(task=task))(None, query).gains
+    shares = (clear.abs() / clear.abs().square().sum(1, keepdim=True).sqrt()).square()
+    monkeypatch.setattr(paths, "FAINT", 0.0)
+    dimmed = placement(None, query).gains
+    # Shares of ``_depths`` are before the element's pattern, which takes power away.
+    skipped = (found != dimmed).nonzero().tolist()
+    assert all(shares[link, path] < 0.01 for link, path in skipped)
+    assert bool(skipped) == (not task.dtype.is_complex)
+
+
 def test_a_small_plane_reflects_near_its_middle():
     query, whole, small = ask(), walled(make(1)), walled(make(1))
     with torch.no_grad():
-        small.middles[4] = torch.tensor([3.0, 2.0, 0.0])
+        small.middles[4] = torch.tensor([3.0, 2.0, 0.0]) - small.middle
         small.log_extents[4] = math.log(0.5)
     ratio = (small(None, query).gains / whole(None, query).gains)[:, 1 + 4].abs()
     image = query.transmitters * torch.tensor([1, 1, -1])
@@ -261,6 +277,8 @@ def test_the_initial_band_is_that_of_the_data_or_of_the_rooms_size():
     [
         ({"planes": 5}, "placement.planes must be at least 6, got 5"),
         ({"order": -1}, "placement.order must be at least 0, got -1"),
+        ({"order": 9}, r"order=9 gives more than 100,000 sequences of 6 planes, .*\n.*placement.order=6 or less"),
+        ({"planes": 10, "order": 10**9}, "set placement.order=5 or less"),
         ({"obstacles": -2}, "placement.obstacles must be at least 0, got -2"),
         ({"channels": 10}, "'mirrored' has 1 or 2 channels, amplitude or complex, got 10"),
     ],

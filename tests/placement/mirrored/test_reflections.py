@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gaigs.data.synthetic.image_source import cells, mirror
-from gaigs.placement.mirrored.reflections import all_sequences, fold, images
+from gaigs.placement.mirrored.reflections import all_sequences, fold, images, largest_order
 
 SIZE = torch.tensor([7.0, 5.0, 3.0], dtype=torch.float64)
 BOX = torch.cat((torch.eye(3), -torch.eye(3))).double(), torch.cat((SIZE, torch.zeros(3, dtype=torch.float64)))
@@ -45,6 +45,9 @@ def test_each_sequence_is_there_once(planes, order):
     sequences = all_sequences(planes, order)
     assert sequences.shape == (1 + sum(planes * (planes - 1) ** k for k in range(order)), order)
     assert len({*map(tuple, sequences.tolist())}) == len(sequences)
+    if planes > 1:
+        assert largest_order(planes, len(sequences)) == order
+        assert largest_order(planes, len(sequences) - 1) == order - 1 or not order
     lengths = (sequences >= 0).sum(1)
     assert (lengths.diff() >= 0).all()  # shorter ones first
     for sequence, length in zip(sequences.tolist(), lengths.tolist(), strict=True):

@@ -1,0 +1,515 @@
+"""Search for planes in complex channels: a Hough transform, variable projection, and slabs that explain the phases."""
+
+import logging
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Complex, Float, Int
+from scipy.constants import speed_of_light
+from torch import Tensor
+from torch.nn import functional
+
+from gaigs.data import Links
+from gaigs.gaussians import fibonacci_lattice
+from gaigs.placement.mirrored.reflections import all_sequences, fold, images, reflect
+from gaigs.propagation import NEAREST, slab
+from gaigs.task.csi import Csi
+
+log = logging.getLogger(__name__)
+
+RIDGE = 1e-3
+"""Ridge of free path strengths over their mean power: images closer than the resolution share their power."""
+
+FLOOR = 1e-3
+"""Share of a channel's power below which a residual hardly counts: 30 dB."""
+
+LEAST = 0.006
+"""Least share of the power that a plane takes. Validation drops planes later; a few too many cost time alone."""
+
+FEWEST = 8
+"""Fewest numbers of a channel in which planes can be searched: one path explains any single number."""
+
+SLABS = torch.tensor([(1.5, 0.3, 1.0), (4.0, 0.3, 1.0), *((2.0, 0.05, 0.005 * k) for k in range(1, 13))]).double().log()
+"""Slabs that are tried: logarithms of the relative permittivity's real part over 1 and imaginary part, and of the
+thickness [m]; a metre is a half-space."""
+
+
+@dataclass(frozen=True)
+class ReceiverChannels:
+    """The training channels of one receiver, thinned to some elements and subcarriers.
+
+    Attributes:
+        places: Transmitters (b, 3) [m].
+        channels: With phases as of exp(-j 2 pi f t) (b, e, s).
+        position: Middle of the array (3,) [m].
+        elements: World frame (e, 3) [m].
+        frequencies: (s,) [Hz].
+    """
+
+    places: Float[Tensor, "b 3"]
+    channels: Complex[Tensor, "b e s"]
+    position: Float[Tensor, "3"]
+    elements: Float[Tensor, "e 3"]
+    frequencies: Float[Tensor, " s"]
+
+    @classmethod
+    def of(cls, links: Links, number: int, sign: int, elements: int = 16, subcarriers: int = 32) -> "ReceiverChannels":
+        receiver, query = links.receivers[number], links.query
+        own = links.split.train[query.receivers[links.split.train] == number]
+        task: Csi = links.task
+        which = _evenly(len(receiver.array), elements)
+        when = _evenly(len(task.frequencies), subcarriers)
+        channels = links.labels[own][:, which][:, :, when].to(torch.complex128)
+        heard = channels.abs().amax((1, 2)) > 0
+        pose = receiver.pose.to(torch.zeros((), dtype=torch.float64))
+        return cls(
+            query.transmitters[own][heard].double(),
+            (channels.conj() if sign > 0 else channels)[heard],
+            pose.position,
+            pose.world(receiver.array.elements[which].double()),
+            task.frequencies[when],
+        )
+
+    def some(self, index: object, when: object = slice(None)) -> "ReceiverChannels":
+        """The channels of some places at some subcarriers."""
+        channels = self.channels[index][:, :, when]
+        return replace(self, places=self.places[index], channels=channels, frequencies=self.frequencies[when])
+
+    def single(self) -> "ReceiverChannels":
+        """In single precision, for descents."""
+        parts = {
+            name: part.float()
+            for name, part in vars(self).items()
+            if isinstance(part, Tensor) and part.is_floating_point()
+        }
+        return replace(self, **parts, channels=self.channels.to(torch.complex64))
+
+    @cached_property
+    def flat(self) -> Complex[Tensor, "b k"]:
+        return self.channels.flatten(1)
+
+    def images(self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"]) -> Float[Tensor, "b n 3"]:
+        return images(self.places, sequences, planes[:, :3], planes[:, 3])[-1]
+
+    def waves(self, points: Float[Tensor, "b n 3"]) -> Complex[Tensor, "b n k"]:
+        """Unit sources at points as the elements receive them."""
+        lengths = (points[..., None, :] - self.elements).norm(dim=-1).clamp_min(NEAREST)[..., None]
+        turns = lengths * (self.frequencies / speed_of_light)
+        turns = turns - turns.detach().round()
+        return torch.polar((1 / lengths).expand_as(turns), -2 * math.pi * turns).flatten(-2)
+
+    def reflected(
+        self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"], sequences: Int[Tensor, "n order"]
+    ) -> Complex[Tensor, "b n k"]:
+        """Waves of all paths after their reflections at slabs; 0 for a path that does not meet its planes."""
+        planes, slabs = planes.to(self.places), slabs.to(self.places)
+        normals, offsets = planes[:, :3], planes[:, 3]
+        seen = images(self.places, sequences, normals, offsets)
+        folded = fold(seen, self.position.expand(len(self.places), 3), sequences, normals, offsets)
+        permittivities, thickness = _materials(slabs)
+        depths = thickness[:, None] * self.frequencies / speed_of_light
+        gains = folded.exists[..., None].to(self.channels.dtype).expand(-1, -1, len(self.frequencies))
+        for first, plane, _, cosines in folded.bounces:
+            te, tm = slab(permittivities[plane, None], cosines[..., None].clamp(1e-3, 1), depths[plane])
+            level = normals[plane, 2, None].square()
+            gains = torch.cat((gains[:, :first], gains[:, first:] * ((1 - level) * te + level * tm)), 1)
+        waves = self.waves(seen[-1]).unflatten(-1, (len(self.elements), -1))
+        return (waves * gains[:, :, None]).flatten(-2)
+
+
+class ChannelSearch:
+    """Planes whose images explain the training channels.
+
+    A candidate is a plane (normal, offset). Its score is the share of the residual's power that its image explains,
+    summed over places and receivers: a Hough transform over all normals and offsets, without a guess of the room. The
+    best candidate is refined by variable projection, together with the planes before it: strengths of paths are free at
+    each place, so neither phases nor blockage are assumed. Then phases count: a periodogram over offset and two tilts
+    proposes planes and slabs whose reflections have like phases at all places, and the residual decides, with strengths
+    that are real and not negative. It sees delays too, so it tells planes half a wavelength apart.
+
+    Args:
+        links: Their training links count; of the task ``csi``.
+        sign: Sign of the channels' phases.
+        common: True if channels have a phase in common.
+        order: Largest number of reflections of a path.
+        most: Largest number of planes.
+        start: Planes known before (w, 4).
+
+    Source: ours; Hough, Method and means for recognizing complex patterns, 1962; Golub and Pereyra, The differentiation
+    of pseudo-inverses and nonlinear least squares problems whose variables separate, 1973.
+    """
+
+    def __init__(self, links: Links, sign: int, common: bool, order: int, most: int, start: Float[Tensor, "w 4"]):
+        self.common, self.order, self.most, self.start = common, order, most, start.double()
+        self.generator = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
+        numbers = links.query.receivers[links.split.train].unique().tolist()
+        self.receivers = [ReceiverChannels.of(links, number, sign) for number in numbers]
+        self.receivers = [receiver for receiver in self.receivers if len(receiver.places)]
+        points = torch.cat([part for receiver in self.receivers for part in (receiver.places, receiver.position[None])])
+        self.points, self.middle = points, (points.amin(0) + points.amax(0)) / 2
+        self.diagonal = float((points.amax(0) - points.amin(0)).norm())
+        self.wavelength = speed_of_light / float(self.receivers[0].frequencies.mean())
+
+    @torch.no_grad()
+    def run(self) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
+        """Planes, strongest first, and their slabs as in ``SLABS``."""
+        planes = self.find()
+        if not len(planes):
+            return planes, planes[:, :3]
+        return self.resolve(self.refine(planes, 300, 5e-3))
+
+    def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
+        return all_sequences(len(planes), self.order)
+
+    def drawn(self, count: int, subcarriers: int | None = None) -> list[ReceiverChannels]:
+        """All receivers with about ``count`` places together, at some subcarriers."""
+        each = max(8, count // len(self.receivers))
+        parts = []
+        for receiver in self.receivers:
+            places, when = (
+                torch.randperm(size, generator=self.generator)[:most].sort().values
+                for size, most in ((len(receiver.places), each), (len(receiver.frequencies), subcarriers))
+            )
+            parts.append(receiver.some(places, when))
+        return parts
+
+    # --- Hough transform ---
+
+    def find(self) -> Float[Tensor, "w 4"]:
+        """Planes one after the other, each refined with those before."""
+        normals = torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3))).to(self.points)
+        along = self.points @ normals.mT
+        margin = 0.3 * self.diagonal
+        low, high = along.amin(0) - margin, along.amax(0) + margin
+        offsets = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, 80).to(low)
+        grid = torch.cat((normals[:, None].expand(-1, offsets.shape[1], -1), offsets[..., None]), 2)
+        # Profiles of some hundred megabytes at most, also in a hall with a large band.
+        size = max(receiver.channels.shape[1] * self.delays(receiver) for receiver in self.receivers)
+        self.many = self.drawn(min(200, 60_000_000 // size))
+        planes = self.start
+        while len(planes) < self.most and (tried := self.with_one_more(planes, grid)):
+            _, share, planes = min(tried, key=lambda found: found[0])
+            planes = self.refine(planes, 60, 1e-2)
+            log.info("plane (%.2f, %.2f, %.2f) at %.2f m: %.1f %% of the power", *planes[-1].tolist(), 100 * share)
+        for _ in range(len(planes) - len(self.start)):  # each once more, as the others are known now
+            others = torch.cat((planes[: len(self.start)], planes[len(self.start) + 1 :]))
+            kept = torch.cat((others, planes[len(self.start), None]))
+            tried = [*self.with_one_more(others, grid), (self.unexplained(kept), 0.0, kept)]
+            planes = min(tried, key=lambda found: found[0])[2]
+        return planes
+
+    def with_one_more(
+        self, planes: Float[Tensor, "w 4"], grid: Float[Tensor, "n k 4"]
+    ) -> list[tuple[float, float, Float[Tensor, "w+1 4"]]]:
+        """Refined planes with each of the best candidates, what they leave, and the candidate's share of power."""
+        rests = [self.profiles(receiver, planes) for receiver in self.many]
+        few = [receiver.some(slice(None, None, 3)) for receiver in self.many]
+        scores = self.scores(few, [rest[::3] for rest in rests], grid).flatten()
+        for plane in planes:
+            scores[self.alike(grid.flatten(0, 1), plane)] = 0
+        found = []
+        for plane, share in self.best(rests, planes, grid.flatten(0, 1), scores):
+            if share >= LEAST:
+                refined = self.refine(torch.cat((planes, plane[None])), 30, 1e-2)
+                found.append((self.unexplained(refined), share, refined))
+        return found
+
+    def unexplained(self, planes: Float[Tensor, "w 4"]) -> float:
+        """Mean log of the share of power that free strengths leave."""
+        sequences, shares = self.sequences(planes), []
+        for receiver in self.many:
+            rest, _ = project(receiver.waves(receiver.images(planes, sequences)), receiver.flat)
+            shares.append(log_share(rest, receiver.flat))
+        return torch.cat(shares).mean().item()
+
+    def best(self, rests, planes, flat: Float[Tensor, "k 4"], scores) -> list[tuple[Float[Tensor, "4"], float]]:
+        """The best three planes near the eight highest maxima but known ones, with their shares of power."""
+        chosen: list[Tensor] = []
+        while len(chosen) < 8 and scores.max() > 0:
+            chosen.append(flat[scores.argmax()])
+            scores[self.alike(flat, chosen[-1])] = 0
+        if not chosen:
+            return []
+        tried, turn, shift = torch.stack(chosen), 0.06, 0.02 * self.diagonal
+        for _ in range(4):
+            noise = torch.randn(len(tried), 24, 4, generator=self.generator).double()
+            noise[:, 0] = 0
+            turned = functional.normalize(tried[:, None, :3] + turn * noise[..., :3], dim=-1)
+            moved = tried[:, None, 3] + (turned - tried[:, None, :3]) @ self.middle + shift * noise[..., 3]
+            about = torch.cat((turned, moved[..., None]), 2)
+            highest, at = self.scores(self.many, rests, about.flatten(0, 1)[:, None]).view(moved.shape).max(1)
+            tried = about[torch.arange(len(tried)), at]
+            turn, shift = turn / 2, shift / 2
+        found: list[tuple[Tensor, float]] = []
+        for number in highest.argsort(descending=True).tolist():
+            others = [*planes, *(plane for plane, _ in found)]
+            if len(found) < 3 and not any(self.alike(tried[number, None], plane).any() for plane in others):
+                found.append((tried[number], highest[number].item()))
+        return found
+
+    def alike(self, flat: Float[Tensor, "k 4"], plane: Float[Tensor, "4"]) -> Bool[Tensor, " k"]:
+        """True for planes within 16 degrees and three hundredths of the room of a known one."""
+        cosines = flat[:, :3] @ plane[:3]
+        apart = (flat[:, 3] - flat[:, :3] @ self.middle) * cosines.sign() - (plane[3] - plane[:3] @ self.middle)
+        return (cosines.abs() > 0.96) & (apart.abs() < 0.03 * self.diagonal)
+
+    def profiles(self, receiver: ReceiverChannels, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b e t 2"]:
+        """Delay profiles of the residual at each element, over the square root of the channel's power.
+
+        A candidate then costs a look-up of each element in place of a sum over subcarriers.
+        """
+        rest, _ = project(receiver.waves(receiver.images(planes, self.sequences(planes))), receiver.flat)
+        rest = rest / (receiver.flat.norm(dim=1, keepdim=True) * math.sqrt(rest.shape[1]))
+        centre, farthest = float(receiver.frequencies.mean()), 4 * self.diagonal / speed_of_light
+        delays = torch.linspace(0, farthest, self.delays(receiver)).double()
+        turns = 2 * math.pi * torch.outer(receiver.frequencies - centre, delays)
+        found = rest.unflatten(1, (len(receiver.elements), -1)) @ torch.polar(torch.ones_like(turns), turns)
+        # Single precision: of a path of 30 m it leaves a hundredth of a radian at 10 GHz.
+        return torch.view_as_real(found.to(torch.complex64))
+
+    def delays(self, receiver: ReceiverChannels) -> int:
+        """Number of delays of a profile, over four diagonals of the room and at an eighth of the resolution."""
+        band = float(receiver.frequencies.max() - receiver.frequencies.min())
+        return 2 + math.ceil(8 * band * 4 * self.diagonal / speed_of_light)
+
+    def scores(self, receivers, rests, grid: Float[Tensor, "w k 4"]) -> Float[Tensor, "w k"]:
+        """Mean share of power that one more image explains; 0 for a plane between the ends."""
+        total = grid.new_zeros(grid.shape[:2])
+        for receiver, rest in zip(receivers, rests, strict=True):
+            count = rest.shape[2]
+            rate = (count - 1) * speed_of_light / (4 * self.diagonal)
+            centre = float(receiver.frequencies.mean())
+            first = torch.arange(rest.shape[0] * rest.shape[1]).view(rest.shape[:2])[:, None] * count
+            values = rest.flatten(0, 2)
+            places, antennas = ((points - receiver.position).float() for points in (receiver.places, receiver.elements))
+            for number, own in enumerate(grid):
+                normal = own[0, :3]
+                heights = (receiver.places @ normal)[:, None] - own[:, 3]
+                points = places[:, None] - 2 * heights[..., None].float() * normal.float()
+                square = points.square().sum(-1, keepdim=True) - 2 * points @ antennas.T + antennas.square().sum(1)
+                delay = square.clamp_min_(0).sqrt_().div_(speed_of_light)
+                at = (delay * rate).clamp_max_(count - 1.001)
+                before = at.long()
+                part = (at - before)[..., None]
+                before += first
+                real, imaginary = torch.lerp(values[before], values[before + 1], part).unbind(-1)
+                turns = (delay * centre).frac_().mul_(2 * math.pi)
+                cos, sin = turns.cos(), turns.sin()
+                power = (real * cos - imaginary * sin).sum(-1).square() + (real * sin + imaginary * cos).sum(
+                    -1
+                ).square()
+                total[number] += (power * (heights * (receiver.position @ normal - own[:, 3]) > 0)).sum(0)
+        return total / sum(len(receiver.places) for receiver in receivers)
+
+    # --- variable projection ---
+
+    def refine(self, planes: Float[Tensor, "w 4"], steps: int, rate: float) -> Float[Tensor, "w 4"]:
+        """Descends on the log of what free strengths leave."""
+        sequences = self.sequences(planes)
+
+        def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:
+            shares = []
+            for receiver in self.drawn(24, 8):
+                receiver = receiver.single()
+                points = receiver.images(planes.to(receiver.places), sequences)
+                shares.append(log_share(project(receiver.waves(points), receiver.flat)[0], receiver.flat))
+            return torch.cat(shares).mean()
+
+        return self.descend(loss, planes, [], steps, rate)[0]
+
+    @torch.enable_grad()
+    def descend(
+        self, loss, planes: Float[Tensor, "w 4"], others: list[Tensor], steps: int, rate: float
+    ) -> list[Tensor]:
+        """Adam on planes, which turn about the room's middle, and on other parameters of ``loss``."""
+        normals = planes[:, :3].clone().requires_grad_()
+        offsets = (planes[:, 3] - planes[:, :3] @ self.middle).requires_grad_()
+        others = [part.clone().requires_grad_() for part in others]
+
+        def now() -> Float[Tensor, "w 4"]:
+            units = functional.normalize(normals, dim=1)
+            return torch.cat((units, (offsets + units @ self.middle)[:, None]), 1)
+
+        optimizer = torch.optim.Adam([{"params": [normals, offsets]}, {"params": others}])
+        for step in range(steps):
+            for group, highest in zip(optimizer.param_groups, (rate, 2e-2), strict=True):
+                group["lr"] = highest * 0.03 ** (step / steps)
+            optimizer.zero_grad()
+            loss(now(), *others).backward()
+            optimizer.step()
+        return [part.detach() for part in (now(), *others)]
+
+    # --- phases ---
+
+    def resolve(self, planes: Float[Tensor, "w 4"]) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
+        """Moves planes to where real strengths of slabs leave least. Planes not yet resolved keep complex strengths."""
+        slabs, resolved = SLABS[1].repeat(len(planes), 1), torch.zeros(len(planes), dtype=torch.bool)
+        phases = self.phases(planes)
+        parts, turns = [], []
+        for receiver, phase in zip(self.receivers, phases, strict=True):
+            every = slice(None, None, max(1, len(receiver.places) * len(self.receivers) // 100))
+            parts.append(receiver.some(every, slice(None, None, 5)))
+            turns.append(phase if len(phase) == 1 else phase[every])
+        for reach, tilt, materials in ((0.07, 0.04, SLABS[::3]), (0.05, 0.006, SLABS), (0.05, 0.006, SLABS)):
+            for k in range(len(planes)):
+                resolved[k] = True
+                trials: list[tuple[float, Tensor, Tensor]] = []
+                for plane, material in self.proposals(planes, k, reach, tilt, materials):
+                    tried, own = planes.clone(), slabs.clone()
+                    tried[k], own[k] = plane, material
+                    trials.append((self.left(parts, turns, tried, own, resolved).item(), tried, own))
+                trials.sort(key=lambda trial: trial[0])
+                if resolved.all():
+                    for _, tried, own in trials[:3]:
+                        moved = self.polish(tried, own, 12, 5e-4, k)
+                        trials.append((self.left(parts, turns, *moved, resolved).item(), *moved))
+                _, planes, slabs = min(trials, key=lambda trial: trial[0])
+        return self.polish(planes, slabs, 60, 3e-4)
+
+    def phases(self, planes: Float[Tensor, "w 4"]) -> list[Complex[Tensor, " c"]]:
+        """Phase of each receiver's direct paths: one in common, or one for each place."""
+        found = []
+        for receiver in self.receivers:
+            waves = receiver.waves(receiver.images(planes, self.sequences(planes)))
+            direct = project(waves, receiver.flat, 1e-4)[1][:, 0]
+            strong = direct.abs() >= direct.abs().median()
+            found.append((direct.sgn() * strong).sum()[None].sgn() if self.common else direct.sgn())
+        return found
+
+    def proposals(self, planes, k: int, reach: float, tilt: float, materials) -> list[tuple[Tensor, Tensor]]:
+        """Planes near plane k, and slabs, with which its reflections have like phases: maxima of a periodogram."""
+        normal, sequences = planes[k, :3], self.sequences(planes)
+        pivot = planes[k, 3] - normal @ self.middle
+        across = tangents(normal)
+        steps = min(self.wavelength / 16, reach / 4), min(self.wavelength / 5 / self.diagonal, tilt / 4)
+        grids = [
+            torch.arange(-round(r / s), round(r / s) + 1).double() * s
+            for r, s in zip((reach, tilt), steps, strict=True)
+        ]
+        grids = [grids[0], grids[1], grids[1]]
+
+        def moved(q: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
+            turned = functional.normalize(normal + q[1] * across[0] + q[2] * across[1], dim=0)
+            return torch.cat((turned, (turned @ self.middle + pivot + q[0])[None]))
+
+        own = int((sequences[:, :-1].lt(0).all(1) & (sequences[:, -1] == k)).nonzero())
+        found = []
+        for receiver, phase in zip(self.receivers, self.phases(planes), strict=True):
+            waves = receiver.waves(receiver.images(planes, sequences))
+            _, strengths = project(waves, receiver.flat, 1e-4)
+
+            def length(q: Float[Tensor, "3"], receiver=receiver) -> Float[Tensor, " b"]:
+                plane = moved(q)
+                return (reflect(receiver.places, plane[:3], plane[3]) - receiver.position).norm(dim=1)
+
+            slope = torch.autograd.functional.jacobian(length, torch.zeros(3).double())
+            ways = reflect(receiver.places, normal, planes[k, 3]) - receiver.position
+            cosines = (functional.normalize(ways, dim=1) @ normal).abs().clamp(1e-3, 1)
+            weights = strengths[:, own].abs() * waves[:, own].norm(dim=1) / receiver.flat.norm(dim=1)
+            phasors = weights * strengths[:, own].sgn() * phase.conj()
+            strongest = weights.argsort(descending=True)[: max(16, 120 // len(self.receivers))]
+            found.append((phasors[strongest], slope[strongest], cosines[strongest]))
+        phasors, slope, cosines = (torch.cat(part) for part in zip(*found, strict=True))
+        turns = [2 * math.pi / self.wavelength * slope[:, axis, None] * grid for axis, grid in enumerate(grids)]
+        offsets, *tilts = (torch.polar(torch.ones_like(turn), turn) for turn in turns)
+        trials = []
+        for material in materials:
+            permittivity, thickness = _materials(material)
+            te, tm = slab(permittivity, cosines, thickness / self.wavelength)
+            expected = (1 - normal[2].square()) * te + normal[2].square() * tm
+            left = ((phasors * expected.conj())[:, None] * offsets)[:, :, None] * tilts[0][:, None]
+            sums = (left.flatten(1).mT @ tilts[1]).real.unflatten(0, (len(grids[0]), -1)).flatten(1)
+            highest, at = sums.max(1)  # of each offset
+            highest = highest / (phasors.abs() * expected.abs()).sum()
+            for offset in range(len(highest)):
+                if highest[offset] == highest[max(0, offset - 2) : offset + 3].max():
+                    q = grids[0][offset], grids[1][at[offset] // len(grids[2])], grids[2][at[offset] % len(grids[2])]
+                    trials.append((highest[offset].item(), torch.stack(q), material))
+        trials.sort(key=lambda trial: -trial[0])
+        kept: list[tuple[float, Tensor, Tensor]] = []
+        for trial in trials:  # the best half-space and the best slab of each lobe
+            alike = [other for other in kept if (other[2][2] < 0) == (trial[2][2] < 0)]
+            if len(alike) < 8 and all((trial[1] - other[1])[0].abs() > self.wavelength / 6 for other in alike):
+                kept.append(trial)
+        return [(moved(q), material) for _, q, material in kept]
+
+    def left(self, receivers, phases, planes, slabs, resolved: Bool[Tensor, " w"]) -> Float[Tensor, ""]:
+        """Mean log of the share of power that real strengths leave; complex ones of paths at planes not resolved."""
+        sequences = self.sequences(planes)
+        free = (~resolved[sequences] & (sequences >= 0)).any(1)
+        shares = []
+        for receiver, phase in zip(receivers, phases, strict=True):
+            channels = receiver.flat * phase[:, None].conj()
+            waves = receiver.reflected(planes, slabs, sequences)
+            waves, signed = torch.cat((waves, 1j * waves[:, free]), 1), torch.cat((free, free[free]))
+            shares.append(log_share(real_residual(waves, channels, signed), channels))
+        return torch.cat(shares).mean()
+
+    def polish(self, planes, slabs, steps: int, rate: float, only: int | None = None) -> tuple[Tensor, Tensor]:
+        """Descends on ``left`` with all planes, or with one."""
+        resolved = torch.ones(len(planes), dtype=torch.bool)
+        moves = resolved if only is None else torch.arange(len(planes)) == only
+        phases = self.phases(planes)
+
+        def loss(tried: Float[Tensor, "w 4"], own: Float[Tensor, "w 3"]) -> Float[Tensor, ""]:
+            tried, own = (torch.where(moves[:, None], new, old) for new, old in ((tried, planes), (own, slabs)))
+            parts, turns = [], []
+            for receiver, phase in zip(self.receivers, phases, strict=True):
+                count = max(8, 40 // len(self.receivers))
+                index = torch.randperm(len(receiver.places), generator=self.generator)[:count]
+                when = torch.randperm(len(receiver.frequencies), generator=self.generator)[:6]
+                parts.append(receiver.some(index, when))
+                turns.append(phase if len(phase) == 1 else phase[index])
+            return self.left(parts, turns, tried, own, resolved)
+
+        moved, own = self.descend(loss, planes, [slabs], steps, rate)
+        return torch.where(moves[:, None], moved, planes), torch.where(moves[:, None], own, slabs)
+
+
+def project(
+    waves: Complex[Tensor, "b n k"], channels: Complex[Tensor, "b k"], ridge: float = RIDGE
+) -> tuple[Complex[Tensor, "b k"], Complex[Tensor, "b n"]]:
+    """Residual of the channels after the best strength of each wave at each place, and these strengths."""
+    gram = _ridged(waves.conj() @ waves.mT, ridge)
+    strengths = torch.linalg.solve(gram, waves.conj() @ channels[..., None])[..., 0]
+    return channels - (strengths[:, None] @ waves)[:, 0], strengths
+
+
+def real_residual(
+    waves: Complex[Tensor, "b n k"], channels: Complex[Tensor, "b k"], signed: Bool[Tensor, " n"]
+) -> Complex[Tensor, "b k"]:
+    """Residual after the best real strengths; those that would be negative and are not ``signed`` are left out."""
+    gram = _ridged((waves.conj() @ waves.mT).real, RIDGE)
+    right = (waves.conj() @ channels[..., None]).real
+    kept = ((torch.linalg.solve(gram, right) >= 0) | signed[:, None]).to(gram)
+    strengths = torch.linalg.solve(gram * kept * kept.mT + torch.diag_embed(1 - kept[..., 0]), right * kept)
+    return channels - (strengths.mT.to(waves) @ waves)[:, 0]
+
+
+def log_share(part: Complex[Tensor, "b k"], whole: Complex[Tensor, "b k"]) -> Float[Tensor, " b"]:
+    return (part.abs().square().sum(-1) / whole.abs().square().sum(-1) + FLOOR).log()
+
+
+def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Two unit vectors at right angles to a normal and to each other."""
+    other = torch.zeros_like(normal)
+    other[normal.abs().argmin()] = 1
+    first = functional.normalize(torch.linalg.cross(normal, other), dim=0)
+    return first, torch.linalg.cross(normal, first)
+
+
+def _ridged(gram: Tensor, ridge: float) -> Tensor:
+    power = gram.diagonal(dim1=1, dim2=2).real.mean(1)
+    return gram + ridge * power[:, None, None] * torch.eye(gram.shape[-1], dtype=power.dtype)
+
+
+def _materials(slabs: Float[Tensor, "*w 3"]) -> tuple[Complex[Tensor, "*w"], Float[Tensor, "*w"]]:
+    """Permittivities, and thicknesses [m]."""
+    real, imaginary, thickness = slabs.exp().unbind(-1)
+    return torch.complex(1 + real, -imaginary), thickness
+
+
+def _evenly(count: int, most: int) -> Int[Tensor, " k"]:
+    return torch.linspace(0, count - 1, min(count, most)).round().long()

@@ -1,0 +1,143 @@
+"""The search for planes in channels of an invented room, made by numpy."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.constants import speed_of_light
+from scipy.optimize import nnls
+
+from gaigs.antenna import Array, Receiver
+from gaigs.data import Links, Split
+from gaigs.geometry import Pose
+from gaigs.placement.mirrored import channel_search
+from gaigs.placement.mirrored.channel_search import ChannelSearch, project, real_residual
+from gaigs.query import Query
+from gaigs.task.csi import Csi
+
+FREQUENCIES = 5.5e9 + np.linspace(-2.5e8, 2.5e8, 16)
+PLANES = np.array([[1.0, 0, 0, -0.4], [0.6, -0.78, 0.18, -3.5]])
+"""Normals and offsets [m]; the second one is not upright to any axis."""
+PLANES /= np.linalg.norm(PLANES[:, :3], axis=1, keepdims=True)
+SLABS = ((3.0 - 0.3j, 1.0), (5.0 - 0.4j, 1.0))
+"""Relative permittivities and thicknesses [m]."""
+
+
+def reflection(permittivity, thickness, cosines, level):
+    """Of a slab between air, as a wave of vertical polarisation meets it."""
+    root = np.sqrt(permittivity - 1 + cosines**2)
+    turns = np.exp(-4j * np.pi * thickness * FREQUENCIES / speed_of_light * root)
+    te, tm = (cosines - root) / (cosines + root), (permittivity * cosines - root) / (permittivity * cosines + root)
+    te, tm = (r * (1 - turns) / (1 - r**2 * turns) for r in (te, tm))
+    return (1 - level) * te + level * tm
+
+
+def channels(places, elements, planes):
+    """Direct waves and images of the first order (b, e, s)."""
+    waves = lambda points: np.exp(-2j * np.pi * FREQUENCIES / speed_of_light * points) / points
+    apart = lambda points: np.linalg.norm(points[:, None] - elements, axis=-1)[..., None]
+    found = waves(apart(places))
+    for (*normal, offset), slab in zip(planes, SLABS, strict=False):
+        images = places - 2 * (places @ normal - offset)[:, None] * normal
+        ways = images - elements.mean(0)
+        cosines = np.abs(ways @ normal) / np.linalg.norm(ways, axis=1)
+        found = found + reflection(*slab, cosines[:, None, None], normal[2] ** 2) * waves(apart(images))
+    return found
+
+
+def room(moved=0.0, receivers=1, count=60, walls=PLANES):
+    """Links in a room that is moved along all axes [m], and its planes."""
+    places = np.float32(np.random.default_rng(0).uniform((0.3, 0.3, 0.5), (5.5, 4.5, 2.2), (count, 3)) + moved)
+    walls = walls.copy()
+    walls[:, 3] += moved * walls[:, :3].sum(1)
+    poses = [Pose.from_xyzw(tuple(moved + x for x in at), (0, 0, 0, 1)) for at in ((1.0, 0.6, 2.4), (4.8, 3.9, 1.1))]
+    array, labels = Array.planar(2, 2, 0.027), []
+    for pose in poses:
+        elements = pose.to(torch.zeros(0).double()).world(array.elements.double()).numpy()
+        labels.append(channels(np.float64(places), elements, walls))
+    which = torch.arange(count) % receivers
+    links = Links(
+        query=Query(torch.from_numpy(places), which),
+        receivers=tuple(Receiver(f"gateway{k}", pose, array) for k, pose in enumerate(poses[:receivers])),
+        labels=torch.from_numpy(np.stack(labels))[which, torch.arange(count)].to(torch.complex64),
+        task=Csi(4, torch.from_numpy(FREQUENCIES)),
+        split=Split("all", torch.arange(count), torch.arange(0), torch.arange(0)),
+    )
+    return links, torch.from_numpy(walls)
+
+
+def search(links, sign=-1, common=True):
+    torch.manual_seed(0)
+    return ChannelSearch(links, sign, common, order=1, most=2, start=torch.zeros(0, 4))
+
+
+def turned(labels):
+    """With a random phase of each link."""
+    phases = 2 * math.pi * torch.rand(len(labels), 1, 1, generator=torch.Generator().manual_seed(1))
+    return labels * torch.polar(torch.ones_like(phases), phases)
+
+
+CASES = {
+    "a room": ({}, {}, lambda labels: labels),
+    "a kilometre away": ({"moved": 1000.0}, {}, lambda labels: labels),
+    "a phase of each link": ({}, {"common": False}, turned),
+    "two receivers": ({"receivers": 2}, {}, lambda labels: labels),
+    "the other sign": ({}, {"sign": 1}, lambda labels: labels.conj().resolve_conj()),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_planes_are_found(case):
+    """To 5 mm and 0.01 rad, a tenth of a wavelength."""
+    made, options, changed = CASES[case]
+    links, walls = room(**made)
+    links = replace(links, labels=changed(links.labels))
+    middle = links.query.transmitters.double().mean(0)
+    planes, slabs = search(links, **options).run()
+    assert planes.shape == (2, 4)
+    assert slabs.shape == (2, 3)
+    for wall in walls:
+        cosines = planes[:, :3] @ wall[:3]
+        number = cosines.abs().argmax()
+        heights = (plane[:3] @ middle - plane[3] for plane in (planes[number] * cosines[number].sgn(), wall))
+        assert torch.linalg.cross(planes[number, :3], wall[:3]).norm() < 0.01
+        assert abs(next(heights) - next(heights)) < 0.005
+
+
+def test_no_plane_is_found_in_free_space(monkeypatch):
+    monkeypatch.setattr(channel_search, "LEAST", 1e-6)
+    links, _ = room(walls=PLANES[:0])
+    planes, slabs = search(links).run()
+    assert len(planes) == len(slabs) == 0
+
+
+# --- strengths ---
+
+
+def draw(*shape):
+    return np.random.default_rng(len(shape)).normal(size=(*shape, 2)) @ [1, 1j]
+
+
+def test_projection_is_least_squares():
+    waves, labels = draw(3, 4, 20), draw(3, 20)
+    rest, strengths = project(torch.from_numpy(waves), torch.from_numpy(labels), ridge=0.0)
+    for k in range(3):
+        expected = np.linalg.lstsq(waves[k].T, labels[k], rcond=None)[0]
+        np.testing.assert_allclose(strengths[k], expected, rtol=1e-9)
+        np.testing.assert_allclose(rest[k], labels[k] - expected @ waves[k], rtol=0, atol=1e-9)
+
+
+def test_real_strengths_are_not_negative_unless_signed(monkeypatch):
+    monkeypatch.setattr(channel_search, "RIDGE", 0.0)
+    waves, signed = draw(6, 4, 200), np.array([False, False, True, False])
+    strengths = np.random.default_rng(0).uniform(0.5, 1, (6, 4)) * [1, -1, -1, 1]
+    labels = (strengths[:, None] @ waves)[:, 0] + 0.1 * draw(6, 200)
+    rest = real_residual(*map(torch.from_numpy, (waves, labels, signed)))
+    for k in range(6):
+        columns = np.concatenate((waves[k], -waves[k][signed]))
+        parts = (np.concatenate((part.real, part.imag), -1) for part in (columns, labels[k]))
+        (both, right) = parts
+        expected, _ = nnls(both.T, right)
+        np.testing.assert_allclose(rest[k], labels[k] - expected @ columns, rtol=0, atol=1e-9)
