@@ -32,6 +32,12 @@ def hold_out_band(links: Links, band_train: Sequence[float] | None, band_test: S
     if not others.any():
         raise ValueError(f"data.band_train={[*band_train]} leaves no subcarrier to test on; choose a narrower band")
     own, rest = task.frequencies[chosen], task.frequencies[others]
+    heard = [part.abs().amax((1, 2)) > 0 for part in (links.labels[..., chosen], links.labels[..., others])]
+    kept = (heard[0] & heard[1]).nonzero()[:, 0]
+    if silent := len(links) - len(kept):
+        remarks = "; ".join(filter(None, (links.remarks, f"{silent} that are zero in a band are left out")))
+        rows = None if links.rows is None else links.rows[kept]
+        links = replace(links, query=links.query[kept], labels=links.labels[kept], rows=rows, remarks=remarks)
     carriers = torch.full((len(links),), (own.min() + own.max()).item() / 2)
     links = replace(links, query=replace(links.query, frequencies=carriers))
     part = lambda which, some: replace(

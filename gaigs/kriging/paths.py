@@ -43,8 +43,9 @@ class Equations:
     ) -> "Equations":
         """From the fields m_i of each ``slice`` of the links, one after the other: all together may take gigabytes."""
         grams, sides = [], []
-        for start in range(0, len(places), 64):
-            part = slice(start, start + 64)
+        size = max(1, min(64, 300_000 // labels[0].numel()))
+        for start in range(0, len(places), size):
+            part = slice(start, start + size)
             fields = margins(part).flatten(2).to(torch.complex128)
             powers = labels[part].abs().double().square().mean((1, 2))[:, None, None]
             grams.append(fields.conj() @ fields.mT / powers)

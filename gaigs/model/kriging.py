@@ -160,7 +160,10 @@ class Kriging(Model):
         return validation_model.to(device)
 
     def variance(self, batch: Batch) -> Float[Tensor, "b e s"]:
-        """Variance of complex channels predicted by kriged paths: that of their strengths, and the nugget's."""
+        """Variance of complex channels predicted by kriged paths: that of their strengths, and the nugget's.
+
+        A lower bound that is not calibrated; of the default hyperparameters if validation chose no kriging.
+        """
         query, process = batch.query, Hyperparameters(*self.hyperparameters.tolist())
         value = self(batch).value
         found = process.nugget * value.abs().square().mean((1, 2), keepdim=True).expand(value.shape).clone()
@@ -185,8 +188,8 @@ class Kriging(Model):
             name = self.fallback_options["name"]
             log.warning(
                 "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
-                "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
-                *(task.monitor, own.mean(), name, other.mean(), name),
+                "the prediction falls back on %s%s, with %.0f %% of the trained model",
+                *(task.monitor, own.mean(), name, other.mean(), "" if self.by_paths else "kriging of ", name),
                 100 * (1 - self.weight * (1 - self.trend_weight)),
             )
         return is_learnt
@@ -253,11 +256,15 @@ class Kriging(Model):
 
     @property
     def any_frequency(self) -> bool:  # type: ignore[override]
-        return self.trend.any_frequency
+        return self._alone.any_frequency
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
-        """The trend alone: its residuals at other frequencies do not correlate with the known ones."""
-        return self.trend.at_frequencies(frequencies)
+        """The trend alone, or the fallback: residuals at other frequencies do not correlate with the known ones."""
+        return self._alone.at_frequencies(frequencies)
+
+    @property
+    def _alone(self) -> Model:
+        return self.trend if self.trend_weight > 0 else self.fallback
 
     @property
     def primitives(self) -> Gaussians | None:  # type: ignore[override]

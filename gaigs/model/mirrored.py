@@ -146,7 +146,8 @@ class MirroredSplatting(GaussianSplatting):
     @property
     def has_margins(self) -> bool:
         """True for ``margins``: channels are sums of mirrored paths alone."""
-        return isinstance(self.pooling, ChannelPooling) and self.takes_paths and self.trend is None
+        alone = self.trend is None and self.gaussians is None
+        return alone and self.takes_paths and isinstance(self.pooling, ChannelPooling)
 
     @torch.no_grad()
     def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:

@@ -133,7 +133,7 @@ class ChannelSearch:
         links: Their training links count; of the task ``csi``.
         sign: Sign of the channels' phases.
         common: True if channels have a phase in common.
-        order: Largest number of reflections of a path.
+        order: Largest number of reflections of a path; more than 2 count as 2, as longer paths hardly locate a plane.
         most: Largest number of planes.
         start: Planes known before (w, 4).
 
@@ -142,7 +142,7 @@ class ChannelSearch:
     """
 
     def __init__(self, links: Links, sign: int, common: bool, order: int, most: int, start: Float[Tensor, "w 4"]):
-        self.common, self.order, self.most, self.start = common, order, most, start.double()
+        self.common, self.order, self.most, self.start = common, min(order, 2), most, start.double()
         self.generator = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
         numbers = links.query.receivers[links.split.train].unique().tolist()
         self.receivers = [ReceiverChannels.of(links, number, sign) for number in numbers]
@@ -185,7 +185,7 @@ class ChannelSearch:
         low, high = along.amin(0) - margin, along.amax(0) + margin
         offsets = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, 80).to(low)
         grid = torch.cat((normals[:, None].expand(-1, offsets.shape[1], -1), offsets[..., None]), 2)
-        # Profiles of some hundred megabytes at most, also in a hall with a large band.
+        # Profiles of a gigabyte at most, also in a hall with a large band.
         size = max(receiver.channels.shape[1] * self.delays(receiver) for receiver in self.receivers)
         self.many = self.drawn(min(200, 60_000_000 // size))
         planes = self.start
@@ -209,9 +209,13 @@ class ChannelSearch:
         scores = self.scores(few, [rest[::3] for rest in rests], grid).flatten()
         for plane in planes:
             scores[self.alike(grid.flatten(0, 1), plane)] = 0
+        # Of noise a wave explains one part in as many as a channel has numbers; the best of a grid somewhat more.
+        places = sum(len(receiver.places) for receiver in self.many)
+        numbers = min(receiver.flat.shape[1] for receiver in self.many)
+        by_chance = math.exp(self.unexplained(planes)) * (1 + 5 / math.sqrt(places)) / numbers
         found = []
         for plane, share in self.best(rests, planes, grid.flatten(0, 1), scores):
-            if share >= LEAST:
+            if share >= max(LEAST, by_chance):
                 refined = self.refine(torch.cat((planes, plane[None])), 30, 1e-2)
                 found.append((self.unexplained(refined), share, refined))
         return found

@@ -12,7 +12,8 @@ from torch.nn.functional import softplus
 from gaigs.data import Links
 from gaigs.geometry import polar, quaternions_to_rotations
 from gaigs.model import Model, Prediction
-from gaigs.propagation import array_sign, fit_gain, free_space, phase_sign
+from gaigs.phases import array_sign
+from gaigs.propagation import fit_gain, free_space
 from gaigs.query import Batch
 from gaigs.scene import Scene, check_elements, direct_waves
 from gaigs.tokenizer.euclidean import fourier_features, learnable_octaves, octaves
@@ -96,7 +97,8 @@ class NGrf(Model):
         train = links.split.train
         labels, query = links.labels[train].to(torch.complex128), links.query[train]
         waves = direct_waves(self.scene, query, self.scene.task.frequencies)
-        self.sign.fill_(phase_sign(labels, waves, query.receivers) or array_sign(labels, waves))
+        sign = self.scene.task.phase_sign(labels, waves, query.receivers)
+        self.sign.fill_(sign or array_sign(labels, waves))
         waves = waves if self.sign < 0 else waves.conj()
         for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver

@@ -113,6 +113,13 @@ def test_no_plane_is_found_in_free_space(monkeypatch):
     assert len(planes) == len(slabs) == 0
 
 
+def test_no_plane_is_found_in_noise():
+    links, _ = room()
+    noise = torch.randn(links.labels.shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(2))
+    planes, _ = search(replace(links, labels=noise)).run()
+    assert len(planes) == 0
+
+
 # --- strengths ---
 
 
