@@ -45,7 +45,8 @@ def test_a_model_chooses_what_suits_it_for_every_task(configure, task):
     assert names == ["mirrored", "mirrored", "none", f"path_{task}"]
     assert model["projection"] is model["rasterizer"] is None
     assert (model["gaussians"], model["trend"]) == (None, TRENDS[task])
-    assert (config["kriging"], config["threads"], config["trainer"]["max_steps"]) == (True, 1, 900)
+    steps = 2000 if task == "csi" else 900
+    assert (config["kriging"], config["threads"], config["trainer"]["max_steps"]) == (True, 1, steps)
 
 
 def test_the_command_line_wins_over_a_model_and_a_model_over_the_task(configure):

@@ -104,7 +104,6 @@ class MirroredSplatting(GaussianSplatting):
             placement.place(number, plane[:3].float(), float(plane[3] - plane[:3] @ placement.middle.double()), slab)
         placement.planned.copy_(placement.sequences_of(torch.arange(len(planes))))
         placement.most.copy_(placement.planned.sum())
-        placement.enable_reflections()
         placement.step.mul_(0.1)  # the search is exact to millimetres
         placement.found.fill_(True)
 

@@ -66,8 +66,8 @@ class NGrf(Model):
             if number < 1:
                 raise ValueError(f"model.{option} must be at least 1, got {number}")
         for option, value in (("margin", margin), ("scale", scale), ("strength", strength)):
-            if not 0 < value < math.inf:
-                raise ValueError(f"model.{option} must be positive, got {value}")
+            if not 0 < value <= 1e6:
+                raise ValueError(f"model.{option} must be more than 0 and at most 1e6, got {value}")
         receivers = scene.positions(scene.lower)
         corners = torch.cat((scene.lower[None], scene.upper[None], receivers))
         lower, upper = corners.amin(0), corners.amax(0)
