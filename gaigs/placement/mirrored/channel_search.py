@@ -25,8 +25,12 @@ RIDGE = 1e-3
 FLOOR = 1e-3
 """Share of a channel's power below which a residual hardly counts: 30 dB."""
 
-LEAST = 0.006
-"""Least share of the power that a plane takes. Validation drops planes later; a few too many cost time alone."""
+LEAST, FAINTEST = 0.006, 0.003
+"""Least share of the power that a plane takes; the second one if the rest falls by ``DROP``. Validation drops planes
+later; a few too many cost time alone."""
+
+DROP = 0.5
+"""Fall of the mean log of the power that is left, by a true plane behind others: false ones reach 0.3."""
 
 FEWEST = 8
 """Fewest numbers of a channel in which planes can be searched: one path explains any single number."""
@@ -212,12 +216,15 @@ class ChannelSearch:
         # Of noise a wave explains one part in as many as a channel has numbers; the best of a grid somewhat more.
         places = sum(len(receiver.places) for receiver in self.many)
         numbers = min(receiver.flat.shape[1] for receiver in self.many)
-        by_chance = math.exp(self.unexplained(planes)) * (1 + 5 / math.sqrt(places)) / numbers
+        before = self.unexplained(planes)
+        by_chance = math.exp(before) * (1 + 5 / math.sqrt(places)) / numbers
         found = []
         for plane, share in self.best(rests, planes, grid.flatten(0, 1), scores):
-            if share >= max(LEAST, by_chance):
+            if share >= max(FAINTEST, by_chance):
                 refined = self.refine(torch.cat((planes, plane[None])), 30, 1e-2)
-                found.append((self.unexplained(refined), share, refined))
+                after = self.unexplained(refined)
+                if share >= LEAST or before - after >= DROP:
+                    found.append((after, share, refined))
         return found
 
     def unexplained(self, planes: Float[Tensor, "w 4"]) -> float:

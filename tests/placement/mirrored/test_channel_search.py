@@ -108,6 +108,7 @@ def test_planes_are_found(case):
 
 def test_no_plane_is_found_in_free_space(monkeypatch):
     monkeypatch.setattr(channel_search, "LEAST", 1e-6)
+    monkeypatch.setattr(channel_search, "FAINTEST", 1e-6)
     links, _ = room(walls=PLANES[:0])
     planes, slabs = search(links).run()
     assert len(planes) == len(slabs) == 0
