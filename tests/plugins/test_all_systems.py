@@ -169,7 +169,7 @@ def test_sizes_of_deformations_below_the_least_are_refused(name, option, least):
         ("mlp", {"dropout": 1.0}, r"model\.dropout must be in \[0, 1\), got 1\.0"),
         ("fire", {"widths": [4, 0, 4]}, r"model\.widths must be of at least 1"),
         ("gsrf", {"radius": 0.0}, "model.radius must be positive"),
-        ("ngrf", {"scale": 0.0}, "model.scale must be positive, got 0"),
+        ("ngrf", {"scale": 0.0}, "model.scale must be more than 0 and at most 1e6, got 0"),
         ("gsrf", {"count": 1}, "a point for each of the 2 receivers"),
         ("gsrf", {"margin": 0.0}, "model.margin must be positive"),
         ("gsrf", {"pooling": {"name": "spectrum", "channels": 1}}, "pooling 'spectrum' takes 1 real channel"),
