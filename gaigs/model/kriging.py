@@ -114,9 +114,9 @@ class Kriging(Model):
         return validation_model
 
     def _krige_paths(self, links: Links, values: Tensor) -> "Kriging":
-        """``krige`` for a trend of paths; hyperparameters are those with which the validation links score best.
+        """``krige`` for a trend of paths; hyperparameters are those with the largest sure gain on the validation links.
 
-        The weight is 1 where the mean score rises by more than a standard error and the median does not fall; else 0.
+        It is the rise of the mean score less a standard error. Without one, or if the median falls, the weight is 0.
         """
         split, task, index = links.split, links.task, known(links)
         query, labels = links.query[index], links.labels[index]
@@ -143,9 +143,9 @@ class Kriging(Model):
                     kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), fields[row], 1)
             after = task.scores(labels[held], kriged)[task.monitor]
             gain = after - before if task.higher_is_better else before - after
-            is_sure = gain.mean() > gain.std() / math.sqrt(len(gain)) and after.median() >= before.median()
-            if is_sure and gain.mean().item() > best[0]:
-                best = gain.mean().item(), process
+            sure = (gain.mean() - gain.std() / math.sqrt(len(gain))).item()
+            if sure > max(0, best[0]) and after.median() >= before.median():
+                best = sure, process
         self.trend_weight.fill_(0)
         if len(held) == 0 or self._is_learnt(links, plain, validation_model.fallback):
             self.trend_weight.fill_(1)

@@ -32,6 +32,10 @@ later; a few too many cost time alone."""
 DROP = 0.5
 """Fall of the mean log of the power that is left, by a true plane behind others: false ones reach 0.3."""
 
+LITTLE = 0.1
+"""Rise of the mean log of the power that is left, without a false plane: of true ones it is 0.14 and more. Two tilted
+planes may share what one true plane explains."""
+
 FEWEST = 8
 """Fewest numbers of a channel in which planes can be searched: one path explains any single number."""
 
@@ -131,7 +135,8 @@ class ChannelSearch:
     best candidate is refined by variable projection, together with the planes before it: strengths of paths are free at
     each place, so neither phases nor blockage are assumed. Then phases count: a periodogram over offset and two tilts
     proposes planes and slabs whose reflections have like phases at all places, and the residual decides, with strengths
-    that are real and not negative. It sees delays too, so it tells planes half a wavelength apart.
+    that are real and not negative. It sees delays too, so it tells planes half a wavelength apart. At last, planes that
+    explain hardly anything are dropped, and what they explained is searched anew.
 
     Args:
         links: Their training links count; of the task ``csi``.
@@ -159,10 +164,26 @@ class ChannelSearch:
     @torch.no_grad()
     def run(self) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
         """Planes, strongest first, and their slabs as in ``SLABS``."""
-        planes = self.find()
+        planes = self.find(self.start)
         if not len(planes):
             return planes, planes[:, :3]
-        return self.resolve(self.refine(planes, 300, 5e-3))
+        best = self.resolve(self.refine(planes, 300, 5e-3))
+        kept = self.without_false(*best)
+        if len(kept) < len(best[0]):  # what they explained is searched anew
+            again = self.resolve(self.refine(self.find(self.refine(kept, 100, 1e-2)), 300, 5e-3))
+            best = min(best, again, key=lambda found: self.left(*self.some(found[0]), *found).item())
+        return best
+
+    def without_false(self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]) -> Float[Tensor, "v 4"]:
+        """Planes of which each explains something that the others do not."""
+        while len(planes) > len(self.start):
+            without = [torch.arange(len(planes)) != k for k in range(len(self.start), len(planes))]
+            left = [self.left(*self.some(planes[kept]), planes[kept], slabs[kept]).item() for kept in without]
+            if min(left) - self.left(*self.some(planes), planes, slabs).item() > LITTLE:
+                break
+            kept = without[left.index(min(left))]
+            planes, slabs = self.polish(planes[kept], slabs[kept], 60, 3e-4)
+        return planes
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
         return all_sequences(len(planes), self.order)
@@ -181,8 +202,8 @@ class ChannelSearch:
 
     # --- Hough transform ---
 
-    def find(self) -> Float[Tensor, "w 4"]:
-        """Planes one after the other, each refined with those before."""
+    def find(self, known: Float[Tensor, "v 4"]) -> Float[Tensor, "w 4"]:
+        """Known planes and others, found one after the other, each refined with those before."""
         normals = torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3))).to(self.points)
         along = self.points @ normals.mT
         margin = 0.3 * self.diagonal
@@ -192,14 +213,14 @@ class ChannelSearch:
         # Profiles of a gigabyte at most, also in a hall with a large band.
         size = max(receiver.channels.shape[1] * self.delays(receiver) for receiver in self.receivers)
         self.many = self.drawn(min(200, 60_000_000 // size))
-        planes = self.start
+        planes = known
         while len(planes) < self.most and (tried := self.with_one_more(planes, grid)):
             _, share, planes = min(tried, key=lambda found: found[0])
             planes = self.refine(planes, 60, 1e-2)
             log.info("plane (%.2f, %.2f, %.2f) at %.2f m: %.1f %% of the power", *planes[-1].tolist(), 100 * share)
-        for _ in range(len(planes) - len(self.start)):  # each once more, as the others are known now
-            others = torch.cat((planes[: len(self.start)], planes[len(self.start) + 1 :]))
-            kept = torch.cat((others, planes[len(self.start), None]))
+        for _ in range(len(planes) - len(known)):  # each once more, as the others are known now
+            others = torch.cat((planes[: len(known)], planes[len(known) + 1 :]))
+            kept = torch.cat((others, planes[len(known), None]))
             tried = [*self.with_one_more(others, grid), (self.unexplained(kept), 0.0, kept)]
             planes = min(tried, key=lambda found: found[0])[2]
         return planes
@@ -357,27 +378,61 @@ class ChannelSearch:
     def resolve(self, planes: Float[Tensor, "w 4"]) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
         """Moves planes to where real strengths of slabs leave least. Planes not yet resolved keep complex strengths."""
         slabs, resolved = SLABS[1].repeat(len(planes), 1), torch.zeros(len(planes), dtype=torch.bool)
-        phases = self.phases(planes)
-        parts, turns = [], []
-        for receiver, phase in zip(self.receivers, phases, strict=True):
-            every = slice(None, None, max(1, len(receiver.places) * len(self.receivers) // 100))
-            parts.append(receiver.some(every, slice(None, None, 5)))
-            turns.append(phase if len(phase) == 1 else phase[every])
+        parts = self.some(planes)
         for reach, tilt, materials in ((0.07, 0.04, SLABS[::3]), (0.05, 0.006, SLABS), (0.05, 0.006, SLABS)):
             for k in range(len(planes)):
                 resolved[k] = True
                 trials: list[tuple[float, Tensor, Tensor]] = []
-                for plane, material in self.proposals(planes, k, reach, tilt, materials):
-                    tried, own = planes.clone(), slabs.clone()
-                    tried[k], own[k] = plane, material
-                    trials.append((self.left(parts, turns, tried, own, resolved).item(), tried, own))
+                for about in (planes, *(self.squared(planes, k) if tilt > 0.01 else ())):
+                    for plane, material in self.proposals(about, k, reach, tilt, materials):
+                        tried, own = planes.clone(), slabs.clone()
+                        tried[k], own[k] = plane, material
+                        trials.append((self.left(*parts, tried, own, resolved).item(), tried, own))
                 trials.sort(key=lambda trial: trial[0])
                 if resolved.all():
                     for _, tried, own in trials[:3]:
                         moved = self.polish(tried, own, 12, 5e-4, k)
-                        trials.append((self.left(parts, turns, *moved, resolved).item(), *moved))
+                        trials.append((self.left(*parts, *moved, resolved).item(), *moved))
                 _, planes, slabs = min(trials, key=lambda trial: trial[0])
         return self.polish(planes, slabs, 60, 3e-4)
+
+    def squared(self, planes: Float[Tensor, "w 4"], k: int) -> list[Float[Tensor, "w 4"]]:
+        """The planes, with plane k parallel or at right angles to others and at the best two offsets near its own.
+
+        A plane that is tilted may stand for two parallel ones.
+        """
+        known = torch.arange(len(planes)) != k
+        normals = planes[known, :3]
+        pairs = torch.combinations(torch.arange(len(normals)))
+        crossed = torch.linalg.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
+        axes = torch.cat((functional.normalize(crossed[crossed.norm(dim=1) > 0.5], dim=1), normals))
+        cosines = axes @ planes[k, :3]
+        axes = (axes * cosines.sign()[:, None])[(cosines.abs() > 0.9) & (cosines.abs() < 0.9995)]
+        distinct: list[Tensor] = []
+        for axis in axes:
+            if all(axis @ other < 0.9998 for other in distinct):
+                distinct.append(axis)
+        rests = [self.profiles(receiver, planes[known]) for receiver in self.many]
+        turned = []
+        for axis in distinct[:3]:
+            offsets = axis @ self.middle + planes[k, 3] - planes[k, :3] @ self.middle
+            offsets = offsets + 0.1 * self.diagonal * torch.linspace(-1, 1, 81).double()
+            line = torch.cat((axis.expand(81, 3), offsets[:, None]), 1)
+            scores = self.scores(self.many, rests, line[None])[0]
+            highest = functional.max_pool1d(scores[None], 5, 1, 2)[0] == scores
+            for at in (scores * highest).argsort(descending=True)[:2]:
+                turned.append(planes.clone())
+                turned[-1][k] = line[at]
+        return turned
+
+    def some(self, planes: Float[Tensor, "w 4"]) -> tuple[list[ReceiverChannels], list[Complex[Tensor, " c"]]]:
+        """About a hundred places at a fifth of the subcarriers, and their phases."""
+        parts, turns = [], []
+        for receiver, phase in zip(self.receivers, self.phases(planes), strict=True):
+            every = slice(None, None, max(1, len(receiver.places) * len(self.receivers) // 100))
+            parts.append(receiver.some(every, slice(None, None, 5)))
+            turns.append(phase if len(phase) == 1 else phase[every])
+        return parts, turns
 
     def phases(self, planes: Float[Tensor, "w 4"]) -> list[Complex[Tensor, " c"]]:
         """Phase of each receiver's direct paths: one in common, or one for each place."""
@@ -446,9 +501,10 @@ class ChannelSearch:
                 kept.append(trial)
         return [(moved(q), material) for _, q, material in kept]
 
-    def left(self, receivers, phases, planes, slabs, resolved: Bool[Tensor, " w"]) -> Float[Tensor, ""]:
+    def left(self, receivers, phases, planes, slabs, resolved: Bool[Tensor, " w"] | bool = True) -> Float[Tensor, ""]:
         """Mean log of the share of power that real strengths leave; complex ones of paths at planes not resolved."""
         sequences = self.sequences(planes)
+        resolved = torch.as_tensor(resolved).expand(len(planes))
         free = (~resolved[sequences] & (sequences >= 0)).any(1)
         shares = []
         for receiver, phase in zip(receivers, phases, strict=True):
@@ -460,8 +516,7 @@ class ChannelSearch:
 
     def polish(self, planes, slabs, steps: int, rate: float, only: int | None = None) -> tuple[Tensor, Tensor]:
         """Descends on ``left`` with all planes, or with one."""
-        resolved = torch.ones(len(planes), dtype=torch.bool)
-        moves = resolved if only is None else torch.arange(len(planes)) == only
+        moves = torch.arange(len(planes)) == only if only is not None else torch.ones(len(planes), dtype=torch.bool)
         phases = self.phases(planes)
 
         def loss(tried: Float[Tensor, "w 4"], own: Float[Tensor, "w 3"]) -> Float[Tensor, ""]:
@@ -473,7 +528,7 @@ class ChannelSearch:
                 when = torch.randperm(len(receiver.frequencies), generator=self.generator)[:6]
                 parts.append(receiver.some(index, when))
                 turns.append(phase if len(phase) == 1 else phase[index])
-            return self.left(parts, turns, tried, own, resolved)
+            return self.left(parts, turns, tried, own)
 
         moved, own = self.descend(loss, planes, [slabs], steps, rate)
         return torch.where(moves[:, None], moved, planes), torch.where(moves[:, None], own, slabs)
