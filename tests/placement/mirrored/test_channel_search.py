@@ -121,6 +121,25 @@ def test_no_plane_is_found_in_noise():
     assert len(planes) == 0
 
 
+def test_false_plane_is_dropped():
+    links, walls = room()
+    false = torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double()
+    with torch.no_grad():
+        kept = search(links).without_false(
+            torch.cat((walls[:1], false, walls[1:])), channel_search.SLABS[:1].repeat(3, 1)
+        )
+    torch.testing.assert_close(kept, walls, rtol=0, atol=0.01)
+
+
+def test_tilted_plane_is_turned_square():
+    links, walls = room(walls=np.array([[1.0, 0, 0, -0.4], [0, 1.0, 0, -0.7]]))
+    tilted, level = torch.tensor([[0.99, -0.13, 0.05, -0.2], [0, 0, 1.0, 3.1]]).double()
+    chosen = search(links)
+    chosen.many = chosen.drawn(60)
+    turned = chosen.squared(torch.stack((tilted / tilted[:3].norm(), walls[1], level)), 0)
+    assert any((plane[0] - walls[0]).abs().max() < 0.03 for plane in turned)
+
+
 # --- strengths ---
 
 
