@@ -430,7 +430,7 @@ class ChannelSearch:
         parts, turns = [], []
         for receiver, phase in zip(self.receivers, self.phases(planes), strict=True):
             every = slice(None, None, max(1, len(receiver.places) * len(self.receivers) // 100))
-            parts.append(receiver.some(every, slice(None, None, 5)))
+            parts.append(receiver.some(every, slice(None, None, 5)).single())
             turns.append(phase if len(phase) == 1 else phase[every])
         return parts, turns
 
@@ -438,6 +438,8 @@ class ChannelSearch:
         """Phase of each receiver's direct paths: one in common, or one for each place."""
         found = []
         for receiver in self.receivers:
+            if self.common:  # a hundred places say it
+                receiver = receiver.some(slice(None, None, max(1, len(receiver.places) // 100)))
             waves = receiver.waves(receiver.images(planes, self.sequences(planes)))
             direct = project(waves, receiver.flat, 1e-4)[1][:, 0]
             strong = direct.abs() >= direct.abs().median()
@@ -508,7 +510,7 @@ class ChannelSearch:
         free = (~resolved[sequences] & (sequences >= 0)).any(1)
         shares = []
         for receiver, phase in zip(receivers, phases, strict=True):
-            channels = receiver.flat * phase[:, None].conj()
+            channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
             waves = receiver.reflected(planes, slabs, sequences)
             waves, signed = torch.cat((waves, 1j * waves[:, free]), 1), torch.cat((free, free[free]))
             shares.append(log_share(real_residual(waves, channels, signed), channels))
@@ -526,7 +528,7 @@ class ChannelSearch:
                 count = max(8, 40 // len(self.receivers))
                 index = torch.randperm(len(receiver.places), generator=self.generator)[:count]
                 when = torch.randperm(len(receiver.frequencies), generator=self.generator)[:6]
-                parts.append(receiver.some(index, when))
+                parts.append(receiver.some(index, when).single())
                 turns.append(phase if len(phase) == 1 else phase[index])
             return self.left(parts, turns, tried, own)
 
