@@ -116,7 +116,8 @@ class Kriging(Model):
     def _krige_paths(self, links: Links, values: Tensor) -> "Kriging":
         """``krige`` for a trend of paths; hyperparameters are those with the largest sure gain on the validation links.
 
-        It is the rise of the mean score less a standard error. Without one, or if the median falls, the weight is 0.
+        It is the rise of the mean score less its standard error. One with which the median falls does not count; if
+        none is left, the weight is 0.
         """
         split, task, index = links.split, links.task, known(links)
         query, labels = links.query[index], links.labels[index]
@@ -134,7 +135,7 @@ class Kriging(Model):
         fields = {int(row): trend.margins(query[row : row + 1].to(device)).cpu()[0] for row in held}
         plain, best = values[held], (-math.inf, next(candidates(self.scene.spacing)))
         before = task.scores(labels[held], plain)[task.monitor] if len(held) else plain.real
-        for process in candidates(self.scene.spacing) if len(held) else ():
+        for process in candidates(self.scene.spacing) if len(held) > 1 else ():
             kriged = plain.clone()
             for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
                 field.solve(known_ones[rows < len(split.train)], process)

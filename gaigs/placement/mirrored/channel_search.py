@@ -160,10 +160,13 @@ class ChannelSearch:
         self.points, self.middle = points, (points.amin(0) + points.amax(0)) / 2
         self.diagonal = float((points.amax(0) - points.amin(0)).norm())
         self.wavelength = speed_of_light / float(self.receivers[0].frequencies.mean())
+        # Profiles of a gigabyte at most, also in a hall with a large band.
+        size = max(receiver.channels.shape[1] * self.delays(receiver) for receiver in self.receivers)
+        self.many = self.drawn(min(200, 60_000_000 // size))
 
     @torch.no_grad()
     def run(self) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
-        """Planes, strongest first, and their slabs as in ``SLABS``."""
+        """Planes, first those of the start, and their slabs as in ``SLABS``."""
         planes = self.find(self.start)
         if not len(planes):
             return planes, planes[:, :3]
@@ -171,7 +174,8 @@ class ChannelSearch:
         kept = self.without_false(*best)
         if len(kept) < len(best[0]):  # what they explained is searched anew
             again = self.resolve(self.refine(self.find(self.refine(kept, 100, 1e-2)), 300, 5e-3))
-            best = min(best, again, key=lambda found: self.left(*self.some(found[0]), *found).item())
+            cost = lambda found: self.left(*self.some(found[0]), *found).item() + LITTLE * len(found[0])
+            best = min(best, again, key=cost)
         return best
 
     def without_false(self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]) -> Float[Tensor, "v 4"]:
@@ -210,9 +214,6 @@ class ChannelSearch:
         low, high = along.amin(0) - margin, along.amax(0) + margin
         offsets = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, 80).to(low)
         grid = torch.cat((normals[:, None].expand(-1, offsets.shape[1], -1), offsets[..., None]), 2)
-        # Profiles of a gigabyte at most, also in a hall with a large band.
-        size = max(receiver.channels.shape[1] * self.delays(receiver) for receiver in self.receivers)
-        self.many = self.drawn(min(200, 60_000_000 // size))
         planes = known
         while len(planes) < self.most and (tried := self.with_one_more(planes, grid)):
             _, share, planes = min(tried, key=lambda found: found[0])
@@ -412,7 +413,7 @@ class ChannelSearch:
         for axis in axes:
             if all(axis @ other < 0.9998 for other in distinct):
                 distinct.append(axis)
-        rests = [self.profiles(receiver, planes[known]) for receiver in self.many]
+        rests = [self.profiles(receiver, planes[known]) for receiver in self.many] if distinct else []
         turned = []
         for axis in distinct[:3]:
             offsets = axis @ self.middle + planes[k, 3] - planes[k, :3] @ self.middle
@@ -420,9 +421,10 @@ class ChannelSearch:
             line = torch.cat((axis.expand(81, 3), offsets[:, None]), 1)
             scores = self.scores(self.many, rests, line[None])[0]
             highest = functional.max_pool1d(scores[None], 5, 1, 2)[0] == scores
-            for at in (scores * highest).argsort(descending=True)[:2]:
-                turned.append(planes.clone())
-                turned[-1][k] = line[at]
+            for at in (scores * highest).topk(2).indices:
+                if scores[at] > 0:
+                    turned.append(planes.clone())
+                    turned[-1][k] = line[at]
         return turned
 
     def some(self, planes: Float[Tensor, "w 4"]) -> tuple[list[ReceiverChannels], list[Complex[Tensor, " c"]]]:
@@ -507,7 +509,7 @@ class ChannelSearch:
         """Mean log of the share of power that real strengths leave; complex ones of paths at planes not resolved."""
         sequences = self.sequences(planes)
         resolved = torch.as_tensor(resolved).expand(len(planes))
-        free = (~resolved[sequences] & (sequences >= 0)).any(1)
+        free = torch.isin(sequences, (~resolved).nonzero()).any(1)
         shares = []
         for receiver, phase in zip(receivers, phases, strict=True):
             channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
@@ -557,7 +559,8 @@ def real_residual(
 
 
 def log_share(part: Complex[Tensor, "b k"], whole: Complex[Tensor, "b k"]) -> Float[Tensor, " b"]:
-    return (part.abs().square().sum(-1) / whole.abs().square().sum(-1) + FLOOR).log()
+    power = whole.abs().square().sum(-1)
+    return (part.abs().square().sum(-1) / torch.where(power > 0, power, 1) + FLOOR).log()
 
 
 def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
