@@ -176,7 +176,43 @@ class ChannelSearch:
             again = self.resolve(self.refine(self.find(self.refine(kept, 100, 1e-2)), 300, 5e-3))
             cost = lambda found: self.left(*self.some(found[0]), *found).item() + LITTLE * len(found[0])
             best = min(best, again, key=cost)
-        return best
+        return self.with_parallel(*best)
+
+    def with_parallel(
+        self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]
+    ) -> tuple[Float[Tensor, "v 4"], Float[Tensor, "v 3"]]:
+        """The planes with parallel ones, which are told from noise when fainter, as three numbers less are free."""
+        while len(planes) < self.most:
+            parts, count = self.some(planes), len(planes)
+            before, found = self.left(*parts, planes, slabs).item(), []
+            rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
+            profiles = [self.profiles(*pair) for pair in zip(self.many, rests, strict=True)]
+            for axis in distinct(planes[:, :3]):
+                along = self.points @ axis
+                margin = 0.3 * self.diagonal
+                offsets = torch.linspace(float(along.min() - margin), float(along.max() + margin), 400).double()
+                line = torch.cat((axis.expand(400, 3), offsets[:, None]), 1)
+                scores = self.scores(self.many, profiles, line[None])[0]
+                for plane in planes:
+                    scores[self.alike(line, plane)] = 0
+                found += [(scores[at].item(), line[at]) for at in maxima(scores, 11)]
+            # A share of what is left lowers its log by about as much.
+            found = sorted((pair for pair in found if pair[0] > LITTLE * math.exp(before)), key=lambda pair: -pair[0])
+            trials = []
+            for _, plane in found[:4]:
+                tried = torch.cat((planes, plane[None]))
+                for moved, material in self.proposals(tried, count, 0.07, 1e-4, SLABS[::3]):
+                    both = torch.cat((planes, moved[None])), torch.cat((slabs, material[None]))
+                    trials.append((self.left(*parts, *both).item(), *both))
+            if not trials:
+                break
+            _, *best = min(trials, key=lambda trial: trial[0])
+            tried, own = self.polish(best[0], best[1], 12, 5e-4, count)
+            if self.left(*parts, tried, own).item() > before - 2 * LITTLE:  # twice of what keeps a plane
+                break
+            planes, slabs = self.polish(tried, own, 60, 3e-4)
+            log.info("plane (%.2f, %.2f, %.2f) at %.2f m, parallel to others", *planes[-1].tolist())
+        return planes, slabs
 
     def without_false(self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]) -> Float[Tensor, "v 4"]:
         """Planes of which each explains something that the others do not."""
@@ -230,7 +266,7 @@ class ChannelSearch:
         self, planes: Float[Tensor, "w 4"], grid: Float[Tensor, "n k 4"]
     ) -> list[tuple[float, float, Float[Tensor, "w+1 4"]]]:
         """Refined planes with each of the best candidates, what they leave, and the candidate's share of power."""
-        rests = [self.profiles(receiver, planes) for receiver in self.many]
+        rests = [self.profiles(receiver, self.projected(receiver, planes)[0]) for receiver in self.many]
         few = [receiver.some(slice(None, None, 3)) for receiver in self.many]
         scores = self.scores(few, [rest[::3] for rest in rests], grid).flatten()
         for plane in planes:
@@ -251,11 +287,16 @@ class ChannelSearch:
 
     def unexplained(self, planes: Float[Tensor, "w 4"]) -> float:
         """Mean log of the share of power that free strengths leave."""
-        sequences, shares = self.sequences(planes), []
+        shares = []
         for receiver in self.many:
-            rest, _ = project(receiver.waves(receiver.images(planes, sequences)), receiver.flat)
-            shares.append(log_share(rest, receiver.flat))
+            shares.append(log_share(self.projected(receiver, planes)[0], receiver.flat))
         return torch.cat(shares).mean().item()
+
+    def projected(
+        self, receiver: ReceiverChannels, planes: Float[Tensor, "w 4"], ridge: float = RIDGE
+    ) -> tuple[Complex[Tensor, "b k"], Complex[Tensor, "b n"]]:
+        """What free strengths leave, and these strengths."""
+        return project(receiver.waves(receiver.images(planes, self.sequences(planes))), receiver.flat, ridge)
 
     def best(self, rests, planes, flat: Float[Tensor, "k 4"], scores) -> list[tuple[Float[Tensor, "4"], float]]:
         """The best three planes near the eight highest maxima but known ones, with their shares of power."""
@@ -288,12 +329,11 @@ class ChannelSearch:
         apart = (flat[:, 3] - flat[:, :3] @ self.middle) * cosines.sign() - (plane[3] - plane[:3] @ self.middle)
         return (cosines.abs() > 0.96) & (apart.abs() < 0.03 * self.diagonal)
 
-    def profiles(self, receiver: ReceiverChannels, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b e t 2"]:
-        """Delay profiles of the residual at each element, over the square root of the channel's power.
+    def profiles(self, receiver: ReceiverChannels, rest: Complex[Tensor, "b k"]) -> Float[Tensor, "b e t 2"]:
+        """Delay profiles of a residual at each element, over the square root of the channel's power.
 
         A candidate then costs a look-up of each element in place of a sum over subcarriers.
         """
-        rest, _ = project(receiver.waves(receiver.images(planes, self.sequences(planes))), receiver.flat)
         rest = rest / (receiver.flat.norm(dim=1, keepdim=True) * math.sqrt(rest.shape[1]))
         centre, farthest = float(receiver.frequencies.mean()), 4 * self.diagonal / speed_of_light
         delays = torch.linspace(0, farthest, self.delays(receiver)).double()
@@ -409,41 +449,37 @@ class ChannelSearch:
         axes = torch.cat((functional.normalize(crossed[crossed.norm(dim=1) > 0.5], dim=1), normals))
         cosines = axes @ planes[k, :3]
         axes = (axes * cosines.sign()[:, None])[(cosines.abs() > 0.9) & (cosines.abs() < 0.9995)]
-        distinct: list[Tensor] = []
-        for axis in axes:
-            if all(axis @ other < 0.9998 for other in distinct):
-                distinct.append(axis)
-        rests = [self.profiles(receiver, planes[known]) for receiver in self.many] if distinct else []
+        axes = distinct(axes)[:3]
+        rests = [
+            self.profiles(receiver, self.projected(receiver, planes[known])[0]) for receiver in self.many if len(axes)
+        ]
         turned = []
-        for axis in distinct[:3]:
+        for axis in axes:
             offsets = axis @ self.middle + planes[k, 3] - planes[k, :3] @ self.middle
             offsets = offsets + 0.1 * self.diagonal * torch.linspace(-1, 1, 81).double()
             line = torch.cat((axis.expand(81, 3), offsets[:, None]), 1)
             scores = self.scores(self.many, rests, line[None])[0]
-            highest = functional.max_pool1d(scores[None], 5, 1, 2)[0] == scores
-            for at in (scores * highest).topk(2).indices:
-                if scores[at] > 0:
-                    turned.append(planes.clone())
-                    turned[-1][k] = line[at]
+            for at in maxima(scores, 5):
+                turned.append(planes.clone())
+                turned[-1][k] = line[at]
         return turned
 
     def some(self, planes: Float[Tensor, "w 4"]) -> tuple[list[ReceiverChannels], list[Complex[Tensor, " c"]]]:
         """About a hundred places at a fifth of the subcarriers, and their phases."""
         parts, turns = [], []
-        for receiver, phase in zip(self.receivers, self.phases(planes), strict=True):
+        for receiver, phase in zip(self.receivers, self.phases(planes, self.receivers), strict=True):
             every = slice(None, None, max(1, len(receiver.places) * len(self.receivers) // 100))
             parts.append(receiver.some(every, slice(None, None, 5)).single())
             turns.append(phase if len(phase) == 1 else phase[every])
         return parts, turns
 
-    def phases(self, planes: Float[Tensor, "w 4"]) -> list[Complex[Tensor, " c"]]:
+    def phases(self, planes: Float[Tensor, "w 4"], receivers: list[ReceiverChannels]) -> list[Complex[Tensor, " c"]]:
         """Phase of each receiver's direct paths: one in common, or one for each place."""
         found = []
-        for receiver in self.receivers:
+        for receiver in receivers:
             if self.common:  # a hundred places say it
                 receiver = receiver.some(slice(None, None, max(1, len(receiver.places) // 100)))
-            waves = receiver.waves(receiver.images(planes, self.sequences(planes)))
-            direct = project(waves, receiver.flat, 1e-4)[1][:, 0]
+            direct = self.projected(receiver, planes, 1e-4)[1][:, 0]
             strong = direct.abs() >= direct.abs().median()
             found.append((direct.sgn() * strong).sum()[None].sgn() if self.common else direct.sgn())
         return found
@@ -466,7 +502,7 @@ class ChannelSearch:
 
         own = int((sequences[:, :-1].lt(0).all(1) & (sequences[:, -1] == k)).nonzero())
         found = []
-        for receiver, phase in zip(self.receivers, self.phases(planes), strict=True):
+        for receiver, phase in zip(self.receivers, self.phases(planes, self.receivers), strict=True):
             waves = receiver.waves(receiver.images(planes, sequences))
             _, strengths = project(waves, receiver.flat, 1e-4)
 
@@ -507,21 +543,29 @@ class ChannelSearch:
 
     def left(self, receivers, phases, planes, slabs, resolved: Bool[Tensor, " w"] | bool = True) -> Float[Tensor, ""]:
         """Mean log of the share of power that real strengths leave; complex ones of paths at planes not resolved."""
+        rests = self.rests(receivers, phases, planes, slabs, resolved)
+        shares = [log_share(rest, receiver.flat) for receiver, rest in zip(receivers, rests, strict=True)]
+        return torch.cat(shares).mean()
+
+    def rests(
+        self, receivers, phases, planes, slabs, resolved: Bool[Tensor, " w"] | bool = True
+    ) -> list[Complex[Tensor, "b k"]]:
+        """What these strengths leave of each receiver's channels."""
         sequences = self.sequences(planes)
         resolved = torch.as_tensor(resolved).expand(len(planes))
         free = torch.isin(sequences, (~resolved).nonzero()).any(1)
-        shares = []
+        found = []
         for receiver, phase in zip(receivers, phases, strict=True):
             channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
             waves = receiver.reflected(planes, slabs, sequences)
             waves, signed = torch.cat((waves, 1j * waves[:, free]), 1), torch.cat((free, free[free]))
-            shares.append(log_share(real_residual(waves, channels, signed), channels))
-        return torch.cat(shares).mean()
+            found.append(real_residual(waves, channels, signed))
+        return found
 
     def polish(self, planes, slabs, steps: int, rate: float, only: int | None = None) -> tuple[Tensor, Tensor]:
         """Descends on ``left`` with all planes, or with one."""
         moves = torch.arange(len(planes)) == only if only is not None else torch.ones(len(planes), dtype=torch.bool)
-        phases = self.phases(planes)
+        phases = self.phases(planes, self.receivers)
 
         def loss(tried: Float[Tensor, "w 4"], own: Float[Tensor, "w 3"]) -> Float[Tensor, ""]:
             tried, own = (torch.where(moves[:, None], new, old) for new, old in ((tried, planes), (own, slabs)))
@@ -569,6 +613,22 @@ def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tens
     other[normal.abs().argmin()] = 1
     first = functional.normalize(torch.linalg.cross(normal, other), dim=0)
     return first, torch.linalg.cross(normal, first)
+
+
+def distinct(normals: Float[Tensor, "k 3"]) -> list[Float[Tensor, "3"]]:
+    """Normals that are over a degree apart."""
+    found: list[Tensor] = []
+    for normal in normals:
+        if all((normal @ other).abs() < 0.9998 for other in found):
+            found.append(normal)
+    return found
+
+
+def maxima(scores: Float[Tensor, " k"], width: int) -> Int[Tensor, " n"]:
+    """Indices of at most two maxima over 0, each the largest of ``width`` neighbours."""
+    peaks = functional.max_pool1d(scores[None], width, 1, width // 2)[0] == scores
+    at = (scores * peaks).topk(2).indices
+    return at[scores[at] * peaks[at] > 0]
 
 
 def _ridged(gram: Tensor, ridge: float) -> Tensor:
