@@ -156,6 +156,16 @@ def test_tilted_plane_is_turned_square():
     assert any((plane[0] - walls[0]).abs().max() < 0.03 for plane in turned)
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_parallel_plane_is_found_if_there_is_one(count):
+    walls = np.array([[1.0, 0, 0, -0.4], [1.0, 0, 0, 6.3]])
+    links, walls = room(walls=walls[:count])
+    first = torch.tensor([[math.log(2.0), math.log(0.3), 0.0]]).double()
+    planes, slabs = search(links).with_parallel(walls[:1], first)
+    assert len(slabs) == count
+    torch.testing.assert_close(planes, walls, rtol=0, atol=0.01)
+
+
 # --- strengths ---
 
 
