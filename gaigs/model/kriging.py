@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from gaigs.data import Links, Split
 from gaigs.gaussians import Gaussians
 from gaigs.kriging.field import Field
-from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, thin_labels
+from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters, thin_labels
 from gaigs.kriging.kernel import LIMIT
 from gaigs.kriging.links import PART, coordinates, thinned
 from gaigs.kriging.paths import Equations, PathField, candidates
@@ -135,7 +135,7 @@ class Kriging(Model):
         fields = {int(row): trend.margins(query[row : row + 1].to(device)).cpu()[0] for row in held}
         plain, best = values[held], (-math.inf, next(candidates(self.scene.spacing)))
         before = task.scores(labels[held], plain)[task.monitor] if len(held) else plain.real
-        for process in candidates(self.scene.spacing) if len(held) > 1 else ():
+        for process in candidates(self.scene.spacing) if len(held) >= FEWEST else ():
             kriged = plain.clone()
             for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
                 field.solve(known_ones[rows < len(split.train)], process)
