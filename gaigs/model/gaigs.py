@@ -188,7 +188,11 @@ class GaussianSplatting(Model):
         # Receivers share what a place excites, unless a part looks at the receiver.
         parts = self.placement, self.tokenizer, self.deformation
         places, which = query.unique(with_receivers=any(getattr(part, "sees_receivers", False) for part in parts))
-        excited = self.excite(places)
+        return self.respond(self.excite(places), which, batch)
+
+    def respond(self, excited: Excited, which: Int[Tensor, " b"], batch: Batch) -> Prediction:
+        """Values of a batch whose rows excite the Gaussians as the rows ``which`` of ``excited``."""
+        query = batch.query
         links, values = [], []
         together = self.takes_paths and self.pooling.is_same_for_all
         group = torch.zeros_like(query.receivers) if together else query.receivers

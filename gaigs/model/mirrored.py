@@ -133,13 +133,13 @@ class MirroredSplatting(GaussianSplatting):
         if not placement.coherent:
             placement.enable_phases(wavelength)
             if self.scene.bandwidth is None and placement.log_bandwidth is not None:
-                choose_bandwidth(placement, wavelength, thinned(train), loss)
-        if placement.fixed:
+                choose_bandwidth(self, wavelength, thinned(train), loss)
+        if placement.fixed or placement.found:
             return "phases count"
         before = loss(train)
         # Powers locate distant planes to some decimetres: the first search reaches farther.
         least = 0.03 * placement.diagonal if number == (0 if adds_waves else 2) else 0.0
-        moves = ", ".join(f"{move:+.3f}" for move in move_planes(placement, train, wavelength, least, loss))
+        moves = ", ".join(f"{move:+.3f}" for move in move_planes(self, train, wavelength, least))
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
 
     @property

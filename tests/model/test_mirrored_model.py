@@ -277,19 +277,31 @@ def test_phases_come_with_a_band_that_is_chosen_and_planes_that_move(monkeypatch
     batch = replace(batch, labels=model(batch).value)
     placement.origin[2, 3] += 0.02
     wrong = loss(batch)
-    (moved,) = search.move_planes(placement, batch, speed_of_light / CARRIER, 0.0, loss)
+    (moved,) = search.move_planes(model, batch, speed_of_light / CARRIER, 0.0)
     assert abs(moved + 0.02) < speed_of_light / CARRIER / 10
     assert loss(batch) < 0.2 * wrong
     assert model.revise(4, batch, batch, loss).endswith(f"-> {loss(batch):.4f}")
 
 
+@torch.no_grad()
+def test_tilted_plane_is_turned_square_to_the_others():
+    links, wavelength = room_spectra("carrier", 24), speed_of_light / CARRIER
+    model, batch = walled(build(links)), links.batch(torch.arange(24))
+    planes = model.placement.origin
+    right = planes.clone()
+    planes[0, :3] = torch.nn.functional.normalize(planes[0, :3] + torch.tensor([0.0, 0.06, 0.04]), dim=0)
+    planes[0, 3] += 0.05
+    search.move_planes(model, batch, wavelength, 0.0)
+    torch.testing.assert_close(planes, right, rtol=0, atol=wavelength / 20)
+
+
 def test_a_search_by_phases_is_bounded_in_a_large_room(monkeypatch, caplog):
     links = room_spectra("band", 6)
-    placement, reaches = build(links).placement, []
+    model, reaches = build(links), []
     monkeypatch.setattr(search, "_move", lambda *arguments: reaches.append(arguments[2]) or 0.0)
     caplog.set_level("INFO")
     for least in (0.2, 1000.0):
-        search.move_planes(placement, links.batch(torch.arange(4)), 0.06, least, lambda batch: 0.0)
+        search.move_planes(model, links.batch(torch.arange(4)), 0.06, least)
     assert {*reaches} == {4 * 0.06, 50 * 0.06}
     assert "planes are searched within 3 m, not 1e+03 m" in caplog.text
 

@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from gaigs.data import Links
 from gaigs.gaussians import fibonacci_lattice
-from gaigs.placement.mirrored.reflections import all_sequences, fold, images, reflect
+from gaigs.placement.mirrored.reflections import all_sequences, distinct, fold, images, reflect
 from gaigs.propagation import NEAREST, slab
 from gaigs.task.csi import Csi
 
@@ -187,7 +187,7 @@ class ChannelSearch:
             before, found = self.left(*parts, planes, slabs).item(), []
             rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
             profiles = [self.profiles(*pair) for pair in zip(self.many, rests, strict=True)]
-            for axis in distinct(planes[:, :3]):
+            for axis in distinct(planes[:, :3], 2e-4):
                 along = self.points @ axis
                 margin = 0.3 * self.diagonal
                 offsets = torch.linspace(float(along.min() - margin), float(along.max() + margin), 400).double()
@@ -449,7 +449,7 @@ class ChannelSearch:
         axes = torch.cat((functional.normalize(crossed[crossed.norm(dim=1) > 0.5], dim=1), normals))
         cosines = axes @ planes[k, :3]
         axes = (axes * cosines.sign()[:, None])[(cosines.abs() > 0.9) & (cosines.abs() < 0.9995)]
-        axes = distinct(axes)[:3]
+        axes = distinct(axes, 2e-4)[:3]
         rests = [
             self.profiles(receiver, self.projected(receiver, planes[known])[0]) for receiver in self.many if len(axes)
         ]
@@ -613,15 +613,6 @@ def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tens
     other[normal.abs().argmin()] = 1
     first = functional.normalize(torch.linalg.cross(normal, other), dim=0)
     return first, torch.linalg.cross(normal, first)
-
-
-def distinct(normals: Float[Tensor, "k 3"]) -> list[Float[Tensor, "3"]]:
-    """Normals that are over a degree apart."""
-    found: list[Tensor] = []
-    for normal in normals:
-        if all((normal @ other).abs() < 0.9998 for other in found):
-            found.append(normal)
-    return found
 
 
 def maxima(scores: Float[Tensor, " k"], width: int) -> Int[Tensor, " n"]:

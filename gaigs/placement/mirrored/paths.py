@@ -169,7 +169,7 @@ class Mirrored(Placement):
             self.boresights = [boresight(receiver, self.middle) for receiver in scene.receivers]
         # Of a spectrum even faint paths show: where obstacles block the others.
         self.skips_faint = not is_complex and scene.task.directions is None
-        self.holds, self.held = False, None
+        self.holds, self.held, self.tried = False, None, None
 
     def fit(self, links: Links) -> None:
         """Starts from the user's walls, if there are any."""
@@ -244,17 +244,20 @@ class Mirrored(Placement):
 
     @contextmanager
     def holding(self) -> Iterator[None]:
-        """Keeps the first query's strengths within the context, while images follow the planes."""
+        """Keeps the first query's strengths within the context, while images follow the planes.
+
+        The strengths are in ``held``. Offsets of the planes for each transmitter (b, w) [m] may be set as ``tried``.
+        """
         self.holds = True
         try:
             yield
         finally:
-            self.holds, self.held = False, None
+            self.holds, self.held, self.tried = False, None, None
 
     def forward(self, gaussians: Gaussians | None, query: Query) -> Placed:
         """Gaussians at the images of each transmitter, followed by the free ones."""
         sequences = self.sequences[self.kept]
-        normals, offsets = self.normals, self.offsets
+        normals, offsets = self.normals, self.offsets if self.tried is None else self.tried
         seen = images(query.transmitters - self.middle, sequences, normals, offsets)
         receivers = (self.scene.positions(query.transmitters) - self.middle)[query.receivers]
         lengths = (seen[-1] - receivers[:, None]).norm(dim=-1).clamp_min(NEAREST)

@@ -71,14 +71,20 @@ def reflect(
 
 
 def images(
-    points: Float[Tensor, "b 3"], sequences: Int[Tensor, "n order"], normals: Float[Tensor, "w 3"], offsets: Tensor
+    points: Float[Tensor, "b 3"],
+    sequences: Int[Tensor, "n order"],
+    normals: Float[Tensor, "w 3"],
+    offsets: Float[Tensor, "*#b w"],
 ) -> list[Float[Tensor, "b n 3"]]:
-    """Images of transmitters [m] in the first 0, 1, ..., order planes of each sequence of ``all_sequences``."""
+    """Images of transmitters [m] in the first 0, 1, ..., order planes of each sequence of ``all_sequences``.
+
+    Each transmitter may have offsets of its own.
+    """
     found = [points[:, None].expand(-1, len(sequences), -1)]
     for column in sequences.unbind(1):
         first = int((column < 0).sum())
         here = column[first:]
-        moved = reflect(found[-1][:, first:], normals[here], offsets[here])
+        moved = reflect(found[-1][:, first:], normals[here], offsets[..., here])
         found.append(torch.cat((found[-1][:, :first], moved), 1))
     return found
 
@@ -128,3 +134,12 @@ def _is_apart(
     """True if a height over a plane exceeds 4 roundings of the point's and the plane's distance from the origin."""
     rounding = torch.finfo(points.dtype).eps
     return heights.abs() > 4 * rounding * (points.detach().norm(dim=-1) + offsets.detach().abs())
+
+
+def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "3"]]:
+    """Normals whose cosines are apart from 1 by more than ``least``."""
+    found: list[Tensor] = []
+    for normal in normals:
+        if all((normal @ other).abs() < 1 - least for other in found):
+            found.append(normal)
+    return found

@@ -12,8 +12,9 @@ from torch.nn import functional
 
 from gaigs.gaussians import fibonacci_lattice
 from gaigs.geometry import Grid
+from gaigs.placement.mirrored.channel_search import log_share
 from gaigs.placement.mirrored.paths import CONDUCTIVITY, PERMITTIVITY, Mirrored
-from gaigs.placement.mirrored.reflections import reflect
+from gaigs.placement.mirrored.reflections import distinct, reflect
 from gaigs.projection import Splats
 from gaigs.propagation import NEAREST, fresnel
 from gaigs.query import Batch
@@ -155,49 +156,86 @@ def _with_one_more(model, batch: Batch, lags, own, receiver: int, normals, offse
 # --- by phases ---
 
 
-def move_planes(placement: Mirrored, batch: Batch, wavelength: float, least: float, loss: Loss) -> list[float]:
-    """Moves each used plane along its normal to the least loss, the strongest plane first.
+def move_planes(model, batch: Batch, wavelength: float, least: float) -> list[float]:
+    """Moves each used plane along its normal, or one that is square to the others, to the least error.
 
-    ``least`` is the least distance searched on either side [m], up to ``WIDEST`` wavelengths. The result are the moves
-    [m].
+    The strongest plane comes first. ``least`` is the least distance searched on either side [m], up to ``WIDEST``
+    wavelengths. The result are the moves [m].
     """
+    placement: Mirrored = model.placement
+    # Planes and descent start anew from here.
+    placement.enable_phases(wavelength)
     some, reach = thinned(batch), max(4.0 * wavelength, min(least, WIDEST * wavelength))
     if least > reach:  # steps cannot be coarser than a fraction of the wavelength
         log.info("planes are searched within %.3g m, not %.3g m; placement.walls can start nearer", reach, least)
-    return [_move(placement, plane, reach, wavelength, some, loss) for plane in by_strength(placement, batch)]
+    return [_move(model, plane, reach, wavelength, some, True) for plane in by_strength(placement, batch)]
 
 
-def choose_bandwidth(placement: Mirrored, wavelength: float, batch: Batch, loss: Loss) -> None:
+def choose_bandwidth(model, wavelength: float, batch: Batch, loss: Loss) -> None:
     """Takes the bandwidth with which moving the two strongest planes lowers the loss most."""
+    placement: Mirrored = model.placement
     used = by_strength(placement, batch)
     origin, losses = placement.origin.clone(), {}
     # From a carrier, where all paths interfere, to a band in which hardly two do.
     for rooms in (0.01, 1.0, 3.0, 10.0, 30.0, 100.0):
         placement.log_bandwidth.fill_(math.log(rooms * speed_of_light / placement.diagonal))
         for plane in used[:2]:
-            _move(placement, plane, 4.0 * wavelength, wavelength, batch, loss)
+            _move(model, plane, 4.0 * wavelength, wavelength, batch)
         losses[rooms] = loss(batch)
         placement.origin.copy_(origin)
     best = min(losses, key=losses.__getitem__)
     placement.log_bandwidth.fill_(math.log(best * speed_of_light / placement.diagonal))
 
 
-def _move(placement: Mirrored, plane: int, reach: float, wavelength: float, batch: Batch, loss: Loss) -> float:
-    """Moves a plane along its normal to the least loss; returns the move [m]."""
+def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, square: bool = False) -> float:
+    """Moves a plane along its normal, or along one of ``square_normals``, to the least error; returns the move [m]."""
+    placement: Mirrored = model.placement
     origin = placement.origin[plane]
-    start = origin[3].item()
     step = wavelength / 10  # a reflected path changes by twice of it
-    count = round(reach / step)
-    moves = [step * k for k in range(-count, count + 1)]
-    losses = []
+    moves = step * torch.arange(-round(reach / step), round(reach / step) + 1).to(origin)
+    tried = []
+    for normal in square_normals(placement, plane) if square else (origin[:3].clone(),):
+        origin[:3] = normal
+        errors = _errors_of_moves(model, batch, plane, moves)
+        best = int(errors.argmin())
+        tried.append((errors[best].item(), moves[best].item(), normal))
+    _, move, origin[:3] = min(tried, key=lambda found: found[0])
+    origin[3] += move
+    return move
+
+
+def square_normals(placement: Mirrored, plane: int) -> list[Float[Tensor, "3"]]:
+    """A plane's normal, and those within 18 degrees that are level, upright, or square to another plane.
+
+    Powers locate planes to some degrees, and phases of a tilted plane match at few places.
+    """
+    normals, up = placement.normals, placement.normals.new_tensor([0.0, 0.0, 1.0])
+    others = normals[[other for other in placement.used.tolist() if other != plane]]
+    own = normals[plane]
+    square = torch.cat((up[None], own[None] * (1 - up), others, torch.linalg.cross(others, up.expand_as(others))))
+    square = functional.normalize(square[square.norm(dim=1) > 0.5], dim=1)
+    square = square * (square @ own).sign()[:, None]
+    return distinct(torch.cat((own[None], square[square @ own > 0.95])), 2e-5)
+
+
+def _errors_of_moves(model, batch: Batch, plane: int, moves: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
+    """Error with a plane moved along its normal [m]; strengths stay those of no move."""
+    placement, query, labels, count = model.placement, batch.query, batch.labels, len(batch.query)
+    errors = []
     with placement.holding():
-        loss(batch)
-        for move in moves:
-            origin[3] = start + move
-            losses.append(loss(batch))
-    best = moves[min(range(len(moves)), key=losses.__getitem__)]
-    origin[3] = start + best
-    return best
+        model.excite(query)
+        held = placement.held
+        for some in moves.split(max(1, 2000 // count)):  # 2000 links at a time
+            rows = torch.arange(count, device=moves.device).repeat(len(some))
+            placement.held, placement.tried = held[rows], placement.offsets.repeat(len(rows), 1)
+            placement.tried[:, plane] += some.repeat_interleave(count)
+            moved = Batch(query[rows], batch.directions)
+            value = model.respond(model.excite(moved.query), torch.arange(len(rows)).to(rows), moved).value
+            error, label = (part.reshape(len(rows), -1) for part in (value - labels[rows], labels[rows]))
+            # A loud channel must not rule.
+            apart = log_share(error, label) if error.is_complex() else error.abs().mean(1)
+            errors.append(apart.view(len(some), count).mean(1))
+    return torch.cat(errors)
 
 
 # --- pruning ---
