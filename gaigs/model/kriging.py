@@ -117,7 +117,7 @@ class Kriging(Model):
         """``krige`` for a trend of paths; hyperparameters are those with the largest sure gain on the validation links.
 
         It is the rise of the mean score less its standard error. One with which the median falls does not count; if
-        none is left, the weight is 0.
+        none is left, or with fewer than ``FEWEST`` validation links, the weight is 0.
         """
         split, task, index = links.split, links.task, known(links)
         query, labels = links.query[index], links.labels[index]

@@ -34,9 +34,9 @@ from gaigs.task.csi import Csi
 class MirroredSplatting(GaussianSplatting):
     """The splatting pipeline with Gaussians at mirror images, learnt from coarse to fine.
 
-    Powers come first: they locate planes to some centimetres. Then phases count too: each plane moves along its normal
-    to the least loss, by steps of a fraction of the wavelength, and descent goes on. ``ChannelSearch`` locates planes
-    of channels before the training.
+    Powers come first: they locate planes to some centimetres. Then phases count too: each plane is turned square to the
+    others and moved along its normal, by steps of a fraction of the wavelength, to the least error, and descent goes
+    on. ``ChannelSearch`` locates planes of channels before the training; they stay there.
 
     Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that suits it.
 

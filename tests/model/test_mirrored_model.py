@@ -295,6 +295,25 @@ def test_tilted_plane_is_turned_square_to_the_others():
     torch.testing.assert_close(planes, right, rtol=0, atol=wavelength / 20)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("phase", ["known", "per_link"])
+def test_plane_of_channels_moves_to_its_phases(phase):
+    """Also if each link has a phase of its own, one is silent, and all are faint."""
+    receiver, places = Receiver("gateway1", POSE, BENT), place(24, 0)
+    labels = 1e-21 * respond(EMPTY, places, receiver, CARRIER, FREQUENCIES[:1] - CARRIER, 1)
+    if phase == "per_link":
+        labels = labels * torch.polar(torch.ones(24), torch.arange(24.0))[:, None, None]
+    labels[5] = 0
+    links = links_of(labels.to(torch.complex64), Csi(4, FREQUENCIES[:1], phase), receiver)
+    model = walled(build(links, pooling="path_csi", placement=MIRRORED | {"order": 1}))
+    model.placement.enable_phases(speed_of_light / CARRIER)
+    model.placement.receiver_gains.fill_(math.log(1e-21))
+    right = model.placement.origin.clone()
+    model.placement.origin[2, 3] += 0.02
+    search.move_planes(model, links.batch(torch.arange(24)), speed_of_light / CARRIER, 0.0)
+    torch.testing.assert_close(model.placement.origin, right, rtol=0, atol=0.006)
+
+
 def test_a_search_by_phases_is_bounded_in_a_large_room(monkeypatch, caplog):
     links = room_spectra("band", 6)
     model, reaches = build(links), []

@@ -210,7 +210,8 @@ class ChannelSearch:
             tried, own = self.polish(best[0], best[1], 12, 5e-4, count)
             if self.left(*parts, tried, own).item() > before - 2 * LITTLE:  # twice of what keeps a plane
                 break
-            planes, slabs = self.polish(tried, own, 60, 3e-4)
+            both = (tried, own), self.polish(tried, own, 60, 3e-4)
+            planes, slabs = min(both, key=lambda found: self.left(*parts, *found).item())
             log.info("plane (%.2f, %.2f, %.2f) at %.2f m, parallel to others", *planes[-1].tolist())
         return planes, slabs
 

@@ -1,4 +1,4 @@
-"""Search for planes: new planes, their offsets by the phases, and planes and paths to drop."""
+"""Search for planes: new planes, their normals and offsets by the phases, and planes and paths to drop."""
 
 import logging
 import math
@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gaigs.gaussians import fibonacci_lattice
-from gaigs.geometry import Grid
+from gaigs.geometry import FAINTEST, Grid
 from gaigs.placement.mirrored.channel_search import log_share
 from gaigs.placement.mirrored.paths import CONDUCTIVITY, PERMITTIVITY, Mirrored
 from gaigs.placement.mirrored.reflections import distinct, reflect
@@ -22,7 +22,7 @@ from gaigs.query import Batch
 log = logging.getLogger(__name__)
 
 WIDEST = 50.0
-"""Largest distance over which a plane is searched by phases [wavelengths]: a thousand losses for each plane."""
+"""Largest distance over which a plane is searched by phases [wavelengths]: a thousand errors for each normal."""
 
 Loss = Callable[[Batch], float]
 """Loss of the model as it stands, on a batch."""
@@ -156,21 +156,23 @@ def _with_one_more(model, batch: Batch, lags, own, receiver: int, normals, offse
 # --- by phases ---
 
 
+@torch.no_grad()
 def move_planes(model, batch: Batch, wavelength: float, least: float) -> list[float]:
     """Moves each used plane along its normal, or one that is square to the others, to the least error.
 
     The strongest plane comes first. ``least`` is the least distance searched on either side [m], up to ``WIDEST``
-    wavelengths. The result are the moves [m].
+    wavelengths. The result are the moves [m]. If a map is drawn, which takes long, planes keep their normals.
     """
     placement: Mirrored = model.placement
-    # Planes and descent start anew from here.
-    placement.enable_phases(wavelength)
+    placement.enable_phases(wavelength)  # adds the steps so far to the planes
     some, reach = thinned(batch), max(4.0 * wavelength, min(least, WIDEST * wavelength))
     if least > reach:  # steps cannot be coarser than a fraction of the wavelength
         log.info("planes are searched within %.3g m, not %.3g m; placement.walls can start nearer", reach, least)
-    return [_move(model, plane, reach, wavelength, some, True) for plane in by_strength(placement, batch)]
+    planes = by_strength(placement, batch)
+    return [_move(model, plane, reach, wavelength, some, model.takes_paths) for plane in planes]
 
 
+@torch.no_grad()
 def choose_bandwidth(model, wavelength: float, batch: Batch, loss: Loss) -> None:
     """Takes the bandwidth with which moving the two strongest planes lowers the loss most."""
     placement: Mirrored = model.placement
@@ -193,6 +195,7 @@ def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, squa
     origin = placement.origin[plane]
     step = wavelength / 10  # a reflected path changes by twice of it
     moves = step * torch.arange(-round(reach / step), round(reach / step) + 1).to(origin)
+    moves = moves[moves.abs().argsort(stable=True)]  # of equal errors the least move
     tried = []
     for normal in square_normals(placement, plane) if square else (origin[:3].clone(),):
         origin[:3] = normal
@@ -219,21 +222,26 @@ def square_normals(placement: Mirrored, plane: int) -> list[Float[Tensor, "3"]]:
 
 
 def _errors_of_moves(model, batch: Batch, plane: int, moves: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-    """Error with a plane moved along its normal [m]; strengths stay those of no move."""
+    """Mean absolute error, of channels log share, with a plane moved along its normal [m] and strengths held."""
     placement, query, labels, count = model.placement, batch.query, batch.labels, len(batch.query)
     errors = []
     with placement.holding():
         model.excite(query)
         held = placement.held
-        for some in moves.split(max(1, 2000 // count)):  # 2000 links at a time
+        numbers = max(1000, labels[0].numel())
+        for some in moves.split(max(1, 2_000_000 // (count * numbers))):
             rows = torch.arange(count, device=moves.device).repeat(len(some))
             placement.held, placement.tried = held[rows], placement.offsets.repeat(len(rows), 1)
             placement.tried[:, plane] += some.repeat_interleave(count)
             moved = Batch(query[rows], batch.directions)
             value = model.respond(model.excite(moved.query), torch.arange(len(rows)).to(rows), moved).value
-            error, label = (part.reshape(len(rows), -1) for part in (value - labels[rows], labels[rows]))
-            # A loud channel must not rule.
-            apart = log_share(error, label) if error.is_complex() else error.abs().mean(1)
+            label = model.scene.task.align(labels[rows], value)
+            error, label = (part.reshape(len(rows), -1) for part in (value - label, label))
+            if error.is_complex():  # a loud channel must not rule, and a weak one has no squares in float32
+                largest = label.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
+                apart = log_share(error / largest, label / largest)
+            else:
+                apart = error.abs().mean(1)
             errors.append(apart.view(len(some), count).mean(1))
     return torch.cat(errors)
 
