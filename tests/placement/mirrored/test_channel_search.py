@@ -53,14 +53,16 @@ def room(moved=0.0, receivers=1, count=60, walls=PLANES):
     walls = walls.copy()
     walls[:, 3] += moved * walls[:, :3].sum(1)
     poses = [Pose.from_xyzw(tuple(moved + x for x in at), (0, 0, 0, 1)) for at in ((1.0, 0.6, 2.4), (4.8, 3.9, 1.1))]
-    array, labels = Array.planar(2, 2, 0.027), []
-    for pose in poses:
-        elements = pose.to(torch.zeros(0).double()).world(array.elements.double()).numpy()
+    whole = Array.planar(2, 2, 0.027)
+    arrays, labels = (whole, Array(whole.elements[:3])), []
+    for pose, array in zip(poses, arrays, strict=True):
+        elements = pose.to(torch.zeros(0).double()).world(whole.elements.double()).numpy()
         labels.append(channels(np.float64(places), elements, walls))
+        labels[-1][:, len(array) :] = 0
     which = torch.arange(count) % receivers
     links = Links(
         query=Query(torch.from_numpy(places), which),
-        receivers=tuple(Receiver(f"gateway{k}", pose, array) for k, pose in enumerate(poses[:receivers])),
+        receivers=tuple(Receiver(f"gateway{k}", poses[k], arrays[k]) for k in range(receivers)),
         labels=torch.from_numpy(np.stack(labels))[which, torch.arange(count)].to(torch.complex64),
         task=Csi(4, torch.from_numpy(FREQUENCIES)),
         split=Split("all", torch.arange(count), torch.arange(0), torch.arange(0)),
@@ -83,7 +85,7 @@ CASES = {
     "a room": ({}, {}, lambda labels: labels),
     "a kilometre away": ({"moved": 1000.0}, {}, lambda labels: labels),
     "a phase of each link": ({}, {"common": False}, turned),
-    "two receivers": ({"receivers": 2}, {}, lambda labels: labels),
+    "two receivers of different sizes": ({"receivers": 2}, {}, lambda labels: labels),
     "the other sign": ({}, {"sign": 1}, lambda labels: labels.conj().resolve_conj()),
 }
 
