@@ -181,18 +181,14 @@ class ChannelSearch:
     def with_parallel(
         self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]
     ) -> tuple[Float[Tensor, "v 4"], Float[Tensor, "v 3"]]:
-        """The planes with parallel ones, which are told from noise when fainter, as three numbers less are free."""
+        """The planes and others parallel to them. Only offsets are searched, so fainter ones stand out from noise."""
         while len(planes) < self.most:
             parts, count = self.some(planes), len(planes)
             before, found = self.left(*parts, planes, slabs).item(), []
+            lines = self.grid(torch.stack(distinct(planes[:, :3], 2e-4)), 400)
             rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
             profiles = [self.profiles(*pair) for pair in zip(self.many, rests, strict=True)]
-            for axis in distinct(planes[:, :3], 2e-4):
-                along = self.points @ axis
-                margin = 0.3 * self.diagonal
-                offsets = torch.linspace(float(along.min() - margin), float(along.max() + margin), 400).double()
-                line = torch.cat((axis.expand(400, 3), offsets[:, None]), 1)
-                scores = self.scores(self.many, profiles, line[None])[0]
+            for line, scores in zip(lines, self.scores(self.many, profiles, lines), strict=True):
                 for plane in planes:
                     scores[self.alike(line, plane)] = 0
                 found += [(scores[at].item(), line[at]) for at in maxima(scores, 11)]
@@ -241,16 +237,19 @@ class ChannelSearch:
             parts.append(receiver.some(places, when))
         return parts
 
+    def grid(self, normals: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "n k 4"]:
+        """Planes at ``count`` offsets of each normal, up to 0.3 diagonals beyond all positions."""
+        along = self.points @ normals.mT
+        margin = 0.3 * self.diagonal
+        low, high = along.amin(0) - margin, along.amax(0) + margin
+        offsets = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, count).to(low)
+        return torch.cat((normals[:, None].expand(-1, count, -1), offsets[..., None]), 2)
+
     # --- Hough transform ---
 
     def find(self, known: Float[Tensor, "v 4"]) -> Float[Tensor, "w 4"]:
         """Known planes and others, found one after the other, each refined with those before."""
-        normals = torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3))).to(self.points)
-        along = self.points @ normals.mT
-        margin = 0.3 * self.diagonal
-        low, high = along.amin(0) - margin, along.amax(0) + margin
-        offsets = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, 80).to(low)
-        grid = torch.cat((normals[:, None].expand(-1, offsets.shape[1], -1), offsets[..., None]), 2)
+        grid = self.grid(torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3))).to(self.points), 80)
         planes = known
         while len(planes) < self.most and (tried := self.with_one_more(planes, grid)):
             _, share, planes = min(tried, key=lambda found: found[0])

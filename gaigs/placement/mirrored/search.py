@@ -234,7 +234,7 @@ def _errors_of_moves(model, batch: Batch, plane: int, moves: Float[Tensor, " m"]
             placement.held, placement.tried = held[rows], placement.offsets.repeat(len(rows), 1)
             placement.tried[:, plane] += some.repeat_interleave(count)
             moved = Batch(query[rows], batch.directions)
-            value = model.respond(model.excite(moved.query), torch.arange(len(rows)).to(rows), moved).value
+            value = model.respond(model.excite(moved.query), torch.arange(len(rows), device=rows.device), moved).value
             label = model.scene.task.align(labels[rows], value)
             error, label = (part.reshape(len(rows), -1) for part in (value - label, label))
             if error.is_complex():  # a loud channel must not rule, and a weak one has no squares in float32
