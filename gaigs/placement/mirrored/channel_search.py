@@ -13,7 +13,16 @@ from torch.nn import functional
 
 from gaigs.data import Links
 from gaigs.gaussians import fibonacci_lattice
-from gaigs.placement.mirrored.reflections import all_sequences, distinct, fold, images, reflect
+from gaigs.placement.mirrored.reflections import (
+    Bounces,
+    all_sequences,
+    distinct,
+    fold,
+    images,
+    polarised,
+    reflect,
+    tangents,
+)
 from gaigs.propagation import NEAREST, slab
 from gaigs.task.csi import Csi
 
@@ -119,10 +128,13 @@ class ReceiverChannels:
         permittivities, thickness = _materials(slabs)
         depths = thickness[:, None] * self.frequencies / speed_of_light
         gains = folded.exists[..., None].to(self.channels.dtype).expand(-1, -1, len(self.frequencies))
-        for first, plane, _, cosines in folded.bounces:
-            te, tm = slab(permittivities[plane, None], cosines[..., None].clamp(1e-3, 1), depths[plane])
-            level = normals[plane, 2, None].square()
-            gains = torch.cat((gains[:, :first], gains[:, first:] * ((1 - level) * te + level * tm)), 1)
+
+        def response(bounce: Bounces) -> Complex[Tensor, "b w s"]:
+            depth, permittivity = depths[bounce.planes], permittivities[bounce.planes, None]
+            te, tm = slab(permittivity, bounce.cosines[..., None].clamp(1e-3, 1), depth)
+            return polarised(normals[bounce.planes, None], te, tm)
+
+        gains = folded.reflected(gains, response)
         waves = self.waves(seen[-1]).unflatten(-1, (len(self.elements), -1))
         return (waves * gains[:, :, None]).flatten(-2)
 
@@ -524,7 +536,7 @@ class ChannelSearch:
         for material in materials:
             permittivity, thickness = _materials(material)
             te, tm = slab(permittivity, cosines, thickness / self.wavelength)
-            expected = (1 - normal[2].square()) * te + normal[2].square() * tm
+            expected = polarised(normal, te, tm)
             left = ((phasors * expected.conj())[:, None] * offsets)[:, :, None] * tilts[0][:, None]
             sums = (left.flatten(1).mT @ tilts[1]).real.unflatten(0, (len(grids[0]), -1)).flatten(1)
             highest, at = sums.max(1)  # of each offset
@@ -605,14 +617,6 @@ def real_residual(
 def log_share(part: Complex[Tensor, "b k"], whole: Complex[Tensor, "b k"]) -> Float[Tensor, " b"]:
     power = whole.abs().square().sum(-1)
     return (part.abs().square().sum(-1) / torch.where(power > 0, power, 1) + FLOOR).log()
-
-
-def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Two unit vectors at right angles to a normal and to each other."""
-    other = torch.zeros_like(normal)
-    other[normal.abs().argmin()] = 1
-    first = functional.normalize(torch.linalg.cross(normal, other), dim=0)
-    return first, torch.linalg.cross(normal, first)
 
 
 def maxima(scores: Float[Tensor, " k"], width: int) -> Int[Tensor, " n"]:

@@ -17,7 +17,7 @@ from gaigs.data import Links
 from gaigs.gaussians import SH_DC, Gaussians, Placed
 from gaigs.placement import Placement
 from gaigs.placement.mirrored.obstacles import Obstacles
-from gaigs.placement.mirrored.reflections import Folded, all_sequences, fold, images, largest_order
+from gaigs.placement.mirrored.reflections import Bounces, Folded, all_sequences, fold, images, largest_order, polarised
 from gaigs.placement.mirrored.walls import read_planes
 from gaigs.propagation import NEAREST, fresnel, slab
 from gaigs.query import Query
@@ -296,16 +296,18 @@ class Mirrored(Placement):
         left = torch.complex(left.exp() * folded.exists, torch.zeros_like(left))
         normals = self.normals
         permittivities = torch.complex(1 + self.log_permittivities.exp(), -self.log_conductivities.exp())
-        for first, planes, points, cosines in folded.bounces:
+
+        def response(bounce: Bounces) -> Complex[Tensor, "b w"]:
+            _, planes, points, cosines = bounce
             if self.log_thicknesses is None:
                 te, tm = fresnel(permittivities[planes], cosines)
             else:
                 wavelengths = speed_of_light / carriers(self.scene, query).to(cosines)[:, None]
                 te, tm = slab(permittivities[planes], cosines, self.log_thicknesses[planes].exp() / wavelengths)
-            level = normals[planes, 2].square()
             aside = (points - self.middles[planes]) * (-self.log_extents[planes]).exp()
-            reflected = ((1 - level) * te + level * tm) * (self.plane_gains[planes] - aside.square().sum(-1) / 2).exp()
-            left = torch.cat((left[:, :first], left[:, first:] * reflected), 1)
+            return polarised(normals[planes], te, tm) * (self.plane_gains[planes] - aside.square().sum(-1) / 2).exp()
+
+        left = folded.reflected(left, response)
         if blocked and self.obstacles is not None and not self.is_bare:
             left = left * (-self._depths(self.obstacles, folded, left)).exp()
         return left

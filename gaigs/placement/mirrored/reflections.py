@@ -1,10 +1,11 @@
 """Reflection paths: sequences of planes, images, and bounces of each path."""
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -40,6 +41,15 @@ class Folded(NamedTuple):
     path: Int[Tensor, " s"]
     bounces: list[Bounces]
     exists: Bool[Tensor, "b n"]
+
+    def reflected(
+        self, strengths: Complex[Tensor, "b n *s"], response: Callable[[Bounces], Complex[Tensor, "b w *s"]]
+    ) -> Complex[Tensor, "b n *s"]:
+        """Strengths of the sequences after all bounces."""
+        for bounce in self.bounces:
+            after = strengths[:, bounce.first :] * response(bounce)
+            strengths = torch.cat((strengths[:, : bounce.first], after), 1)
+        return strengths
 
 
 def largest_order(planes: int, most: int) -> int:
@@ -143,3 +153,43 @@ def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, 
         if all((normal @ other).abs() < 1 - least for other in found):
             found.append(normal)
     return found
+
+
+def square_normals(normals: Float[Tensor, "w 3"], plane: int) -> list[Float[Tensor, "3"]]:
+    """A plane's normal, and those within 18 degrees that are level, upright, or square to another plane.
+
+    Powers locate planes to some degrees, and phases of a tilted plane match at few places.
+    """
+    up, own = normals.new_tensor([0.0, 0.0, 1.0]), normals[plane]
+    others = normals[torch.arange(len(normals)) != plane]
+    square = torch.cat((up[None], own[None] * (1 - up), others, torch.linalg.cross(others, up.expand_as(others))))
+    square = functional.normalize(square[square.norm(dim=1) > 0.5], dim=1)
+    square = square * (square @ own).sign()[:, None]
+    return distinct(torch.cat((own[None], square[square @ own > 0.95])), 2e-5)
+
+
+def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Two unit vectors at right angles to a normal and to each other."""
+    other = torch.zeros_like(normal)
+    other[normal.abs().argmin()] = 1
+    first = functional.normalize(torch.linalg.cross(normal, other), dim=0)
+    return first, torch.linalg.cross(normal, first)
+
+
+def reflection_points(
+    starts: Float[Tensor, "b 3"], ends: Float[Tensor, "b 3"], planes: Float[Tensor, "w 4"]
+) -> Float[Tensor, "b w 3"]:
+    """Points at which planes reflect waves from starts to ends [m]; of ends on two sides, as if they were on one."""
+    normals, offsets = planes[:, :3], planes[:, 3]
+    own, other = (point @ normals.T - offsets for point in (starts, ends))
+    feet = [p[:, None] - height[..., None] * normals for p, height in ((starts, own), (ends, other))]
+    own, other = (height.abs().clamp_min(1e-6)[..., None] for height in (own, other))
+    return (feet[0] * other + feet[1] * own) / (own + other)
+
+
+def polarised(
+    normals: Float[Tensor, "*#n 3"], te: Complex[Tensor, "*n"], tm: Complex[Tensor, "*n"]
+) -> Complex[Tensor, "*n"]:
+    """Reflection coefficients for vertical polarisation: TE at upright planes, TM at level ones, a mean in between."""
+    level = normals[..., 2].square()
+    return (1 - level) * te + level * tm

@@ -14,7 +14,7 @@ from gaigs.gaussians import fibonacci_lattice
 from gaigs.geometry import FAINTEST, Grid
 from gaigs.placement.mirrored.channel_search import log_share
 from gaigs.placement.mirrored.paths import CONDUCTIVITY, PERMITTIVITY, Mirrored
-from gaigs.placement.mirrored.reflections import distinct, reflect
+from gaigs.placement.mirrored.reflections import polarised, reflect, square_normals
 from gaigs.projection import Splats
 from gaigs.propagation import NEAREST, fresnel
 from gaigs.query import Batch
@@ -136,8 +136,7 @@ def _with_one_more(model, batch: Batch, lags, own, receiver: int, normals, offse
     sides = (places @ normals.T - offsets) * (here @ normals.T - offsets)
     directions = (seen / lengths[..., None]) @ pose.rotation
     te, tm = fresnel(complex(PERMITTIVITY, -CONDUCTIVITY), (seen * normals).sum(-1).abs() / lengths)
-    level = normals[:, 2].square()
-    gains = ((1 - level) * te + level * tm) * placement.pattern(receiver, directions) * (sides > 0) / lengths
+    gains = polarised(normals, te, tm) * placement.pattern(receiver, directions) * (sides > 0) / lengths
     gains = gains * placement.receiver_gains[receiver].exp()
     flat = lambda values: values.flatten(0, 1)[:, None]
     splats = Splats(flat(directions[..., :2]), normals.new_zeros(1, 1, 3), flat(lengths), flat(sides > 0))
@@ -197,7 +196,8 @@ def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, squa
     moves = step * torch.arange(-round(reach / step), round(reach / step) + 1).to(origin)
     moves = moves[moves.abs().argsort(stable=True)]  # of equal errors the least move
     tried = []
-    for normal in square_normals(placement, plane) if square else (origin[:3].clone(),):
+    used = placement.used.tolist()
+    for normal in square_normals(placement.normals[used], used.index(plane)) if square else (origin[:3].clone(),):
         origin[:3] = normal
         errors = _errors_of_moves(model, batch, plane, moves)
         best = int(errors.argmin())
@@ -205,20 +205,6 @@ def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, squa
     _, move, origin[:3] = min(tried, key=lambda found: found[0])
     origin[3] += move
     return move
-
-
-def square_normals(placement: Mirrored, plane: int) -> list[Float[Tensor, "3"]]:
-    """A plane's normal, and those within 18 degrees that are level, upright, or square to another plane.
-
-    Powers locate planes to some degrees, and phases of a tilted plane match at few places.
-    """
-    normals, up = placement.normals, placement.normals.new_tensor([0.0, 0.0, 1.0])
-    others = normals[[other for other in placement.used.tolist() if other != plane]]
-    own = normals[plane]
-    square = torch.cat((up[None], own[None] * (1 - up), others, torch.linalg.cross(others, up.expand_as(others))))
-    square = functional.normalize(square[square.norm(dim=1) > 0.5], dim=1)
-    square = square * (square @ own).sign()[:, None]
-    return distinct(torch.cat((own[None], square[square @ own > 0.95])), 2e-5)
 
 
 def _errors_of_moves(model, batch: Batch, plane: int, moves: Float[Tensor, " m"]) -> Float[Tensor, " m"]:

@@ -1,0 +1,126 @@
+"""The search for planes in spectra: in spectra of a room with known walls, and against sums by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from gaigs.antenna import Array, Receiver
+from gaigs.data import Split
+from gaigs.geometry import Pose
+from gaigs.model.mirrored import MirroredSplatting
+from gaigs.placement.mirrored.lag_search import MATERIAL, LagSearch
+from gaigs.placement.mirrored.reflections import all_sequences
+from gaigs.propagation import fresnel
+from gaigs.query import Query
+from gaigs.task.spectrum import Spectrum
+from gaigs.testing import example_links
+
+WALLS = torch.tensor([(1.0, 0, 0, 6.5), (0, 1.0, 0, -0.4), (0, 0, 1.0, -0.3)]).double()
+
+
+@pytest.fixture
+def search():
+    """A search in covariances of a room of three walls, and its links."""
+    links = example_links("spectrum")
+    pose = Pose.from_xyzw([0.5, 1.0, 1.5], [0.0, 0.0, 0.0, 1.0])
+    receiver = Receiver("array", pose, Array.planar(4, 4, pitch=0.0625))
+    places = torch.tensor([6.0, 4.0, 2.0]) * torch.rand(150, 3, generator=torch.Generator().manual_seed(0))
+    query = Query(places, torch.zeros(150, dtype=torch.long), torch.full((150,), 2.4e9))
+    split = Split("made up", *torch.arange(150).split((150, 0, 0)))
+    links = replace(links, query=query, receivers=(receiver,), labels=torch.ones(150, 2), rows=None, split=split)
+    count = len(receiver.array.lags[0])
+    made = LagSearch(links, lambda labels, query: torch.ones(len(labels), count, dtype=torch.complex128), 2)
+    own = made.receivers[0]
+    lags = own.sums(*own.paths(WALLS, all_sequences(3, 2)), 0.0)
+    made.receivers = [replace(own, lags=7 * lags)]
+    made.few = [made.receivers[0].some(slice(None, None, 2))]
+    return made
+
+
+def test_planes_off_by_decimetres_and_degrees_are_found(search):
+    start = WALLS + 0.03 * torch.randn(3, 4, generator=torch.Generator().manual_seed(1))
+    start[:, :3] = functional.normalize(start[:, :3], dim=1)
+    start[:, 3] += torch.tensor([0.15, -0.2, 0.1])
+    assert (start - WALLS)[:, 3].abs().min() > 0.05
+    off = (search.run(start, 0.0, 0.4) - WALLS).abs()
+    assert off[:, :3].max() < 0.005
+    assert off[1:, 3].max() < 0.005
+    assert off[0, 3] < 0.0625 + 0.005, "the faintest may be half a wavelength off: its error hardly counts"
+
+
+def test_a_plane_stays_where_nothing_shows_it(search):
+    """A wall without power: the covariances are those of the direct path alone."""
+    own = search.receivers[0]
+    lags = own.sums(*own.paths(WALLS[:0], all_sequences(0, 2)), 0.0)
+    noise = torch.randn(lags.shape, dtype=lags.dtype, generator=torch.Generator().manual_seed(0))
+    search.receivers = [replace(own, lags=lags + 0.3 * lags.abs() * noise)]
+    search.bandwidth, search.wavelength = 0.0, 0.1
+    far = torch.tensor([[0.0, 0.0, 1.0, 40.0]]).double()
+    assert search.moved(far, 0, 0.3) is far
+
+
+def test_no_plane_and_no_power_move_nothing(search):
+    assert len(search.run(WALLS[:0], 0.0, 0.4)) == 0
+    search.receivers = []
+    torch.testing.assert_close(search.run(WALLS, 0.0, 0.4), WALLS, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("bandwidth", [0.0, 2e8])
+def test_the_covariances_are_the_sums_of_waves_over_the_band(search, bandwidth):
+    own = search.receivers[0].some(slice(4))
+    fields, _, lengths = (part.numpy() for part in own.paths(WALLS, all_sequences(3, 1)))
+    found = own.sums(*own.paths(WALLS, all_sequences(3, 1)), bandwidth).numpy()
+    position, rotation = own.pose.position.numpy(), own.pose.rotation.numpy()
+    places, elements, frequency = own.places.numpy(), own.array.elements.double().numpy(), own.frequencies[0].item()
+    images = np.stack([places, *(places - 2 * ((places @ n) - d)[:, None] * n for *n, d in _rows())], 1)
+    ways = (images - position) @ rotation
+    distances = np.linalg.norm(ways, axis=-1)
+    np.testing.assert_allclose(lengths, distances)
+    te, tm = (part.numpy() for part in fresnel(MATERIAL, torch.tensor(_cosines(images, position))))
+    level = np.array([0, 0, 0, 1.0])
+    gains = np.where(np.arange(4) > 0, (1 - level) * te + level * tm, 1) * (np.abs(fields) > 0)
+    total = 0
+    bands = (np.arange(2000) + 0.5) / 2000 - 0.5 if bandwidth else np.zeros(1)
+    wavenumber = 2 * np.pi * frequency / 299792458
+    steering = np.exp(1j * wavenumber * (ways / distances[..., None])[..., :2] @ elements[:, :2].T)
+    for share in bands:
+        phases = -wavenumber * distances - 2 * np.pi * share * bandwidth / 299792458 * distances
+        waves = ((gains / distances * np.exp(1j * phases))[..., None] * steering).sum(1)
+        total = total + waves[:, :, None] * waves[:, None].conj() / len(bands)
+    _, pairs, counts = own.array.lags
+    for lag in range(len(counts)):
+        expected = total.reshape(4, -1)[:, (pairs == lag).numpy()].mean(1)
+        np.testing.assert_allclose(found[:, lag], expected, rtol=0, atol=1e-6 * np.abs(total).max())
+
+
+def _rows():
+    return [(*row[:3], row[3]) for row in WALLS.numpy()]
+
+
+def _cosines(images, position):
+    units = (images - position) / np.linalg.norm(images - position, axis=-1, keepdims=True)
+    normals = np.concatenate((np.zeros((1, 3)), WALLS[:, :3].numpy()))
+    return np.abs((units * normals).sum(-1)).clip(1e-3)
+
+
+def test_spectra_give_back_the_covariances_of_their_elements():
+    """Up to a scale, though labels have lost their least amplitude."""
+    links = example_links("spectrum")
+    grid = links.task.directions
+    task = Spectrum(grid.elevations, grid.azimuths, "min-max of each spectrum's amplitude")
+    receiver = replace(links.receivers[0], array=Array.planar(3, 4, pitch=0.05))
+    links = replace(links, task=task, receivers=(receiver, receiver))
+    pooling = MirroredSplatting(links.scene).pooling
+    elements = links.receivers[0].array
+    waves = torch.randn(5, 3, len(elements), dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    covariances = (waves.mT @ waves.conj()).flatten(1)
+    _, pairs, counts = elements.lags
+    lags = covariances.new_zeros(5, len(counts)).index_add(1, pairs, covariances) / counts
+    query = Query(torch.zeros(5, 3), torch.zeros(5, dtype=torch.long), torch.full((5,), 2.4e9))
+    found = pooling.beamformer.lags(pooling.beamformer(lags.to(torch.complex64), query), query)
+    half = len(counts) // 2
+    torch.testing.assert_close(found / found[:, half, None], lags / lags[:, half, None], rtol=0, atol=1e-3)
+    assert not pooling.beamformer.lags(torch.zeros(5, *links.task.shape), query).any()
