@@ -18,7 +18,7 @@ from gaigs.placement.learnt_room import LearntRoom
 from gaigs.placement.mirrored import export
 from gaigs.placement.mirrored.channel_search import FEWEST, ChannelSearch
 from gaigs.placement.mirrored.lag_search import LagSearch
-from gaigs.placement.mirrored.search import Loss, choose_bandwidth, find_planes, move_planes, prune, thinned
+from gaigs.placement.mirrored.search import WIDEST, Loss, choose_bandwidth, find_planes, move_planes, prune, thinned
 from gaigs.pooling import Pooling
 from gaigs.pooling.channels import ChannelPooling
 from gaigs.pooling.path_spectrum import PathSpectrum
@@ -83,8 +83,9 @@ class MirroredSplatting(GaussianSplatting):
         self.places = export.some(links.query[links.split.train])
         task = self.scene.task
         is_known = links.query.frequencies is not None or len(self.scene.frequencies) == 1
-        if isinstance(self.pooling, PathSpectrum) and is_known and not self.placement.fixed:
-            self.search = LagSearch(links, self.pooling.beamformer.lags, self.placement.order)
+        if isinstance(self.pooling, PathSpectrum) and is_known and self.placement.order and not self.placement.fixed:
+            frequencies, lags = carriers(self.scene, links.query), self.pooling.beamformer.lags
+            self.search = LagSearch(links, frequencies, lags, self.placement.order)
         if not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling)) or self.trend is not None:
             return
         train, sign, frequencies = links.split.train, int(self.pooling.sign), task.frequencies
@@ -143,27 +144,28 @@ class MirroredSplatting(GaussianSplatting):
         if placement.fixed or placement.found:
             return "phases count"
         before = loss(train)
-        if isinstance(self.pooling, PathSpectrum):
-            return f"phases count; {self._search_lags(before, lambda: loss(train))}"
+        bandwidth = 0.0 if placement.log_bandwidth is None else placement.log_bandwidth.exp().item()
+        if self.search is not None and bandwidth * placement.diagonal < speed_of_light:  # most paths interfere
+            return "phases count" if number > 2 else self._search_lags(bandwidth, before, lambda: loss(train))
         # Powers locate distant planes to some decimetres: the first search reaches farther.
         least = 0.03 * placement.diagonal if number == (0 if adds_waves else 2) else 0.0
         moves = ", ".join(f"{move:+.3f}" for move in move_planes(self, train, wavelength, least))
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
 
-    def _search_lags(self, before: float, loss: Callable[[], float]) -> str:
-        """Moves planes by ``LagSearch``, once."""
-        search, placement = self.search, self.placement
-        if search is None:
-            return "planes have been searched"
-        self.search, used = None, placement.used
-        normals = placement.normals[used]
+    def _search_lags(self, bandwidth: float, before: float, loss: Callable[[], float]) -> str:
+        """Moves planes by ``LagSearch``, unless the loss rises."""
+        placement, used, origin = self.placement, self.placement.used, self.placement.origin.clone()
+        normals, middle = placement.normals[used], placement.middle.cpu().double()
         start = torch.cat((normals, (placement.offsets[used] + normals @ placement.middle)[:, None]), 1).cpu().double()
-        bandwidth = 0.0 if placement.log_bandwidth is None else placement.log_bandwidth.exp().item()
-        planes, middle = search.run(start, bandwidth, 0.04 * placement.diagonal), placement.middle.cpu().double()
+        reach = min(0.04 * placement.diagonal, WIDEST * self.search.wavelength)
+        planes = self.search.run(start, bandwidth, reach)
         for number, plane in zip(used.tolist(), planes, strict=True):
             placement.place(number, plane[:3].to(normals), float(plane[3] - plane[:3] @ middle))
+        if (after := loss()) > before:
+            placement.origin.copy_(origin)
+            return f"phases count; planes stay, as their search has a loss of {after:.4f}, not {before:.4f}"
         moves = ", ".join(f"{move:+.3f}" for move in ((planes - start) @ torch.cat((-middle, torch.ones(1)))).tolist())
-        return f"planes moved by {moves} m at the middle of the room; loss {before:.4f} -> {loss():.4f}"
+        return f"phases count; planes moved by {moves} m at the middle of the room; loss {before:.4f} -> {after:.4f}"
 
     @property
     def has_margins(self) -> bool:

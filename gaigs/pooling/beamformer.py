@@ -91,17 +91,18 @@ class Beamformer:
         """Covariances of which labels are the spectra, in float64: the inverse of a call, but for each label's scale.
 
         A label y is s - m but for a scale, with the least amplitude m. So y² + 2 m y + m² is linear in the covariances,
-        and they and m are the solution of least squares. A label of zeros has covariances of 0.
+        and they and m are the solution of least squares. What the directions hardly show is left out: of an array of
+        closely spaced elements the noise of the labels would swamp it. A label of zeros has covariances of 0.
         """
         own = self.scene.task.directions
-        rows, columns = (slice(None, None, max(1, size // 40)) for size in own.shape)  # 40 x 40 pixels, or a few more
+        rows, columns = (slice(None, None, max(1, size // 40)) for size in own.shape)  # at least 40 x 40 pixels
         thin, labels = own.thin(rows, columns), labels[:, rows, columns].flatten(1).double()
         found = torch.zeros(len(labels), len(self.array(query).lags[0]), dtype=torch.complex128)
         for carrier, links in self.by_carrier(query):
             basis = self._basis(carrier, query, thin)
             half = len(basis) // 2
             basis = torch.cat((basis[:half], basis[half + 1 :]))  # the lag 0 is real
-            inverse = torch.linalg.pinv(basis, rtol=1e-6)
+            inverse = torch.linalg.pinv(basis, rtol=1e-3)
             squares, doubles = labels[links].square(), 2 * labels[links]
             rests = [part - part @ inverse @ basis for part in (squares, doubles)]
             least = -(rests[0] * rests[1]).sum(1) / rests[1].square().sum(1).clamp_min(1e-30)

@@ -26,7 +26,6 @@ from gaigs.placement.mirrored.reflections import (
 )
 from gaigs.propagation import NEAREST, fresnel
 from gaigs.query import Query
-from gaigs.scene import carriers
 
 MATERIAL = complex(4.0, -0.3)
 """Relative permittivity of all planes: between wood and concrete."""
@@ -42,6 +41,9 @@ FAINT = 1e-3
 
 TILE = 0.025
 """Half the width of a tile of the periodogram [rad]: over some metres, lengths are linear within it."""
+
+TURN = 0.16
+"""Step of a turn in the periodogram [wavelengths over the places' mean distance from the pivot]: about 2 rad."""
 
 
 @dataclass(frozen=True)
@@ -115,14 +117,26 @@ class ReceiverLags:
         return self.lags / scales[:, None] - model, square
 
     def one_more(self, paths: tuple[Tensor, Tensor, Tensor], bandwidth: float) -> tuple[Tensor, Tensor]:
-        """The wave of one more path beside known ones: its interference with each (b, n, e), and their lengths."""
+        """The wave of one more path beside known ones: its interference with each (b, n, e), and their lengths.
+
+        Without a bandwidth it is the same for a path of any length: one sum (b, 1, e).
+        """
         fields, steering, lengths = paths
         rest, square = self.left(self.sums(fields, steering, lengths, bandwidth))
         matrices = rest[:, self.array.lags[1]].view(-1, len(self.array), len(self.array))
-        return (matrices @ steering.mT).mT * fields[..., None] / square[:, None, None], lengths
+        waves = (matrices @ steering.mT).mT * fields[..., None] / square[:, None, None]
+        return (waves, lengths) if bandwidth else (waves.sum(1, keepdim=True), lengths[:, :1])
 
     def periodogram(
-        self, waves: Tensor, lengths: Tensor, bandwidth: float, plane, pivot, axes, moves, turns
+        self,
+        waves: Complex[Tensor, "b n e"],
+        lengths: Float[Tensor, "b n"],
+        bandwidth: float,
+        plane: Float[Tensor, "4"],
+        pivot: Float[Tensor, "3"],
+        axes: Float[Tensor, "2 3"],
+        moves: Float[Tensor, " m"],
+        turns: Float[Tensor, " t"],
     ) -> Float[Tensor, "m t t"]:
         """Likeness of the reflection at planes about one to the waves of one more path.
 
@@ -136,9 +150,7 @@ class ReceiverLags:
         cosines = units @ normal
         near = torch.minimum(here.abs(), there.abs()) < moves[-1]  # planes of the tile are on either side
         gains = self.array.gain(ways) / own * ((here * there > 0) | near) * reflection(normal, cosines.abs())
-        likeness = (
-            torch.sinc(bandwidth / speed_of_light * (lengths - own[:, None])) if bandwidth else torch.ones_like(lengths)
-        )
+        likeness = torch.sinc(bandwidth / speed_of_light * (lengths - own[:, None]))
         left = (waves * likeness[..., None]).sum(1)
         heard = (self.steering(ways[:, None])[:, 0].conj() * left).sum(1) * gains.conj()
         heard = heard * torch.polar(torch.ones_like(own), self.wavenumbers * own)
@@ -166,16 +178,25 @@ class LagSearch:
     covariances decides between proposals, after a descent on it. The strongest plane comes first.
 
     Args:
-        links: Their training links count; of the task ``spectrum``, with known carriers.
+        links: Their training links count; of the task ``spectrum``.
+        frequencies: Carrier of each link [Hz].
         covariances: Function from labels and their query to lags, each label's up to a scale.
         order: Largest number of reflections of a path; more than 2 count as 2, as longer paths hardly locate a plane.
-        most: Links that count, of all receivers together.
+        most: Links that count, of all receivers together; of each at least 20.
 
     Source: ours; Van Trees, Optimum Array Processing, 2002, section 2.4, for the covariances.
     """
 
-    def __init__(self, links: Links, covariances: Callable[[Tensor, Query], Tensor], order: int, most: int = 300):
+    def __init__(
+        self,
+        links: Links,
+        frequencies: Float[Tensor, " n"],
+        covariances: Callable[[Tensor, Query], Tensor],
+        order: int,
+        most: int = 300,
+    ):
         self.order, self.receivers = min(order, 2), []
+        self.wavelength = speed_of_light / frequencies.max().item()
         train, query = links.split.train, links.query
         numbers = query.receivers[train].unique().tolist()
         for number in numbers:
@@ -184,9 +205,14 @@ class LagSearch:
             lags = covariances(links.labels[own], query[own])
             powers = lags[:, lags.shape[1] // 2].real
             heard, receiver = powers > 0, links.receivers[number]
-            places, frequencies = query.transmitters[own].double(), carriers(links.scene, query[own]).double()
             pose = receiver.pose.to(torch.zeros((), dtype=torch.float64))
-            everything = ReceiverLags(places, lags / powers[:, None], frequencies, pose, receiver.array)
+            everything = ReceiverLags(
+                query.transmitters[own].double(),
+                lags / powers[:, None],
+                frequencies[own].double(),
+                pose,
+                receiver.array,
+            )
             if heard.any():
                 self.receivers.append(everything.some(heard))
         count = sum(len(receiver.places) for receiver in self.receivers)
@@ -194,20 +220,21 @@ class LagSearch:
 
     @torch.no_grad()
     def run(self, planes: Float[Tensor, "w 4"], bandwidth: float, reach: float) -> Float[Tensor, "w 4"]:
-        """The planes, each moved by up to ``reach`` [m] and 4 degrees, twice.
+        """The planes, each searched twice: up to ``reach`` [m] on either side of where it is, and 4 degrees.
 
-        ``bandwidth`` is that over which powers are averaged [Hz].
+        Towards normals that are square to others it may turn by 18 degrees. ``bandwidth`` is that over which powers are
+        averaged [Hz].
         """
         planes, self.bandwidth = planes.double(), bandwidth
         if not len(planes) or not self.receivers:
             return planes
-        self.wavelength = speed_of_light / max(receiver.frequencies.max().item() for receiver in self.receivers)
         for _ in range(2):
             for k in self.by_strength(planes):
                 planes = self.moved(planes, k, reach)
             everything = torch.ones(len(planes), dtype=torch.bool)
             polished = self.polish(planes, everything, 40, 3e-3)
-            planes = min(planes, polished, key=lambda found: self.errors(found, self.receivers).mean().item())
+            gains = self.errors(planes, self.receivers) - self.errors(polished, self.receivers)
+            planes = polished if is_sure(gains) else planes
         return planes
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
@@ -226,12 +253,13 @@ class LagSearch:
     def errors(
         self, planes: Float[Tensor, "w 4"], receivers: list[ReceiverLags], sequences: Tensor | None = None
     ) -> Float[Tensor, " b"]:
-        """Log of each link's squared error over the squared covariances: blocked links must not rule."""
+        """Log of the share of each link's squared covariances that paths do not explain: none must rule."""
         sequences = self.sequences(planes) if sequences is None else sequences
         logs = []
         for receiver in receivers:
             rest, square = receiver.left(receiver.sums(*receiver.paths(planes, sequences), self.bandwidth))
-            logs.append(((receiver.array.lags[2] * rest.abs().square()).sum(1) / square + FLOOR).log())
+            error = (receiver.array.lags[2] * rest.abs().square()).sum(1)
+            logs.append((error / (error + square) + FLOOR).log())
         return torch.cat(logs)
 
     def moved(self, planes: Float[Tensor, "w 4"], k: int, reach: float) -> Float[Tensor, "w 4"]:
@@ -251,8 +279,7 @@ class LagSearch:
         _, best, _ = min(rates, key=lambda rate: rate[0])
         rates.append(rated(self.polish(best, torch.arange(len(planes)) == k, 10, 4e-3)))
         _, best, errors = min(rates, key=lambda rate: rate[0])
-        gains = rates[0][2] - errors
-        return best if gains.mean() > SURE * gains.std() / math.sqrt(len(gains)) else planes
+        return best if is_sure(rates[0][2] - errors) else planes
 
     def pivots(self, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "w 3"]:
         """Mean point at which each plane reflects [m]: turned about it, a plane changes the lengths least."""
@@ -269,11 +296,13 @@ class LagSearch:
         sequences = self.sequences(planes)
         sequences = sequences[(sequences != k).all(1)]
         half = min(self.wavelength, reach)  # of a tile [m]
-        steps = torch.linspace(-half, half, 19).double(), torch.linspace(-TILE, TILE, 11).double()
+        (about,) = self.pivots(torch.cat((normal, normal.new_tensor([offset])))[None])
+        spread = torch.cat([part.places - about for part in self.few]).norm(dim=1).mean().item()
+        turns = 2 * math.ceil(TILE / min(TILE / 5, TURN * self.wavelength / spread)) + 1
+        steps = torch.linspace(-half, half, 19).double(), torch.linspace(-TILE, TILE, turns).double()
         starts = torch.linspace(-reach, reach, 2 * math.ceil(reach / half / 2) + 1).double()
         centres = 2 * TILE * torch.arange(-tilts, tilts + 1).double()
         axes = torch.stack(tangents(normal))
-        (about,) = self.pivots(torch.cat((normal, normal.new_tensor([offset])))[None])
         waves = [receiver.one_more(receiver.paths(planes, sequences), self.bandwidth) for receiver in self.receivers]
         found = []
         for a, b, start in itertools.product(centres, centres, starts):
@@ -325,6 +354,11 @@ class LagSearch:
             self.errors(now(), self.few, sequences).mean().backward()
             optimizer.step()
         return now().detach()
+
+
+def is_sure(gains: Float[Tensor, " b"]) -> bool:
+    """True if the mean gain of the links is ``SURE``."""
+    return bool(gains.mean() > SURE * gains.std() / math.sqrt(len(gains)))
 
 
 def reflection(normals: Float[Tensor, "*#n 3"], cosines: Float[Tensor, "*n"]) -> Complex[Tensor, "*n"]:
