@@ -38,7 +38,8 @@ class MirroredSplatting(GaussianSplatting):
 
     Powers come first: they locate planes to some centimetres. Then phases count too: each plane is turned square to the
     others and moved along its normal, by steps of a fraction of the wavelength, to the least error, and descent goes
-    on. ``ChannelSearch`` locates planes of channels before the training; they stay there.
+    on. Of spectra at a carrier, ``LagSearch`` moves the planes then. ``ChannelSearch`` locates planes of channels before
+    the training; they stay there.
 
     Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that suits it.
 
@@ -49,7 +50,7 @@ class MirroredSplatting(GaussianSplatting):
     revisions = (0.0, 0.06, 0.25, 0.5, 0.75)
 
     places: Query | None = None  # set by fit
-    search: LagSearch | None = None  # set by fit, for spectra
+    search: LagSearch | None = None  # set by fit, for spectra with known carriers
 
     def __init__(
         self,
