@@ -1,5 +1,6 @@
 """Mirrored Gaussians: our own predictor, which learns the walls of the room."""
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,8 @@ from gaigs.registry import register
 from gaigs.scene import Scene, carriers, direct_gains, direct_waves
 from gaigs.task.csi import Csi
 
+log = logging.getLogger(__name__)
+
 
 @register("model", "mirrored")
 class MirroredSplatting(GaussianSplatting):
@@ -38,8 +41,8 @@ class MirroredSplatting(GaussianSplatting):
 
     Powers come first: they locate planes to some centimetres. Then phases count too: each plane is turned square to the
     others and moved along its normal, by steps of a fraction of the wavelength, to the least error, and descent goes
-    on. Of spectra at a carrier, ``LagSearch`` moves the planes then. ``ChannelSearch`` locates planes of channels before
-    the training; they stay there.
+    on. Of spectra at a carrier, ``LagSearch`` moves the planes then. ``ChannelSearch`` locates planes of channels
+    before the training; they stay there.
 
     Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that suits it.
 
@@ -87,6 +90,10 @@ class MirroredSplatting(GaussianSplatting):
         if isinstance(self.pooling, PathSpectrum) and is_known and self.placement.order and not self.placement.fixed:
             frequencies, lags = carriers(self.scene, links.query), self.pooling.beamformer.lags
             self.search = LagSearch(links, frequencies, lags, self.placement.order)
+            for doubt in self.search.doubts:
+                log.warning("%s", doubt)
+            if not self.search.receivers:
+                self.search = None
         if not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling)) or self.trend is not None:
             return
         train, sign, frequencies = links.split.train, int(self.pooling.sign), task.frequencies

@@ -87,8 +87,12 @@ class Beamformer:
         whole = spectra[1] if len(spectra) == 2 else torch.cat(spectra)[torch.cat(order).argsort()]
         return whole.unflatten(1, asked.shape)
 
-    def lags(self, labels: Float[Tensor, "b rows columns"], query: Query) -> Complex[Tensor, "b l"]:
-        """Covariances of which labels are the spectra, in float64: the inverse of a call, but for each label's scale.
+    def lags(
+        self, labels: Float[Tensor, "b rows columns"], query: Query
+    ) -> tuple[Complex[Tensor, "b l"], Float[Tensor, " b"]]:
+        """Covariances of which labels are the spectra, and the share of each label that is no such spectrum; float64.
+
+        The covariances are the inverse of a call, but for each label's scale. The share is that of the squared norm.
 
         A label y is s - m but for a scale, with the least amplitude m. So y² + 2 m y + m² is linear in the covariances,
         and they and m are the solution of least squares. What the directions hardly show is left out: of an array of
@@ -98,6 +102,7 @@ class Beamformer:
         rows, columns = (slice(None, None, max(1, size // 40)) for size in own.shape)  # at least 40 x 40 pixels
         thin, labels = own.thin(rows, columns), labels[:, rows, columns].flatten(1).double()
         found = torch.zeros(len(labels), len(self.array(query).lags[0]), dtype=torch.complex128)
+        left = torch.zeros(len(labels), dtype=torch.float64)
         for carrier, links in self.by_carrier(query):
             basis = self._basis(carrier, query, thin)
             half = len(basis) // 2
@@ -107,10 +112,13 @@ class Beamformer:
             rests = [part - part @ inverse @ basis for part in (squares, doubles)]
             least = -(rests[0] * rests[1]).sum(1) / rests[1].square().sum(1).clamp_min(1e-30)
             least = least.clamp_min(0)[:, None]
-            parts = (squares + least * doubles + least.square()) @ inverse
+            powers = squares + least * doubles + least.square()
+            parts = powers @ inverse
+            rest = (powers - parts @ basis).square().sum(1)
+            left[links] = rest / powers.square().sum(1).clamp_min(1e-30)
             later = torch.complex(parts[:, :half], torch.cat((0 * parts[:, :1], parts[:, half:]), 1))
             found[links] = torch.cat((later[:, 1:].conj().flip(1), later), 1)
-        return found
+        return found, left
 
     def array(self, query: Query) -> Array:
         """The array of a query's receiver."""

@@ -39,6 +39,10 @@ SURE = 2.0
 FAINT = 1e-3
 """Share of the power below which paths of several reflections are left out."""
 
+STRANGE = 0.01
+"""Share of a spectrum that its array cannot explain, from which on the search is left out. Measured spectra have 0.001,
+powers in place of amplitudes 0.05."""
+
 TILE = 0.025
 """Half the width of a tile of the periodogram [rad]: over some metres, lengths are linear within it."""
 
@@ -108,6 +112,28 @@ class ReceiverLags:
         _, pairs, counts = self.array.lags
         flat = covariances.flatten(1)
         return flat.new_zeros(len(flat), len(counts)).index_add(1, pairs, flat) / counts
+
+    def doubts(self, name: str) -> list[str]:
+        """A sentence if the direct path shows in another direction than geometry says."""
+        _, pairs, _ = self.array.lags
+        matrices = self.lags[:, pairs].view(-1, len(self.array), len(self.array))
+        ways = self.seen(self.places[:, None])[0]
+        shares = {}
+        for turn, flip in itertools.product(range(4), (1, -1)):
+            turned = torch.view_as_real(torch.view_as_complex(ways[..., :2].contiguous()) * 1j**turn)
+            turned = torch.cat((turned[..., :1], flip * turned[..., 1:], ways[..., 2:]), -1)
+            steering = self.steering(turned)[:, 0]
+            share = torch.einsum("bi,bij,bj->b", steering.conj(), matrices, steering).real / len(self.array) ** 2
+            shares[turn, flip] = share.median().item()
+        (turn, flip), best = max(shares.items(), key=lambda item: item[1])
+        if best < 0.4 or shares[0, 1] > best - 0.2:
+            return []
+        words = f"turned by {90 * turn} degrees" if turn else ""
+        words += " and " * bool(turn and flip < 0) + "counted clockwise" * (flip < 0)
+        return [
+            f"the direct path explains {shares[0, 1]:.0%} of the spectra of {name}, "
+            f"{best:.0%} if azimuths were {words}\ncheck the receiver's orientation and the azimuths of the data"
+        ]
 
     def left(self, model: Complex[Tensor, "b l"]) -> tuple[Complex[Tensor, "b l"], Float[Tensor, " b"]]:
         """What a model of the covariances leaves, with the best scale of each link, and the model's square."""
@@ -180,7 +206,8 @@ class LagSearch:
     Args:
         links: Their training links count; of the task ``spectrum``.
         frequencies: Carrier of each link [Hz].
-        covariances: Function from labels and their query to lags, each label's up to a scale.
+        covariances: Function from labels and their query to lags, each label's up to a scale, and the share of each
+            label that they do not explain.
         order: Largest number of reflections of a path; more than 2 count as 2, as longer paths hardly locate a plane.
         most: Links that count, of all receivers together; of each at least 20.
 
@@ -191,18 +218,18 @@ class LagSearch:
         self,
         links: Links,
         frequencies: Float[Tensor, " n"],
-        covariances: Callable[[Tensor, Query], Tensor],
+        covariances: Callable[[Tensor, Query], tuple[Tensor, Tensor]],
         order: int,
         most: int = 300,
     ):
-        self.order, self.receivers = min(order, 2), []
+        self.order, self.receivers, self.doubts = min(order, 2), [], []
         self.wavelength = speed_of_light / frequencies.max().item()
         train, query = links.split.train, links.query
         numbers = query.receivers[train].unique().tolist()
         for number in numbers:
             own = train[query.receivers[train] == number]
             own = own[torch.linspace(0, len(own) - 1, min(len(own), max(20, most // len(numbers)))).round().long()]
-            lags = covariances(links.labels[own], query[own])
+            lags, left = covariances(links.labels[own], query[own])
             powers = lags[:, lags.shape[1] // 2].real
             heard, receiver = powers > 0, links.receivers[number]
             pose = receiver.pose.to(torch.zeros((), dtype=torch.float64))
@@ -213,8 +240,14 @@ class LagSearch:
                 pose,
                 receiver.array,
             )
-            if heard.any():
+            if left.median() > STRANGE:
+                self.doubts.append(
+                    f"the array of {receiver.name} does not explain {left.median():.0%} of its spectra\n"
+                    "check frequency, elements and directions, and that labels are amplitudes, not powers or dB"
+                )
+            elif heard.any():
                 self.receivers.append(everything.some(heard))
+                self.doubts += self.receivers[-1].doubts(receiver.name)
         count = sum(len(receiver.places) for receiver in self.receivers)
         self.few = [receiver.some(slice(None, None, max(1, round(count / 100)))) for receiver in self.receivers]
 

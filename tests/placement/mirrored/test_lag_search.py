@@ -32,7 +32,7 @@ def search():
     split = Split("made up", *torch.arange(150).split((150, 0, 0)))
     links = replace(links, query=query, receivers=(receiver,), labels=torch.ones(150, 2), rows=None, split=split)
     count = len(receiver.array.lags[0])
-    ones = lambda labels, query: torch.ones(len(labels), count, dtype=torch.complex128)
+    ones = lambda labels, query: (torch.ones(len(labels), count, dtype=torch.complex128), torch.zeros(len(labels)))
     made = LagSearch(links, query.frequencies, ones, 2)
     own = made.receivers[0]
     lags = own.sums(*own.paths(WALLS, all_sequences(3, 2)), 0.0)
@@ -61,6 +61,28 @@ def test_a_plane_stays_where_nothing_shows_it(search):
     search.bandwidth = 0.0
     far = torch.tensor([[0.0, 0.0, 1.0, 40.0]]).double()
     assert search.moved(far, 0, 0.3) is far
+
+
+@pytest.mark.parametrize(
+    ("turn", "flip", "words"),
+    [
+        (0, 1, None),
+        (0, -1, "azimuths were counted clockwise"),
+        (1, 1, "turned by 90 degrees\n"),
+        (3, -1, "and counted"),
+    ],
+)
+def test_azimuths_that_the_direct_path_contradicts_are_named(search, turn, flip, words):
+    own = search.receivers[0]
+    frame = torch.eye(3).double()
+    frame[:2, :2] = torch.linalg.matrix_power(torch.tensor([[0.0, -1.0], [1.0, 0.0]]).double(), turn)
+    frame[1] *= flip
+    fields, _, lengths = own.paths(WALLS[:0], all_sequences(0, 2))
+    ways, _ = own.seen(own.places[:, None])
+    lags = own.sums(fields, own.steering(ways @ frame.T), lengths, 0.0)
+    lags = lags / lags[:, lags.shape[1] // 2, None].real
+    found = replace(own, lags=lags).doubts("door")
+    assert [words in doubt for doubt in found] == [True] * (words is not None)
 
 
 def test_no_plane_and_no_power_move_nothing(search):
@@ -121,7 +143,10 @@ def test_spectra_give_back_the_covariances_of_their_elements():
     _, pairs, counts = elements.lags
     lags = covariances.new_zeros(5, len(counts)).index_add(1, pairs, covariances) / counts
     query = Query(torch.zeros(5, 3), torch.zeros(5, dtype=torch.long), torch.full((5,), 2.4e9))
-    found = pooling.beamformer.lags(pooling.beamformer(lags.to(torch.complex64), query), query)
+    labels = pooling.beamformer(lags.to(torch.complex64), query)
+    found, left = pooling.beamformer.lags(labels, query)
+    assert left.max() < 1e-6
+    assert pooling.beamformer.lags(labels.flip(1), query)[1].min() > 0.01, "no spectra of this array"
     half = len(counts) // 2
     torch.testing.assert_close(found / found[:, half, None], lags / lags[:, half, None], rtol=0, atol=1e-3)
-    assert not pooling.beamformer.lags(torch.zeros(5, *links.task.shape), query).any()
+    assert not pooling.beamformer.lags(torch.zeros(5, *links.task.shape), query)[0].any()
