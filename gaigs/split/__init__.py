@@ -50,11 +50,17 @@ def part(
 
 
 def hold_out(
-    name: str, links: Int[Tensor, " k"], groups: Int[Tensor, " n"], fraction: float, generator: torch.Generator
+    name: str,
+    links: Int[Tensor, " k"],
+    groups: Int[Tensor, " n"],
+    fraction: float,
+    generator: torch.Generator,
+    at_most: bool = False,
 ) -> tuple[Int[Tensor, " kept"], Int[Tensor, " held"]]:
     """Holds out random whole groups, as near to a fraction of some ascending links as possible.
 
-    The groups are those of all links of the data; there must be two or more. An error calls the fraction ``name``.
+    With ``at_most`` it is not more than the fraction, if one group is not. The groups are those of all links of the
+    data; there must be two or more. An error calls the fraction ``name``.
     """
     if not fraction:
         return links, links[:0]
@@ -67,7 +73,8 @@ def hold_out(
         )
     order = torch.randperm(len(present), generator=generator)
     surplus = sizes[order].cumsum(0)[:-1] - fraction * len(links)
-    chosen = present[order[: int(surplus.abs().argmin()) + 1]]
+    count = max(1, int((surplus <= 0).sum())) if at_most else int(surplus.abs().argmin()) + 1
+    chosen = present[order[:count]]
     held = torch.isin(groups[links], chosen)
     return links[~held], links[held]
 

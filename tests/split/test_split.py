@@ -105,7 +105,7 @@ def test_cubes_stay_whole(seed, edge, far):
     ("options", "name"),
     [
         ({"name": "official", "validation": 0.1}, "official, validation 0.1, seed 0"),
-        ({"name": "official", "length": 8}, "official, validation 0.1 in runs of 8, seed 0"),
+        ({"name": "official", "length": 4}, "official, validation 0.1 in runs of 4, seed 0"),
         ({"name": "sparse", "train": 60}, "sparse 60, test 0.2, validation 0.1, seed 0"),
         ({"name": "runs", "length": 20, "test": 0.3}, "runs of 20, test 0.3, validation 0.1, seed 0"),
         ({"name": "blocks", "edge": 0.25, "validation": 0}, "blocks 0.25 m, test 0.2, seed 0"),
@@ -125,7 +125,6 @@ def test_names_say_the_numbers(links, options, name):
         ({"name": "random", "validation": 1}, r"split.validation must be in \[0, 1\), got 1"),
         ({"name": "official", "validation": 1.5}, "split.validation must be"),
         ({"name": "official", "length": 0}, "split.length must be a whole number of rows"),
-        ({"name": "official", "length": N}, r"split.validation=0\.1 holds out whole .* two of them or more, got 1"),
         ({"name": "blocks", "edge": 0}, r"split.edge must be from 1e-06 to 1e\+06 m, got 0"),
         *((options | {"seed": -1}, "split.seed must be a whole number from 0 to") for options in SPLITS),
         ({"name": "sparse", "train": 321}, r"split.train must be in 1\.\.320"),
@@ -169,11 +168,22 @@ def test_runs_count_rows(heard):
 def test_official_validation_in_runs_of_rows(heard):
     rows = heard.rows
     official = (rows < 100).nonzero()[:, 0], (rows >= 100).nonzero()[:, 0]
-    result = part(replace(heard, official=lambda: official), name="official", length=10, validation=0.3)
+    result = part(replace(heard, official=lambda: official), name="official", length=10, validation=0.45)
     validating = rows[result.validation].unique()
     assert {(row // 10).item() for row in validating}.isdisjoint((rows[result.train] // 10).tolist())
-    assert len(validating) == pytest.approx(30, abs=10)
+    assert len(validating) == pytest.approx(45, abs=10)
     assert torch.equal(result.test, official[1])
+
+
+@pytest.mark.parametrize(("rows", "length", "expected"), [(126, 100, 3), (4000, 100, 100), (30, 100, 1), (126, 2, 2)])
+def test_official_runs_are_short_enough_for_four_to_validate(rows, length, expected):
+    """Of 126 rows one run of 100 would be most of the training."""
+    links = links_at(torch.rand(rows + 9, 3), official=lambda: torch.arange(rows + 9).split((rows, 9)))
+    result = part(links, name="official", length=length, validation=0.1)
+    assert 0.05 * rows < len(result.validation) <= 0.1 * rows
+    assert len(result.validation) % expected == 0
+    assert len((result.validation // expected).unique()) == len(result.validation) / expected >= min(4, 0.1 * rows)
+    assert (f"runs of {expected}" in result.name) == (expected > 1)
 
 
 # --- configuration ---
