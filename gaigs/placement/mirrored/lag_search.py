@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
@@ -69,7 +69,8 @@ class ReceiverLags:
 
     def some(self, index: object) -> "ReceiverLags":
         """The same of some links."""
-        return ReceiverLags(self.places[index], self.lags[index], self.frequencies[index], self.pose, self.array)
+        parts = {name: getattr(self, name)[index] for name in ("places", "lags", "frequencies")}
+        return replace(self, **parts)
 
     @property
     def wavenumbers(self) -> Float[Tensor, " b"]:
@@ -390,8 +391,8 @@ class LagSearch:
 
 
 def is_sure(gains: Float[Tensor, " b"]) -> bool:
-    """True if the mean gain of the links is ``SURE``."""
-    return bool(gains.mean() > SURE * gains.std() / math.sqrt(len(gains)))
+    """True if the mean gain of two links or more is ``SURE``."""
+    return len(gains) > 1 and bool(gains.mean() > SURE * gains.std() / math.sqrt(len(gains)))
 
 
 def reflection(normals: Float[Tensor, "*#n 3"], cosines: Float[Tensor, "*n"]) -> Complex[Tensor, "*n"]:
