@@ -28,16 +28,24 @@ Parts = tuple[Int[Tensor, " train"], Int[Tensor, " test"]]
 
 @dataclass(frozen=True)
 class Split:
-    """Links to train, validate and test on; ``name`` is the protocol with its numbers."""
+    """Links to train, validate and test on; ``name`` is the protocol with its numbers.
+
+    ``groups`` has the group of each link of the data, a row, a run or a cube: each is held out whole. None: places are.
+    """
 
     name: str
     train: Int[Tensor, " train"]
     validation: Int[Tensor, " validation"]
     test: Int[Tensor, " test"]
+    groups: Int[Tensor, " n"] | None = None
 
     def parts(self) -> dict[str, Int[Tensor, " k"]]:
         """The three parts by name."""
         return {"train": self.train, "validation": self.validation, "test": self.test}
+
+    def validating(self) -> "Split":
+        """The split whose test are the validation links, for models that have not seen them."""
+        return replace(self, validation=self.validation[:0], test=self.validation)
 
 
 @dataclass(frozen=True, repr=False)

@@ -37,7 +37,21 @@ def thinned(links: Links, most: int) -> Links:
     chosen = torch.cat([evenly(index, most) for index in known_links(links)])
     split = links.split
     train, validation = (part[torch.isin(part, chosen)] for part in (split.train, split.validation))
-    return replace(links, split=Split(split.name, train, validation, split.test))
+    return replace(links, split=Split(split.name, train, validation, split.test, split.groups))
+
+
+FOLDS = 10
+"""Folds of known links that are predicted from all others, to choose a hyperparameter."""
+
+
+def folds_of(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " k"]:
+    """Fold of some links, from 0; groups of the split, or places, are random whole folds, as the test is."""
+    groups = links.split.groups
+    if groups is None:
+        _, groups = links.query.transmitters.unique(dim=0, return_inverse=True)
+    numbers, group = groups[index].unique(return_inverse=True)
+    order = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(0))
+    return (order % FOLDS)[group]
 
 
 def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tensor, "b d"]:

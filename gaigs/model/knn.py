@@ -1,17 +1,21 @@
 """Inverse-distance weighting of the nearest known links: the simplest look-up."""
 
 import math
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.kriging.links import at_directions, coordinates, distances, evenly, known_links, scale_bounds
+from gaigs.kriging.links import at_directions, coordinates, distances, evenly, folds_of, known_links, scale_bounds
 from gaigs.model import Model, Prediction
 from gaigs.query import Batch, Query
 from gaigs.registry import register
 from gaigs.scene import Scene
+
+COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50)
+"""Numbers of neighbours to choose from."""
 
 
 @register("model", "knn")
@@ -26,32 +30,37 @@ class KNearestNeighbours(Model):
     predicted from those at other places.
 
     Args:
-        k: Number of neighbours; with fewer known links, all of them.
+        k: Number of neighbours; with fewer known links, all of them. None: that of ``COUNTS`` with the least error of
+            known links that are predicted from those of other folds, see ``gaigs.kriging.links.folds_of``.
         power: Exponent of the distance; 0 weights all neighbours equally.
 
     Source: reference look-up of the data sets' own README; Shepard, 1968.
     """
 
-    def __init__(self, scene: Scene, k: int = 3, power: float = 2.0):
+    def __init__(self, scene: Scene, k: int | None = 3, power: float = 2.0):
         super().__init__(scene)
-        if k < 1:
-            raise ValueError(f"model.k must be at least 1, got {k}")
+        if k is not None and k < 1:
+            raise ValueError(f"model.k must be at least 1 or null, got {k}")
         if not 0 <= power < math.inf:
             raise ValueError(f"model.power must be 0 or more, and finite, got {power}")
-        self.k, self.power = k, power
+        self.k, self.power, self.chosen = k, power, k or 3
         self.scale = math.nan
 
     def fit(self, links: Links) -> None:
-        """Keeps the links, and chooses the scale of frequencies."""
-        self.links, self.known, self.scale = links, known_links(links), math.nan
+        """Keeps the links, and chooses the scale of frequencies, and the number of neighbours if it is None."""
+        self.links, self.known, self.scale, self.chosen = links, known_links(links), math.nan, self.k or 3
         if self.scene.has_band:
             low, high = scale_bounds(self.scene)
             scales = torch.logspace(math.log10(low), math.log10(high), 16, dtype=torch.float64).tolist()
-            self.scale = min(scales, key=self._leave_one_out)
+            self.scale = min(scales, key=self._squared_error)
+        if self.k is None:
+            folds = [folds_of(links, index) for index in self.known]
+            self.chosen = min(COUNTS, key=lambda count: self._rank(count, folds))
 
     def facts(self) -> dict[str, float]:
-        """``frequency_scale_m``, with several carriers."""
-        return {} if math.isnan(self.scale) else {"frequency_scale_m": self.scale}
+        """``neighbours``, and with several carriers ``frequency_scale_m``."""
+        facts: dict[str, float] = {"neighbours": self.chosen}
+        return facts if math.isnan(self.scale) else {**facts, "frequency_scale_m": self.scale}
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
@@ -68,7 +77,7 @@ class KNearestNeighbours(Model):
 
     def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
         """Labels from those of known links and their distances; links at an infinite distance are left out."""
-        farthest = apart.topk(min(self.k, len(index)), largest=False).values[:, -1:]
+        farthest = apart.topk(min(self.chosen, len(index)), largest=False).values[:, -1:]
         near = (apart <= farthest) & apart.isfinite()
         # A transmitter within a micrometre of a measured one gets that label.
         apart = apart.clamp_min(1e-6)
@@ -82,18 +91,28 @@ class KNearestNeighbours(Model):
             rows.append(torch.tensordot(own[near].to(labels), align(labels[near], labels[first : first + 1]), 1))
         return torch.stack(rows)
 
-    def _leave_one_out(self, scale: float) -> float:
-        """Mean squared error of known links that are predicted from those at other places, as test links are."""
-        errors, count = 0.0, 0
-        for index in self.known:
-            for part in evenly(index, max(1, 256 // len(self.known))).split(32):
-                asked, known = self.links.query[part], self.links.query[index]
+    def _held_out(self, folds: Sequence[Int[Tensor, " k"]] | None = None) -> Iterator[tuple[Tensor, Tensor]]:
+        """Labels of known links, and what links of other folds predict for them, or for None those at other places."""
+        for receiver, index in enumerate(self.known):
+            for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):
+                asked, known = self.links.query[index[rows]], self.links.query[index]
                 here = (asked.transmitters[:, None] == known.transmitters).all(-1)
-                apart = self._distances(asked, index, scale).masked_fill(here, math.inf)
+                if folds is not None:
+                    here |= folds[receiver][rows][:, None] == folds[receiver]
+                apart = self._distances(asked, index, self.scale).masked_fill(here, math.inf)
                 found = apart.isfinite().any(1)  # a place may be the only one
-                part = part[found]
-                values = self._look_up(apart[found], index)
-                error = values - self.scene.task.align(self.links.labels[part], values)
-                errors += error.abs().double().square().sum().item()
-                count += len(part)
-        return errors / max(count, 1)
+                if found.any():
+                    values = self._look_up(apart[found], index)
+                    yield self.scene.task.align(self.links.labels[index[rows[found]]], values), values
+
+    def _squared_error(self, scale: float) -> float:
+        self.scale = scale
+        errors = [(values - labels).abs().double().square().flatten() for labels, values in self._held_out()]
+        return torch.cat(errors).mean().item() if errors else 0.0
+
+    def _rank(self, count: int, folds: Sequence[Int[Tensor, " k"]]) -> float:
+        """Mean score of known links by some neighbours, an error or a negative similarity."""
+        self.chosen, task = count, self.scene.task
+        scores = [task.scores(labels, values)[task.monitor] for labels, values in self._held_out(folds)]
+        mean = torch.cat(scores).mean().item() if scores else 0.0
+        return -mean if task.higher_is_better else mean

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gaigs.data import Links, Split
+from gaigs.data import Links
 from gaigs.gaussians import Gaussians
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters, thin_labels
@@ -94,7 +94,7 @@ class Kriging(Model):
             return self._krige_paths(links, values)
         self._fit_trend_weight(links, values)
         self._solve(links, values)
-        training = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
+        training = replace(links, split=split.validating())
         validation_model = Kriging(self.scene, self.trend, self.fallback_options)
         validation_model.trend_weight.copy_(self.trend_weight)
         validation_model.hyperparameters.copy_(self.hyperparameters)
@@ -129,7 +129,7 @@ class Kriging(Model):
             margins = lambda part, rows=rows: trend.margins(query[rows[part]].to(device)).cpu()
             equations.append(Equations.of(query.transmitters[rows], margins, labels[rows], residuals[rows]))
         validation_model = Kriging(self.scene, self.trend, self.fallback_options)
-        training = replace(links, split=Split(split.name, split.train, split.validation[:0], split.validation))
+        training = replace(links, split=split.validating())
         validation_model.fallback.fit(training)
         held = torch.arange(len(split.train), len(index))
         fields = {int(row): trend.margins(query[row : row + 1].to(device)).cpu()[0] for row in held}

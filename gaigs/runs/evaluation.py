@@ -18,7 +18,7 @@ from rich.jupyter import JupyterMixin
 from torch import Tensor
 
 from gaigs.configuration import composed, has_file
-from gaigs.data import Links, Split
+from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
 from gaigs.model import Model, call_optional
@@ -192,7 +192,6 @@ def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: 
     split = links.split
     if not len(split.validation):
         return {}
-    split = Split(split.name, split.train, split.validation[:0], split.validation)
     return score(models, look_ups, replace(links, split=split, held_out=None))
 
 

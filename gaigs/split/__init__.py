@@ -46,7 +46,7 @@ def part(
         training = training[torch.isin(groups[training], chosen)]
     training, validating = hold_out("validation", training, groups, validation, generator)
     words = [name, f"test {test:g}", *([f"validation {validation:g}"] if validation else []), f"seed {seed}"]
-    return Split(", ".join(words), training, validating, testing)
+    return Split(", ".join(words), training, validating, testing, groups)
 
 
 def hold_out(

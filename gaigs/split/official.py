@@ -29,4 +29,4 @@ def official(links: Links, length: int = 1, validation: float = 0.1, seed: int =
     words = ["official"]
     if validation:
         words += [f"validation {validation:g}{f' in runs of {length}' if length > 1 else ''}", f"seed {seed}"]
-    return Split(", ".join(words), train, validating, test)
+    return Split(", ".join(words), train, validating, test, runs)

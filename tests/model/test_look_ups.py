@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import gaigs
 from gaigs.data import Split
 from gaigs.geometry import Grid, Rays
 from gaigs.kriging.links import distances
@@ -57,8 +58,27 @@ def test_known_links_are_needed_at_each_receiver(name, task):
 
 @pytest.mark.parametrize(("k", "power"), [(0, 2.0), (-2, 2.0), (3, -1.0), (3, float("inf")), (3, float("nan"))])
 def test_a_neighbourhood_out_of_range_is_refused(k, power):
-    with pytest.raises(ValueError, match=r"model\.(k must be at least 1, got|power must be 0 or more, and finite)"):
+    with pytest.raises(ValueError, match=r"model\.(k must be at least 1 or|power must be 0 or more, and finite)"):
         KNearestNeighbours(example_links().scene, k, power)
+
+
+def test_the_number_of_neighbours_follows_from_held_out_groups():
+    """Readings of one run are equal, and those of others pure noise: within runs one neighbour would do."""
+    links = gaigs.links("synthetic_rssi", transmitters=200)
+    query = replace(links.query, receivers=torch.zeros_like(links.query.receivers))
+    group = torch.arange(len(links)) // 20
+    places = torch.stack((group.float(), torch.arange(len(links)) % 20 / 1e3, torch.zeros(len(links))), 1)
+    labels = torch.randn(len(links), generator=torch.Generator().manual_seed(0))[group]
+    split = Split("runs", *torch.arange(len(links)).split((600, 100, len(links) - 700)), group)
+    query = replace(query, transmitters=places)
+    links = replace(links, query=query, labels=labels, split=split, receivers=links.receivers[:1], rows=None)
+    chosen = []
+    for each in (links, replace(links, split=replace(split, groups=None))):
+        model = KNearestNeighbours(links.scene, None)
+        model.fit(each)
+        chosen.append(model.chosen)
+    assert chosen[0] > 1
+    assert chosen[1] == 1
 
 
 # --- directions ---
