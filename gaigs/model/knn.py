@@ -58,8 +58,8 @@ class KNearestNeighbours(Model):
             self.chosen = min(COUNTS, key=lambda count: self._rank(count, folds))
 
     def facts(self) -> dict[str, float]:
-        """``neighbours``, and with several carriers ``frequency_scale_m``."""
-        facts: dict[str, float] = {"neighbours": self.chosen}
+        """``neighbours`` if they were chosen, and with several carriers ``frequency_scale_m``."""
+        facts: dict[str, float] = {"neighbours": self.chosen} if self.k is None else {}
         return facts if math.isnan(self.scale) else {**facts, "frequency_scale_m": self.scale}
 
     def forward(self, batch: Batch) -> Prediction:
@@ -91,7 +91,7 @@ class KNearestNeighbours(Model):
             rows.append(torch.tensordot(own[near].to(labels), align(labels[near], labels[first : first + 1]), 1))
         return torch.stack(rows)
 
-    def _held_out(self, folds: Sequence[Int[Tensor, " k"]] | None = None) -> Iterator[tuple[Tensor, Tensor]]:
+    def _held_out(self, folds: Sequence[Int[Tensor, " _"]] | None = None) -> Iterator[tuple[Tensor, Tensor]]:
         """Labels of known links, and what links of other folds predict for them, or for None those at other places."""
         for receiver, index in enumerate(self.known):
             for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):
@@ -110,7 +110,7 @@ class KNearestNeighbours(Model):
         errors = [(values - labels).abs().double().square().flatten() for labels, values in self._held_out()]
         return torch.cat(errors).mean().item() if errors else 0.0
 
-    def _rank(self, count: int, folds: Sequence[Int[Tensor, " k"]]) -> float:
+    def _rank(self, count: int, folds: Sequence[Int[Tensor, " _"]]) -> float:
         """Mean score of known links by some neighbours, an error or a negative similarity."""
         self.chosen, task = count, self.scene.task
         scores = [task.scores(labels, values)[task.monitor] for labels, values in self._held_out(folds)]

@@ -189,10 +189,9 @@ def score(
 
 def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
     """Scores of every validation link, by models that have not been fitted to these links; empty without such links."""
-    split = links.split
-    if not len(split.validation):
+    if not len(links.split.validation):
         return {}
-    return score(models, look_ups, replace(links, split=split, held_out=None))
+    return score(models, look_ups, replace(links, split=links.split.validating(), held_out=None))
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:

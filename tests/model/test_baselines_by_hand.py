@@ -200,6 +200,8 @@ def compare(config, links, sign=-1):
     values = evaluation.predict(model, links, test).reshape(TEST, -1).numpy()
     if config["name"] == "gaussian_process":  # the search for these has a test of its own
         config = {**config, "length": model.facts()["length_m"], "nugget": model.facts()["nugget"]}
+    elif config.get("k", 0) is None:  # so has the choice of this
+        config = {**config, "k": model.facts()["neighbours"]}
     index = torch.cat((links.split.train, links.split.validation))
     for receiver in range(3):
         asked, known = heard(links, receiver, test), heard(links, receiver, index, sign)
