@@ -10,10 +10,11 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, thin_labels
 from gaigs.kriging.kernel import LIMIT, cholesky_factor, kernel, kriging_weights
-from gaigs.kriging.links import PART, at_directions, coordinates, distances, known_links
+from gaigs.kriging.links import PART, at_directions, coordinates, distances, folds_of, known_links, thinned
+from gaigs.kriging.scalar import ScalarProcess, is_scalar
 from gaigs.model import Model, Prediction, build_trend
 from gaigs.query import Batch, Query
-from gaigs.registry import register
+from gaigs.registry import name_of, register
 from gaigs.scene import Scene
 
 NEIGHBOURS = 300
@@ -32,13 +33,18 @@ class GaussianProcess(Model):
     validation links given the training links around them, see ``gaigs.kriging.fit``. All receivers share the three.
     The signal's variance is each receiver's most likely one.
 
+    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` instead: kernel, noise and trend are those
+    with which folds of the known links are most likely, and each receiver has hyperparameters of its own. Of a receiver
+    with more than ``LIMIT`` known links an even part is used.
+
     A receiver with more than ``LIMIT`` known links is predicted from the ``NEIGHBOURS`` nearest to each query (local
     kriging). Residuals of channels are limited to ``kriging.fit.LOUDEST`` times the receiver's median channel.
 
     It is a look-up: it keeps the links, and is not stored in a checkpoint.
 
     Args:
-        trend: Configuration of the model whose residuals the process describes. None: each receiver's mean label.
+        trend: Configuration of the model whose residuals the process describes. None: each receiver's mean label; for
+            labels of one real number this or ``path_loss``.
 
     Raises:
         ValueError: The trend is a trained model.
@@ -48,18 +54,26 @@ class GaussianProcess(Model):
 
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
-        built = build_trend({"name": "mean"} if trend is None else trend, scene)
-        if [*built.parameters()]:
+        names = ("mean", "path_loss") if is_scalar(scene) else ("mean",)
+        # In plain sequences: their state is no state of this look-up.
+        given = [{"name": name} for name in names] if trend is None else [trend]
+        self.trends = tuple(build_trend(one, scene) for one in given)
+        if any([*built.parameters()] for built in self.trends):
             raise ValueError(f"model.trend cannot be trained, got {trend['name']}; take mean, path_loss or friis")
-        self.trends = (built,)  # in a tuple: its state is no state of this look-up
+        self.chosen = 0
+        self.scalar = [ScalarProcess(scene)] if is_scalar(scene) else []
         self.factors: Tensor | None = None
         self.process = Hyperparameters()
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
         """Fits trend and hyperparameters, and factorises the covariances."""
-        self.links, self.known = links, known_links(links)
-        self.trends[0].fit(links)
+        self.links, self.known, self.chosen = links, known_links(links), 0
+        for trend in self.trends:
+            trend.fit(links)
+        if self.scalar:
+            self._fit_scalar(thinned(links, LIMIT))
+            return
         self.factors = None
         if self.scene.task.dtype.is_complex:
             index = torch.cat(self.known)
@@ -70,21 +84,37 @@ class GaussianProcess(Model):
         self.process, _ = fit_hyperparameters(self.scene, links, residuals)
         self.solved = [self._solve(index) for index in self.known]
 
+    def _fit_scalar(self, links: Links) -> None:
+        index = torch.cat(known_links(links))
+        query, process = links.query[index], self.scalar[0]
+        residuals = [(links.labels[index] - trend(Batch(query)).value).double() for trend in self.trends]
+        known = coordinates(self.scene, query, 1.0), query.receivers
+        self.chosen = process.fit(*known, residuals, folds_of(links, index), torch.arange(len(index)))
+        process.solve(*known, residuals[self.chosen])
+
+    @property
+    def trend(self) -> Model:
+        """The model whose residuals the process describes."""
+        return self.trends[self.chosen]
+
     @property
     def any_frequency(self) -> bool:  # type: ignore[override]
-        return self.trends[0].any_frequency
+        return self.trend.any_frequency
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
         """The trend alone: its residuals at other frequencies do not correlate with the known ones."""
-        return self.trends[0].at_frequencies(frequencies)
+        return self.trend.at_frequencies(frequencies)
 
-    def facts(self) -> dict[str, float]:
-        """``length_m``, ``nugget``, and with several carriers ``frequency_scale_m``."""
-        return self.process.facts()
+    def facts(self) -> dict[str, object]:
+        """``length_m``, ``nugget``, with several carriers ``frequency_scale_m``; of scalars the other choices."""
+        return {**self.scalar[0].facts(), "trend": name_of(self.trend)} if self.scalar else {**self.process.facts()}
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
-        trend = self.trends[0](Batch(query, self.scene.task.directions)).value
+        trend = self.trend(Batch(query, self.scene.task.directions)).value
+        if self.scalar:
+            levels = self.scalar[0](coordinates(self.scene, query, 1.0), query.receivers)
+            return Prediction(trend + levels.to(trend), {})
         added = torch.zeros_like(trend)
         for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver
@@ -111,7 +141,7 @@ class GaussianProcess(Model):
     def _residuals(self, index: Int[Tensor, " k"]) -> Iterator[Tensor]:
         """Labels of some links, aligned to their trend, less this trend; ``PART`` links at a time."""
         for some in index.split(PART):
-            trend = self.trends[0](Batch(self.links.query[some], self.scene.task.directions)).value
+            trend = self.trend(Batch(self.links.query[some], self.scene.task.directions)).value
             residuals = self.scene.task.align(self.links.labels[some], trend) - trend
             if self.factors is not None:
                 residuals = residuals * self.factors[some, None, None]

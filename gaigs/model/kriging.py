@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from gaigs.gaussians import Gaussians
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters, thin_labels
 from gaigs.kriging.kernel import LIMIT
-from gaigs.kriging.links import PART, coordinates, thinned
+from gaigs.kriging.links import PART, coordinates, folds_of, thinned
 from gaigs.kriging.paths import Equations, PathField, candidates
+from gaigs.kriging.scalar import ScalarProcess, is_scalar
 from gaigs.model import Model, Prediction, call_optional
 from gaigs.placement.learnt_room import LearntRoom
 from gaigs.query import Batch
@@ -42,6 +44,8 @@ class Kriging(Model):
     Trend weight, length and nugget maximise the likelihood of the validation links given the training links around
     them. The weight is the one with which the validation links, predicted from the training links, score best: the
     likelihood alone would trust kriging too far where cubes of space are held out.
+
+    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` as z, with hyperparameters of each receiver.
 
     Of a trend whose paths have ``margins``, strengths are kriged path by path, and phases stay those of the geometry.
 
@@ -77,7 +81,11 @@ class Kriging(Model):
         self.register_buffer("weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("hyperparameters", torch.full((3,), math.nan, dtype=torch.float64))
         self.by_paths = getattr(self.trend, "has_margins", False)
-        self.fields = nn.ModuleList(PathField() if self.by_paths else Field(scene) for _ in scene.receivers)
+        self.is_scalar = is_scalar(scene)
+        if self.is_scalar:
+            self.process = ScalarProcess(scene)
+        else:
+            self.fields = nn.ModuleList(PathField() if self.by_paths else Field(scene) for _ in scene.receivers)
 
     def fit(self, links: Links) -> None:
         """Kriges the residuals of the trend, which must be trained."""
@@ -98,6 +106,8 @@ class Kriging(Model):
         validation_model = Kriging(self.scene, self.trend, self.fallback_options)
         validation_model.trend_weight.copy_(self.trend_weight)
         validation_model.hyperparameters.copy_(self.hyperparameters)
+        if self.is_scalar:
+            validation_model.process.load_state_dict(self.process.state_dict())
         validation_model.fallback.fit(training)
         validation_model._solve(training, values[: len(split.train)])
         validation_model.to(self.weight.device)
@@ -206,6 +216,20 @@ class Kriging(Model):
                 mean = blend(links.task, values[part], fallback, trend_weight)
                 parts.append(thin_labels(links.task.align(labels, mean) - mean))
 
+        if self.is_scalar:
+            query = links.query[index]
+            left = [torch.cat(residuals[trend_weight]).flatten().double() for trend_weight in WEIGHTS]
+            fit = partial(self.process.cpu().fit, coordinates(self.scene, query, 1.0), query.receivers)
+            every = folds_of(links, index), torch.arange(len(index))
+            # Training links' own residuals are too small, as the trend was trained on them: validation links decide.
+            is_held = every[1] >= len(links.split.train)
+            enough = is_held.sum() >= FEWEST
+            best = WEIGHTS[fit(left, *((is_held.long(), every[1][is_held]) if enough else every))]
+            if enough and best == 0:
+                fit(left[-1:], *every)
+            self.trend_weight.fill_(best)
+            return
+
         def fitted(trend_weight: float, **options: int) -> tuple[Hyperparameters, float]:
             left = torch.cat(residuals[trend_weight])
             if left.is_complex():
@@ -222,18 +246,27 @@ class Kriging(Model):
     def _solve(self, links: Links, values: Tensor) -> None:
         """Kriges the residuals of the known links."""
         index, trend_weight = known(links), self.trend_weight.item()
-        receivers = links.query.receivers[index]
-        for receiver, field in enumerate(self.fields):
-            rows = (receivers == receiver).nonzero()[:, 0]
-            residuals = torch.empty(len(rows), *self.scene.task.shape, dtype=self.scene.task.dtype)
+        query, labels = links.query[index], links.labels[index]
+
+        def residuals(rows: Int[Tensor, " k"]) -> Tensor:
+            left = torch.empty(len(rows), *self.scene.task.shape, dtype=self.scene.task.dtype)
             for part in torch.arange(len(rows)).split(PART):
-                some = index[rows[part]]
-                mean = blend(links.task, values[rows[part]], predicted(self.fallback, links, some), trend_weight)
-                residuals[part] = links.task.align(links.labels[some], mean) - mean
-            if residuals.is_complex():
-                residuals = residuals * damping(residuals, links.labels[index[rows]], receivers[rows])[:, None, None]
-            process = Hyperparameters(*self.hyperparameters.tolist())
-            field.solve(coordinates(self.scene, links.query[index[rows]], process.scale), residuals, process)
+                some = rows[part]
+                mean = blend(links.task, values[some], predicted(self.fallback, links, index[some]), trend_weight)
+                left[part] = links.task.align(labels[some], mean) - mean
+            if left.is_complex():
+                left = left * damping(left, labels[rows], query.receivers[rows])[:, None, None]
+            return left
+
+        if self.is_scalar:
+            left = residuals(torch.arange(len(index))).double()
+            self.process.cpu().solve(coordinates(self.scene, query, 1.0), query.receivers, left)
+            self.process.to(self.weight.device)
+            return
+        process = Hyperparameters(*self.hyperparameters.tolist())
+        for receiver, field in enumerate(self.fields):
+            rows = (query.receivers == receiver).nonzero()[:, 0]
+            field.solve(coordinates(self.scene, query[rows], process.scale), residuals(rows), process)
 
     def forward(self, batch: Batch) -> Prediction:
         query, trend_weight, weight = batch.query, self.trend_weight.item(), self.weight.item()
@@ -244,6 +277,9 @@ class Kriging(Model):
             return Prediction(trend, {})
         task, fallback = self.scene.task, self.fallback(batch).value if trend_weight < 1 else None
         value = blend(task, trend, fallback, trend_weight)
+        if self.is_scalar:
+            levels = self.process(coordinates(self.scene, query, 1.0), query.receivers).to(value)
+            return Prediction(blend(task, value + levels, trend, weight), {})
         places = query.transmitters if self.by_paths else coordinates(self.scene, query, scale)
         for receiver in query.receivers.unique().tolist() if trend_weight or not self.by_paths else ():
             own = query.receivers == receiver
@@ -274,6 +310,9 @@ class Kriging(Model):
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
         facts: dict[str, Any] = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
+        if self.is_scalar:
+            facts |= {**self.process.facts(), "links": len(self.process.places)}
+            return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
         facts |= Hyperparameters(*self.hyperparameters.tolist()).facts()
         places = [len(field.places) for field in self.fields]
         facts["links"] = sum(places)

@@ -1,6 +1,7 @@
 """The Gaussian process against numpy, and against draws of processes with known hyperparameters.
 
-tests/model/test_baselines_by_hand.py checks its predictions and the likelihood of its hyperparameters.
+tests/model/test_baselines_by_hand.py checks its predictions and the likelihood of its hyperparameters, and
+test_scalar_process.py the process of labels of one number.
 """
 
 from dataclasses import replace
@@ -21,7 +22,7 @@ from gaigs.registry import registry
 from gaigs.task.csi import Csi
 from gaigs.testing import example_links
 
-TASKS = pytest.mark.parametrize("task", ["spectrum", "rssi", "csi", "one channel"])
+TASKS = pytest.mark.parametrize("task", ["spectrum", "csi", "one channel"])
 BOX = torch.tensor([6.0, 4.0, 2.0])
 
 
@@ -133,27 +134,6 @@ def test_places_measured_twice_do_not_break_the_matrices(task):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
     copies = links.labels[:40].unflatten(0, (10, 4))[:, :2].mean(0)
     torch.testing.assert_close(found, copies, rtol=0, atol=1e-3)
-
-
-def test_distances_count_place_and_log_frequency():
-    links = make("rssi", 120, carriers=(1e9, 1.7e9, 2.9e9))
-    links.labels.add_(3 * links.query.frequencies.log() + links.query.transmitters[:, 0])
-    model = fitted(links)
-    length, nugget, scale = model.process
-    assert model.facts() == {"length_m": length, "nugget": nugget, "frequency_scale_m": scale}
-    stretched = lambda query: torch.cat(
-        (query.transmitters.double(), scale * query.frequencies.double().log()[:, None]), 1
-    )
-    index = model.known[0]
-    asked = Query(torch.rand(4, 3), torch.zeros(4, dtype=torch.long), torch.tensor([1e9, 1.3e9, 2e9, 5e9]))
-    places, towards = stretched(links.query[index]), stretched(asked)
-    labels = links.labels[index].double().numpy()
-    covariances = np.exp(-cdist(places, places) / length) + nugget * np.eye(len(index))
-    weights = np.exp(-cdist(towards, places) / length) @ np.linalg.inv(covariances)
-    expected = labels.mean() + weights @ (labels - labels.mean())
-    np.testing.assert_allclose(model.predict(asked), expected, rtol=0, atol=1e-3)
-    with pytest.raises(ValueError, match="3 carriers"):
-        model.predict(Query(torch.zeros(2, 3), torch.zeros(2, dtype=torch.long)))
 
 
 # --- hyperparameters ---

@@ -9,7 +9,7 @@ import torch
 import gaigs
 from gaigs import checkpoint, runs
 from gaigs.data import load
-from gaigs.kriging import fit
+from gaigs.kriging import fit, scalar
 from gaigs.runs import evaluation
 from gaigs.training.descent import Descent
 
@@ -27,6 +27,7 @@ def quick():
         patch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
         patch.setattr(evaluation, "median_ms", lambda *_: 1.0)
         patch.setattr(fit, "AROUND", 8)
+        patch.setattr(scalar, "NEAREST", 8)
         yield
 
 
@@ -49,7 +50,8 @@ def test_trend_and_kriging_are_reported(finished):
     assert metrics["validation_score"] == metrics["validation"]["gaigs"]["mae_db"]
     assert [*metrics["receivers"]["west"]] == ["gaigs", "gaigs_trend", "mean"]
     facts, links = metrics["kriging"], load(config["data"], config["split"])
-    assert list(facts) == ["weight", "trend_weight", "length_m", "nugget", "links", "components", "seconds"]
+    choices = ["length_m", "nugget", "smoothness", "degrees_of_freedom"]
+    assert list(facts) == ["weight", "trend_weight", *choices, "links", "seconds"]
     assert facts["links"] == len(links.split.train) + len(links.split.validation)
     assert facts["seconds"] > 0
     # The validation scores are of the validation model: the kriged one knows these links.

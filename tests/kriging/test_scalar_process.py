@@ -1,0 +1,212 @@
+"""The process of labels of one number against numpy and scipy, and against draws of processes that are known."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from scipy.integrate import quad
+from scipy.spatial.distance import cdist
+
+from gaigs.data import Split
+from gaigs.kriging import scalar
+from gaigs.kriging.links import coordinates, folds_of
+from gaigs.kriging.scalar import Choice, ScalarProcess, conditional, covariances, log_density
+from gaigs.model.gaussian_process import GaussianProcess
+from gaigs.query import Query
+from gaigs.testing import example_links
+
+BOX = torch.tensor([6.0, 4.0, 2.0])
+MATERN = {0.5: lambda x: np.exp(-x), 1.5: lambda x: (1 + math.sqrt(3) * x) * np.exp(-math.sqrt(3) * x)}
+
+
+@pytest.fixture(autouse=True)
+def few_neighbours(monkeypatch):
+    monkeypatch.setattr(scalar, "NEAREST", 16)
+
+
+def drawn(
+    lengths=(1.0, 1.0), smoothness=0.5, signal=4.0, noise=1.0, degrees=math.inf, count=300, height=2.0, carriers=()
+):
+    """Levels of ``count`` places at each of two receivers; three tenths test."""
+    links, rng = example_links("rssi"), np.random.default_rng(0)
+    places = torch.from_numpy(rng.uniform(size=(count, 3)) * (6, 4, height)).float()
+    apart, labels = cdist(places, places), []
+    for length in lengths:
+        factor = np.linalg.cholesky(MATERN[smoothness](apart / length) + 1e-9 * np.eye(count))
+        scatter = rng.standard_normal(count) if math.isinf(degrees) else rng.standard_t(degrees, count)
+        labels.append(-60 + signal * factor @ rng.standard_normal(count) + noise * scatter)
+    frequencies = torch.tensor(carriers)[torch.arange(2 * count) % len(carriers)] if carriers else None
+    query = Query(places.repeat(2, 1), torch.arange(2).repeat_interleave(count), frequencies)
+    parts = [part.repeat(2) for part in torch.arange(count).split((7 * count // 10, 0, count - 7 * count // 10))]
+    parts = [torch.cat((part[: len(part) // 2], part[len(part) // 2 :] + count)) for part in parts]
+    values = torch.from_numpy(np.concatenate(labels)).float()
+    return replace(links, query=query, labels=values, rows=None, split=Split("drawn", *parts))
+
+
+def fitted(links, **options):
+    model = GaussianProcess(links.scene, **options)
+    model.fit(links)
+    return model
+
+
+def known(links):
+    index = links.split.train
+    query = links.query[index]
+    return coordinates(links.scene, query, 1.0), query.receivers, links.labels[index].double()
+
+
+@pytest.mark.parametrize("degrees", [math.inf, 4.0])
+@pytest.mark.parametrize(("variance", "noise"), [(4.0, 0.5), (0.2, 3.0), (1.0, 1.0)])
+def test_the_density_is_that_of_a_normal_variable_plus_noise(degrees, variance, noise):
+    errors = np.array([0.0, 0.7, 5.0, 12.0 if math.isinf(degrees) else 40.0])
+    scatter = stats.norm if math.isinf(degrees) else stats.t(degrees)
+    both = lambda u, e: stats.norm.pdf(u) * scatter.pdf((e - u * variance**0.5) / noise) / noise
+    expected = [np.log(quad(both, -20, 20, args=(e,), points=[0, e / variance**0.5], limit=400)[0]) for e in errors]
+    size = torch.ones(4, dtype=torch.float64)
+    found = log_density(torch.from_numpy(errors), variance * size, noise**2 * size, degrees)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("smoothness", [0.5, 1.5])
+@pytest.mark.parametrize("carriers", [(), (1e9, 1.7e9, 2.9e9)])
+def test_means_and_deviations_are_the_formula(smoothness, carriers):
+    links = drawn(count=60, carriers=carriers)
+    places, receivers, values = known(links)
+    process = ScalarProcess(links.scene)
+    process.logarithms.copy_(torch.tensor([[1.5, 4.0, 1.0], [0.7, 3.0, 2.0]]).log())
+    process.choice.copy_(torch.tensor(Choice(smoothness, 4.0, 3.0 if carriers else math.nan)))
+    process.solve(places, receivers, values)
+    query = replace(links.query[links.split.test], receivers=torch.ones(36, dtype=torch.long))
+    asked, own = coordinates(links.scene, query, 1.0), receivers == 1
+    stretch = lambda points: np.hstack((points[:, :3], 3.0 * points[:, 3:]))
+    kernel = lambda a, b: 9 * MATERN[smoothness](cdist(stretch(a.numpy()), stretch(b.numpy())) / 0.7)
+    noises = process.variances[own].numpy()
+    solve = np.linalg.inv(kernel(places[own], places[own]) + np.diag(noises))
+    towards = kernel(asked, places[own])
+    np.testing.assert_allclose(process(asked, query.receivers), towards @ solve @ values[own].numpy(), atol=1e-8)
+    # Student's t of four degrees of freedom has twice its squared scale as variance.
+    expected = np.sqrt(9 - np.einsum("ij,jk,ik->i", towards, solve, towards) + 2 * 4)
+    np.testing.assert_allclose(process.deviations(asked, query.receivers), expected, rtol=0.03)  # of 42 readings 16
+    fresh = ScalarProcess(links.scene)
+    fresh.load_state_dict(process.state_dict())
+    assert torch.equal(fresh(asked, query.receivers), process(asked, query.receivers))
+    assert torch.equal(fresh.deviations(asked, query.receivers), process.deviations(asked, query.receivers))
+
+
+def test_the_gradient_is_finite_where_places_coincide():
+    links = drawn(count=40, carriers=(1e9, 2e9))
+    links.query.transmitters[1::2] = links.query.transmitters[::2]
+    process = ScalarProcess(links.scene)
+    process.places, process.receivers, values = known(links)
+    rows = torch.arange(10)
+    nearest = process._nearest(process.places[rows], process.receivers[rows], rows, torch.arange(len(values)))
+    around = process._around(process.places[rows], process.receivers[rows], nearest)
+    logarithms = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
+    scale = torch.ones((), dtype=torch.float64, requires_grad=True)
+    between = covariances(around, logarithms.exp(), Choice(0.5, math.inf, scale))
+    parts = conditional(between, values[around.rows], torch.ones_like(around.found, dtype=torch.float64))
+    sum(part.sum() for part in parts).backward()
+    assert logarithms.grad.isfinite().all()
+    assert scale.grad.isfinite()
+
+
+def test_readings_of_the_own_fold_do_not_predict():
+    links = drawn(count=60)
+    links.query.transmitters[20:40] = links.query.transmitters[:20]
+    process = ScalarProcess(links.scene)
+    process.places, process.receivers, _ = known(links)
+    folds = folds_of(links, links.split.train)
+    rows, found = process._nearest(process.places, process.receivers, folds, folds)
+    assert found.any(1).all()
+    assert (folds[rows] != folds[:, None])[found].all()
+    same = (process.places[rows] == process.places[:, None]).all(-1)
+    assert not (same & found).any(), "readings at one place are one fold"
+
+
+# --- choices ---
+
+
+@pytest.mark.parametrize("smoothness", [0.5, 1.5])
+@pytest.mark.parametrize("degrees", [math.inf, 3.0])
+def test_kernel_tails_and_hyperparameters_are_those_of_the_draw(smoothness, degrees):
+    length = 2.0 if smoothness == 0.5 else 0.7
+    links = drawn((length, length), smoothness, 5.0, 0.7, degrees, 600, 0.0)
+    model = fitted(links, trend={"name": "mean"})
+    facts = model.facts()
+    assert facts["smoothness"] == smoothness
+    assert facts["degrees_of_freedom"] == (0 if math.isinf(degrees) else 4)
+    length, signal, noise = model.scalar[0].logarithms.exp().unbind(1)
+    # Within a box of few lengths, length and variance are hardly known apart, but well as this power of both.
+    slope = lambda length, signal: signal**2 / length ** (2 * smoothness)
+    np.testing.assert_allclose(slope(length, signal), slope(2.0 if smoothness == 0.5 else 0.7, 5.0), rtol=0.6)
+    np.testing.assert_allclose(noise, 0.7, rtol=0.6)
+
+
+def test_each_receiver_has_a_length_of_its_own():
+    process = fitted(drawn((0.7, 4.0), noise=0.3, count=500), trend={"name": "mean"}).scalar[0]
+    short, long = process.logarithms[:, 0].exp()
+    assert long > 1.5 * short
+
+
+@pytest.mark.parametrize("law", [False, True])
+def test_the_trend_is_that_of_the_labels(law):
+    links = drawn(signal=2.0)
+    if law:
+        apart = (links.query.transmitters - links.scene.positions(links.labels)[links.query.receivers]).norm(dim=1)
+        links.labels.add_(-40 * apart.clamp_min(0.1).log10())
+    assert fitted(links).facts()["trend"] == ("path_loss" if law else "mean")
+
+
+def test_a_few_readings_that_are_far_out_hardly_count():
+    links = drawn((2.0, 2.0), 1.5, 4.0, 0.5)
+    spoilt = replace(links, labels=links.labels.clone())
+    rows = links.split.train[::15]
+    spoilt.labels[rows] += 40.0
+    query, labels = links.query[links.split.test], links.labels[links.split.test]
+    plain, robust = fitted(links), fitted(spoilt)
+    assert robust.facts()["degrees_of_freedom"] == 4
+    errors = [(model.predict(query) - labels).abs().mean() for model in (plain, robust)]
+    assert errors[1] < 1.3 * errors[0]
+    factors = robust.scalar[0].variances / (2 * robust.scalar[0].logarithms[robust.scalar[0].receivers, 2]).exp()
+    is_spoilt = torch.isin(torch.cat(robust.known), rows)
+    assert factors[is_spoilt].min() > 10 * factors[~is_spoilt].median()
+
+
+def test_intervals_of_the_process_hold_their_share():
+    links = drawn((1.0, 2.0), 0.5, 5.0, 1.0, 4.0, 800)
+    model, test = fitted(links), links.split.test
+    query = links.query[test]
+    deviations = model.scalar[0].deviations(coordinates(links.scene, query, 1.0), query.receivers)
+    within = ((model.predict(query) - links.labels[test]).abs() <= 1.645 * deviations).double().mean()
+    assert within == pytest.approx(0.9, abs=0.04)
+
+
+# --- hard cases ---
+
+
+@pytest.mark.parametrize("level", [0.0, -60.0])
+def test_labels_that_the_trend_explains_are_predicted_by_it(level):
+    links = drawn()
+    links.labels.fill_(level)
+    torch.testing.assert_close(fitted(links).predict(BOX * torch.rand(4, 3)), torch.full((4,), level))
+
+
+def test_places_measured_often_are_predicted_by_the_mean_of_their_readings():
+    links = drawn(noise=0.01)
+    links.query.transmitters[:200] = links.query.transmitters[:4].repeat(50, 1)
+    links.labels[:200] = links.labels[:4].repeat(50) + 0.5 * torch.randn(
+        200, generator=torch.Generator().manual_seed(0)
+    )
+    found = fitted(links).predict(links.query.transmitters[:4], 0)
+    torch.testing.assert_close(found, links.labels[:200].reshape(50, 4).mean(0), rtol=0, atol=0.3)
+
+
+def test_a_receiver_with_hardly_a_reading_is_predicted():
+    links = drawn(count=40)
+    few = torch.cat((torch.arange(28), torch.tensor([40])))
+    links = replace(links, split=replace(links.split, train=few))
+    found = fitted(links).predict(links.query.transmitters[:3], 1)
+    torch.testing.assert_close(found, links.labels[40].expand(3), rtol=0, atol=1e-3)
