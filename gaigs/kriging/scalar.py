@@ -178,8 +178,8 @@ class ScalarProcess(nn.Module):
         tried = [(*self._maximise(values, *few, Choice()), index) for index, values in enumerate(candidates)]
         best = min(tried, key=lambda found: found[0])
         values = candidates[best[-1]]
-        for smoothness, degrees in ((1.5, math.inf), (None, DEGREES)):
-            choice = best[2]._replace(smoothness=smoothness or best[2].smoothness, degrees=degrees)
+        for smoothness, degrees in ((1.5, math.inf), (0.5, DEGREES), (1.5, DEGREES)):
+            choice = best[2]._replace(smoothness=smoothness, degrees=degrees)
             best = min(best, (*self._maximise(values, *few, choice, best[1]), best[-1]), key=lambda found: found[0])
         _, logarithms, choice, index = best
         _, self.logarithms, choice = self._maximise(values, *around(most), choice, logarithms, has_deviations=True)
