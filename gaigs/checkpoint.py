@@ -78,7 +78,7 @@ def save(model: nn.Module, path: str | Path) -> None:
     state = model.state_dict()
     if not state:
         raise ValueError(f"model {name_of(model)!r} is a look-up without a state; keep its links, and fit it again")
-    part = {"version": VERSION, "model": configuration_of(model), "scene": model.scene.state()}
+    part = {"version": VERSION, "scene": model.scene.state(), **described(model)}
     write({KEY: part, "state_dict": {f"model.{key}": value.cpu() for key, value in state.items()}}, Path(path))
 
 
@@ -112,6 +112,7 @@ def load(path: str | Path) -> nn.Module:
         unset = {name for name, value in model.state_dict().items() if not value.isfinite().all()}
         model.load_state_dict(weights)
         _check_finite("weights", {name: value for name, value in weights.items() if name not in unset})
+        model.calibrate(content[KEY].get("calibration"))
     except Exception as error:  # any error of a constructor with damaged options
         if lacks_memory(error):
             raise
@@ -130,11 +131,24 @@ def trained_weights(content: dict) -> dict:
     return {f"model.{key.removeprefix(part)}": value for key, value in weights.items() if key.startswith(part)}
 
 
+def described(model: nn.Module) -> dict:
+    """A model's configuration and, if it has one, its calibration."""
+    calibration = model.calibration
+    return {"model": configuration_of(model), "calibration": None if calibration is None else calibration.state()}
+
+
 def exchange_model(path: Path, model: nn.Module, trained: str) -> None:
     """Replaces the model of a checkpoint by one of the same scene, whose part ``trained`` is the trained model."""
     content = read(path)
-    content[KEY] |= {"version": VERSION, "model": configuration_of(model), "trained": trained}
+    content[KEY] |= {"version": VERSION, "trained": trained, **described(model)}
     content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
+    write(content, path)
+
+
+def add_calibration(path: Path, model: nn.Module) -> None:
+    """Adds the calibration of a checkpoint's model."""
+    content = read(path)
+    content[KEY] |= described(model)
     write(content, path)
 
 

@@ -47,6 +47,10 @@ class Split:
         """The split whose test are the validation links, for models that have not seen them."""
         return replace(self, validation=self.validation[:0], test=self.validation)
 
+    def choosing(self, validation: Int[Tensor, " v"]) -> "Split":
+        """The split with other validation links, such as some of its own."""
+        return replace(self, validation=validation)
+
 
 @dataclass(frozen=True, repr=False)
 class Links:

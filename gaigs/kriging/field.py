@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Inexact
 from torch import Tensor, nn
 
-from gaigs.kriging.fit import Hyperparameters
+from gaigs.kriging.fit import Hyperparameters, local_deviations
 from gaigs.kriging.kernel import cholesky_factor, kernel
 from gaigs.kriging.links import at_directions
 from gaigs.query import Batch
@@ -30,6 +30,7 @@ class Field(nn.Module):
         super().__init__()
         task = scene.task
         self.scene = scene
+        self.signal: Tensor | None = None
         parts = (2,) if task.dtype.is_complex else ()
         self.register_buffer("places", torch.zeros(0, 3 + scene.has_band, dtype=torch.float64))
         self.register_buffer("weights", torch.zeros(0, 0, dtype=task.dtype))
@@ -54,13 +55,24 @@ class Field(nn.Module):
         scores = torch.linalg.solve(gram, cross, left=False)
         factor = cholesky_factor(places, process.length, process.nugget)
         self.weights = like_loaded(self.weights, torch.cholesky_solve(scores, factor.to(wide)))
-        self.places = like_loaded(self.places, places)
+        self.places, self.signal = like_loaded(self.places, places), None
 
     def forward(self, places: Float[Tensor, "b d"], length: Tensor, batch: Batch) -> Tensor:
         """Kriged residuals (b, *shape) at some places, in the directions of a batch."""
         covariances = kernel(places, self.places, length)
         components = at_directions(self.widened, batch, self.scene)
         return torch.tensordot(covariances.to(self.weights) @ self.weights, components, 1)
+
+    def deviations(self, places: Float[Tensor, "b d"], process: Hyperparameters) -> Float[Tensor, " b"]:
+        """Standard deviations of noisy labels at some places, means over a label's numbers."""
+        if self.signal is None:  # the most likely standard deviation of the process
+            covariances = kernel(self.places, self.places, process.length)
+            covariances.diagonal().add_(process.nugget)
+            kept = self.widened.reshape(len(self.components), -1)
+            products = self.weights.mH @ covariances.to(self.weights) @ self.weights
+            squares = (products.mT * (kept @ kept.mH).to(products)).sum().real / (len(self.places) * kept.shape[1])
+            self.signal = squares.clamp_min(0).sqrt()
+        return self.signal * local_deviations(places, self.places, process)
 
     def _widen(self) -> None:
         components = self.components.float()
@@ -71,6 +83,7 @@ class Field(nn.Module):
             if f"{prefix}{name}" in state_dict:  # of any k and q
                 setattr(self, name, getattr(self, name).new_empty(state_dict[f"{prefix}{name}"].shape))
         super()._load_from_state_dict(state_dict, prefix, *args)
+        self.signal = None
         self._widen()
 
 
@@ -85,7 +98,12 @@ EXACT = 512
 def principal_components(residuals: Inexact[Tensor, "k m"]) -> Inexact[Tensor, "q m"]:
     """The fewest principal components that leave out at most ``LEFT`` of the energy, each scaled to a maximum of 1."""
     if min(residuals.shape) <= EXACT:
-        _, values, components = torch.linalg.svd(residuals, full_matrices=False)
+        # By the smaller matrix of products: a decomposition of the residuals themselves takes ten times as long.
+        wide = residuals.to(torch.promote_types(residuals.dtype, torch.float64))
+        is_flat = len(wide) <= wide.shape[1]
+        squares, vectors = torch.linalg.eigh(wide @ wide.mH if is_flat else wide.mH @ wide)
+        values, vectors = squares.flip(0).clamp_min(0).sqrt().to(residuals.abs().dtype), vectors.flip(1).mH
+        components = (vectors @ wide if is_flat else vectors).to(residuals)
     else:
         with torch.random.fork_rng(devices=[]):  # a resumed run must continue as an uninterrupted one
             torch.manual_seed(0)

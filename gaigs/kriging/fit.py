@@ -168,3 +168,15 @@ def negative_log_likelihood(
     # The difference of nearly equal numbers, rounded to float64's sixteen digits, may be negative.
     errors = errors.clamp_min(1e-12 * own.mean())
     return len(asked) * (errors / variances).mean().log() + variances.log().sum()
+
+
+def local_deviations(
+    asked: Float[Tensor, "b d"], known: Float[Tensor, "k d"], process: Hyperparameters
+) -> Float[Tensor, " b"]:
+    """Standard deviations of noisy labels over the signal's, given the nearest known places; see ``coordinates``."""
+    count = min(AROUND, len(known))
+    found = [asked.new_zeros(0)]
+    for part in asked.split(1024):
+        near = known[distances(part, known).topk(count, largest=False).indices]
+        found.append(kriging_weights(part, near, process.length, process.nugget)[1])
+    return torch.cat(found).sqrt()

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, overload
 
 import torch
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from gaigs import checkpoint
 from gaigs.data import Links
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Directions, ExtrapolationWarning
+from gaigs.kriging.intervals import Calibration, Estimate
 from gaigs.query import ROUNDING, Batch, Query, as_directions, as_subcarriers
 from gaigs.registry import check_type, registry
 from gaigs.scene import Scene
@@ -51,6 +52,7 @@ class Model(nn.Module):
         revisions: Fractions of the training after which ``OptionalMethods.revise`` is called.
         any_frequency: True if channels are a function of frequency, read from ``scene.task.frequencies``.
         configuration: Options that a registered model was made with; ``save`` stores them.
+        calibration: What intervals are made of; None if no validation links have measured the model's errors.
 
     Example:
         >>> class Nearest(gaigs.Model):
@@ -78,6 +80,7 @@ class Model(nn.Module):
     predicts_untrained: bool = False
     any_frequency: bool = False
     primitives: Gaussians | None = None
+    calibration: Calibration | None = None
 
     def __init__(self, scene: Scene):
         super().__init__()
@@ -109,6 +112,10 @@ class Model(nn.Module):
         """
         checkpoint.save(self, path)
 
+    def calibrate(self, state: Mapping[str, Tensor] | None) -> None:
+        """Takes the state of a calibration from a checkpoint; None if it has none."""
+        self.calibration = None if state is None else Calibration(**state)
+
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
         """Values (b, *shape) of a batch in all its directions, ``chunk`` pairs of a link and a direction at a time."""
@@ -124,7 +131,11 @@ class Model(nn.Module):
             values.append(value.unflatten(1, batch.directions.shape))
         return torch.cat(values)
 
-    def predict(
+    @overload
+    def predict(self, transmitters: object, *options: Any, interval: None = None, **named: Any) -> Tensor: ...
+    @overload
+    def predict(self, transmitters: object, *options: Any, interval: float, **named: Any) -> Estimate: ...
+    def predict(  # type: ignore[misc]
         self,
         transmitters: object,
         receiver: object = 0,
@@ -132,7 +143,8 @@ class Model(nn.Module):
         batch_size: int = 16,
         directions: Directions | None = None,
         frequencies: object = None,
-    ) -> Tensor:
+        interval: float | None = None,
+    ) -> Tensor | Estimate:
         """Values for transmitters anywhere: a query, or a point, a list of points, or a grid.
 
         Args:
@@ -144,10 +156,12 @@ class Model(nn.Module):
             directions: Directions to predict; None: the label's own, if it has directions.
             frequencies: Subcarriers of channels to predict (s,) [Hz], also ones that no label had; None: the label's
                 own. A model without ``any_frequency``, such as ``knn``, gives the values of its nearest subcarriers.
+            interval: Probability with which an interval holds the label, between 0 and 1, e.g. 0.9; None: values alone.
 
         Returns:
             A value of the task's shape for each position, scaled as the training labels
-            (``model.scene.task.normalisation``); on the model's device.
+            (``model.scene.task.normalisation``); on the model's device. With an interval an ``Estimate``: the value,
+            its standard deviation, and the interval's ends.
 
         Warns:
             ExtrapolationWarning: A position is farther from the training transmitters' box than the diagonal of this
@@ -156,7 +170,7 @@ class Model(nn.Module):
 
         Raises:
             ValueError: The batch size is less than 1, or a position, receiver, frequency or direction is impossible; or
-                the labels have no subcarriers.
+                the labels have no subcarriers; or the model had too few validation links for the interval.
 
         Example:
             >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
@@ -168,10 +182,26 @@ class Model(nn.Module):
             >>> channels = gaigs.train("friis", gaigs.links("synthetic_csi", transmitters=20, order=0))
             >>> channels.predict([1.0, 2.0, 1.5], frequencies=[5.0e9, 5.1e9]).shape
             torch.Size([16, 2])
+            >>> levels = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=100))
+            >>> low, high = levels.predict([1.0, 2.0, 1.5], interval=0.9)[2:4]  # [dBm]
+            >>> bool(low < high)
+            True
         """
-        parts, shape = self._values(transmitters, receiver, frequency, batch_size, directions, frequencies)
-        values = torch.cat([*parts])
-        return values.reshape(shape + values.shape[1:])
+        arguments = transmitters, receiver, frequency, batch_size, directions, frequencies
+        if interval is None:
+            parts, shape = self._values(*arguments)
+            values = torch.cat([*parts])
+            return values.reshape(shape + values.shape[1:])
+        if not isinstance(interval, float) or not 0 < interval < 1:
+            raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
+        if self.calibration is None:
+            raise ValueError(
+                "the model has no intervals: no validation links have measured its errors\n"
+                "train it by gaigs.train or a run, on links with split.validation above 0"
+            )
+        estimates, shape = self._values(*arguments, interval)
+        parts = (None if part[0] is None else torch.cat(part) for part in zip(*estimates, strict=True))
+        return Estimate(*(None if part is None else part.reshape(shape + part.shape[1:]) for part in parts))
 
     def predict_batches(
         self,
@@ -200,9 +230,10 @@ class Model(nn.Module):
         return other
 
     def _values(
-        self, transmitters, receiver, frequency, batch_size, directions, frequencies
-    ) -> tuple[Iterator[Tensor], tuple[int, ...]]:
-        """Values for the checked arguments of ``predict``, a batch at a time; and the positions' leading axes."""
+        self, transmitters, receiver, frequency, batch_size, directions, frequencies, interval=None
+    ) -> tuple[Iterator, tuple[int, ...]]:
+        """Values, or estimates of an interval, for the checked arguments of ``predict``, a batch at a time; and the
+        positions' leading axes."""
         check_type("batch_size", batch_size, int)
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
@@ -227,6 +258,10 @@ class Model(nn.Module):
         device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
         query, directions = query.to(device), None if directions is None else directions.to(device)
         batches = (Batch(part, directions) for part in query.parts(batch_size))
+        if interval is not None:
+            if model is not self or chosen is not None:
+                raise ValueError("intervals are those of the labels' own subcarriers; leave frequencies out")
+            return (self._estimate(batch, interval) for batch in batches), shape
         values = map(model._answer, batches)
         return values if chosen is None else (part[..., chosen] for part in values), shape
 
@@ -239,6 +274,22 @@ class Model(nn.Module):
             return self.evaluate(batch)
         finally:
             self.train(training)
+
+    def _estimate(self, batch: Batch, interval: float) -> Estimate:
+        value = self._answer(batch)
+        assert self.calibration is not None
+        return self.calibration.estimate(value, self.spread(batch, value), batch.query, interval)
+
+    @torch.no_grad()
+    def spread(self, batch: Batch, value: Tensor) -> Tensor:
+        """Standard deviation of the labels as the model knows it, (b,) or of each number; a calibration scales it.
+
+        By default 1, of channels the root mean square of each link's value.
+        """
+        found = call_optional(self, "deviations", batch)
+        if found is None and value.is_complex():
+            found = value.abs().square().flatten(1).mean(1).sqrt()
+        return torch.ones(len(value), device=value.device) if found is None else found
 
 
 class OptionalMethods(Protocol):
@@ -255,6 +306,9 @@ class OptionalMethods(Protocol):
 
     def export(self, folder: Path) -> None:
         """Writes files for other programs into a run's folder."""
+
+    def deviations(self, batch: Batch) -> Tensor:
+        """Standard deviations of the labels (b,), or of each of their numbers (b, *shape), but for a common factor."""
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
         """Changes the model between two training steps, such as by a search, and gives a sentence for the log.

@@ -8,9 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, thin_labels
+from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations, thin_labels
 from gaigs.kriging.kernel import LIMIT, cholesky_factor, kernel, kriging_weights
-from gaigs.kriging.links import PART, at_directions, coordinates, distances, folds_of, known_links, thinned
+from gaigs.kriging.links import PART, at_directions, coordinates, distances, evenly, folds_of, known_links, thinned
 from gaigs.kriging.scalar import ScalarProcess, is_scalar
 from gaigs.model import Model, Prediction, build_trend
 from gaigs.query import Batch, Query
@@ -82,7 +82,16 @@ class GaussianProcess(Model):
             self.factors = torch.ones(len(links)).index_copy(0, index, factors)
         residuals = lambda index: torch.cat([thin_labels(part) for part in self._residuals(index)])
         self.process, _ = fit_hyperparameters(self.scene, links, residuals)
-        self.solved = [self._solve(index) for index in self.known]
+        self.solved, self.signals = [], []
+        for index in self.known:
+            factor = self._factor(index)
+            self.solved.append(self._solve(index, factor))
+            left = residuals(evenly(index, LIMIT) if factor is None else index)
+            # Without a factor, the mean square instead of the most likely variance.
+            wide = left.to(torch.promote_types(left.dtype, torch.float64))
+            root = (1 + self.process.nugget) ** 0.5
+            white = wide / root if factor is None else torch.linalg.solve_triangular(factor.to(wide), wide, upper=False)
+            self.signals.append(white.abs().square().mean().sqrt().item())
 
     def _fit_scalar(self, links: Links) -> None:
         index = torch.cat(known_links(links))
@@ -121,18 +130,29 @@ class GaussianProcess(Model):
             added[own] = self._kriged(query[own], receiver)
         return Prediction(at_directions(trend + added, batch, self.scene), {})
 
+    def deviations(self, batch: Batch) -> Tensor:
+        """Standard deviations of the labels, means over a label's numbers."""
+        query = batch.query
+        if self.scalar:
+            return self.scalar[0].deviations(coordinates(self.scene, query, 1.0), query.receivers)
+        found = torch.zeros(len(query), dtype=torch.float64)
+        for receiver in query.receivers.unique().tolist():
+            own, known = query.receivers == receiver, self._places(self.links.query[self.known[receiver]])
+            found[own] = self.signals[receiver] * local_deviations(self._places(query[own]), known, self.process)
+        return found
+
     def _places(self, query: Query) -> Tensor:
         return coordinates(self.scene, query, self.process.scale)
 
-    def _solve(self, index: Int[Tensor, " k"]) -> tuple[Tensor | None, Tensor | None]:
-        """A receiver's residuals over their covariances or, if smaller, the covariances' Cholesky factor.
-
-        Both are None for local kriging.
-        """
+    def _factor(self, index: Int[Tensor, " k"]) -> Tensor | None:
+        """Cholesky factor of a receiver's covariances; None for local kriging."""
         if len(index) > LIMIT:
-            return None, None
-        factor = cholesky_factor(self._places(self.links.query[index]), self.process.length, self.process.nugget)
-        if math.prod(self.scene.task.shape) >= len(index):
+            return None
+        return cholesky_factor(self._places(self.links.query[index]), self.process.length, self.process.nugget)
+
+    def _solve(self, index: Int[Tensor, " k"], factor: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        """A receiver's residuals over their covariances or, if smaller, the covariances' factor; None for neither."""
+        if factor is None or math.prod(self.scene.task.shape) >= len(index):
             return None, factor
         residuals = torch.cat([*self._residuals(index)]).reshape(len(index), -1)
         wide = torch.promote_types(residuals.dtype, torch.float64)

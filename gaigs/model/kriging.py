@@ -15,7 +15,13 @@ from torch import Tensor, nn
 from gaigs.data import Links
 from gaigs.gaussians import Gaussians
 from gaigs.kriging.field import Field
-from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters, thin_labels
+from gaigs.kriging.fit import (
+    FEWEST,
+    Hyperparameters,
+    damping,
+    fit_hyperparameters,
+    thin_labels,
+)
 from gaigs.kriging.kernel import LIMIT
 from gaigs.kriging.links import PART, coordinates, folds_of, thinned
 from gaigs.kriging.paths import Equations, PathField, candidates
@@ -92,16 +98,20 @@ class Kriging(Model):
         self.krige(links)
 
     @torch.no_grad()
-    def krige(self, links: Links) -> "Kriging":
-        """Fits, and gives the validation model: the same weights and hyperparameters on the training links alone."""
+    def krige(self, links: Links, is_final: bool = True) -> "Kriging":
+        """Fits, and gives the validation model: the same weights and hyperparameters on the training links alone.
+
+        If not ``is_final``, only the validation model is fitted, without a word.
+        """
         links = thinned(links, LIMIT)
         split = links.split
         values = predicted(self.trend, links, known(links))
         self.fallback.fit(links)
         if self.by_paths:
-            return self._krige_paths(links, values)
+            return self._krige_paths(links, values, is_final)
         self._fit_trend_weight(links, values)
-        self._solve(links, values)
+        if is_final:
+            self._solve(links, values)
         training = replace(links, split=split.validating())
         validation_model = Kriging(self.scene, self.trend, self.fallback_options)
         validation_model.trend_weight.copy_(self.trend_weight)
@@ -119,11 +129,13 @@ class Kriging(Model):
             best = max(WEIGHTS, key=lambda weight: sign * score(weight))
             self.weight.fill_(best)
             validation_model.weight.fill_(best)
-            self._is_learnt(links, trend, validation_model.fallback)
-        log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))
+            if is_final:
+                self._is_learnt(links, trend, validation_model.fallback)
+        if is_final:
+            self._log()
         return validation_model
 
-    def _krige_paths(self, links: Links, values: Tensor) -> "Kriging":
+    def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` for a trend of paths; hyperparameters are those with the largest sure gain on the validation links.
 
         It is the rise of the mean score less its standard error. One with which the median falls does not count; if
@@ -158,35 +170,48 @@ class Kriging(Model):
             if sure > max(0, best[0]) and after.median() >= before.median():
                 best = sure, process
         self.trend_weight.fill_(0)
-        if len(held) == 0 or self._is_learnt(links, plain, validation_model.fallback):
+        if len(held) == 0 or self._is_learnt(links, plain, validation_model.fallback, is_final):
             self.trend_weight.fill_(1)
-        for model in (self, validation_model):
+        for model in (self, validation_model) if is_final else (validation_model,):
             model.trend_weight.copy_(self.trend_weight)
             model.weight.fill_(float(best[0] > 0) if self.trend_weight else 1.0)
             model.hyperparameters.copy_(torch.tensor(best[1], dtype=torch.float64))
             for rows, field, known_ones in zip(own, model.fields, equations, strict=True):
                 field.solve(known_ones if model is self else known_ones[rows < len(split.train)], best[1])
-        log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))
+        if is_final:
+            self._log()
         self.fields.to(device)
         return validation_model.to(device)
 
-    def variance(self, batch: Batch) -> Float[Tensor, "b e s"]:
-        """Variance of complex channels predicted by kriged paths: that of their strengths, and the nugget's.
+    def _log(self) -> None:
+        log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))
 
-        A lower bound that is not calibrated; of the default hyperparameters if validation chose no kriging.
+    def deviations(self, batch: Batch) -> Tensor:
+        """Standard deviations of the labels; of spectra means over their pixels.
+
+        Those of kriged paths are bounds below, of the default hyperparameters if validation chose no kriging.
         """
         query, process = batch.query, Hyperparameters(*self.hyperparameters.tolist())
-        value = self(batch).value
-        found = process.nugget * value.abs().square().mean((1, 2), keepdim=True).expand(value.shape).clone()
+        if self.is_scalar:
+            return self.process.deviations(coordinates(self.scene, query, 1.0), query.receivers)
+        places = query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
+        if self.by_paths:
+            value = self(batch).value
+            found = process.nugget * value.abs().square().mean((1, 2), keepdim=True).expand(value.shape).clone()
+        else:
+            found = places.new_zeros(len(query))
         trend: Any = self.trend
         for receiver in query.receivers.unique().tolist():
-            own = query.receivers == receiver
-            variances = self.fields[receiver].variances(query.transmitters[own].double(), process)
-            squares = trend.margins(query[own]).abs().square()
-            found[own] = found[own] + (variances.to(squares)[..., None, None] * squares).sum(1)
-        return found
+            own, field = query.receivers == receiver, self.fields[receiver]
+            if self.by_paths:
+                variances = field.variances(places[own].double(), process)
+                squares = trend.margins(query[own]).abs().square()
+                found[own] = found[own] + (variances.to(squares)[..., None, None] * squares).sum(1)
+            else:
+                found[own] = field.deviations(places[own], process).square()
+        return found.sqrt()
 
-    def _is_learnt(self, links: Links, trend: Tensor, fallback: Model) -> bool:
+    def _is_learnt(self, links: Links, trend: Tensor, fallback: Model, says: bool = True) -> bool:
         """False if the trend's values of the validation links score worse than the fallback's by more than chance."""
         task, held = links.task, links.split.validation
         own, other = (
@@ -195,7 +220,7 @@ class Kriging(Model):
         )
         behind = (other - own) * (1 if task.higher_is_better else -1)
         is_learnt = len(held) < 2 or bool(behind.mean() <= 2 * behind.std() / math.sqrt(len(held)))  # standard errors
-        if not is_learnt:
+        if not is_learnt and says:
             name = self.fallback_options["name"]
             log.warning(
                 "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"

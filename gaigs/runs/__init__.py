@@ -80,10 +80,10 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     fitted = fit(None, loss, links, config, folder)
     if fitted is None:
         return None
-    model, is_trained = fitted.models[name], bool(fitted.unseen)
-    scores = evaluation.score(fitted.models, baselines, links, folder)
-    own = {} if is_trained else {name: registry("model").build(config["model"], scene=scene)}
-    validation = evaluation.validate(fitted.unseen, {**own, **baselines}, links)
+    model, is_trained = fitted.models[name], fitted.seconds is not None
+    validation, calibrations = evaluation.validate(fitted.unseen, baselines, links)
+    calibrations |= {key: own.calibration for key, own in fitted.models.items()}
+    scores = evaluation.score(fitted.models, baselines, links, folder, calibrations)
     metrics = {
         "task": task.name,
         "data": links.remarks,
@@ -98,8 +98,8 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "num_gaussians_start": fitted.start,
         "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
         "checkpoint_bytes": (folder / "best.ckpt").stat().st_size if is_trained else None,
-        "models": {name: task.summarise(values) for name, values in scores.items()},
-        "validation": {name: task.summarise(values) for name, values in validation.items()},
+        "models": {name: evaluation.summary(task, values) for name, values in scores.items()},
+        "validation": {name: evaluation.summary(task, values) for name, values in validation.items()},
         "validation_score": validation[name][task.monitor].mean().item() if validation else None,
         "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
     } | (call_optional(model, "facts") or {})

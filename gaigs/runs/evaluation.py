@@ -21,8 +21,11 @@ from gaigs.configuration import composed, has_file
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
+from gaigs.kriging.intervals import Calibration, interval_scores, summarise_intervals
+from gaigs.kriging.links import folds_of
 from gaigs.model import Model, call_optional
 from gaigs.model.kriging import Kriging
+from gaigs.query import Batch
 from gaigs.registry import name_of, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.scene import Scene
@@ -30,6 +33,9 @@ from gaigs.task import Task
 
 BATCH = 64
 """Links predicted at a time."""
+
+INTERVALS = "interval_"
+"""Beginning of the names of scores of intervals."""
 
 Scores = dict[str, dict[str, Tensor]]
 """Scores of every link, by the names of model and score."""
@@ -76,6 +82,38 @@ def predict(
     return torch.cat([part.cpu() for part in values])
 
 
+def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:
+    """The model's own deviations of some links, ``Model.spread``, on the CPU; ``values`` are its predictions."""
+    parts = zip(links.query[index].parts(BATCH), values.split(BATCH), strict=True)
+    device, directions = device_of(model), links.task.directions
+    batches = ((Batch(query, directions).to(device), part.to(device)) for query, part in parts)
+    return torch.cat([model.spread(batch, part).cpu() for batch, part in batches])
+
+
+def calibrated(unseen: Model, links: Links) -> Calibration | None:
+    """The calibration of a model, by what it predicts for validation links that it is not fitted to.
+
+    A kriged model chose weights and hyperparameters on these links: for each half of them they are chosen anew on the
+    other half. The step of a training stays the one chosen on all of them.
+    """
+    split, index = links.split, links.split.validation
+    if not len(index) or links.held_out is not None:
+        return None
+    halves = folds_of(links, index) % 2
+    answers = [(unseen, index)]
+    if isinstance(unseen, Kriging) and 0 < halves.sum() < len(halves):
+        parts = index[halves == 0], index[halves == 1]
+        answers = []
+        for own, other in (parts, parts[::-1]):
+            kriged = Kriging(links.scene, unseen.trend, unseen.fallback_options).to(device_of(unseen))
+            answers.append((kriged.krige(replace(links, split=split.choosing(own)), is_final=False), other))
+    index = torch.cat([part for _, part in answers])
+    values = [predict(model, links, part) for model, part in answers]
+    own = [spreads(model, links, part, value) for (model, part), value in zip(answers, values, strict=True)]
+    query, train = links.query[index], links.query[split.train]
+    return Calibration.of(links.task, links.labels[index], torch.cat(values), torch.cat(own), query, train)
+
+
 @dataclass(frozen=True)
 class Evaluation(JupyterMixin):
     """Scores on the test links; prints as a table, in a notebook too.
@@ -95,7 +133,7 @@ class Evaluation(JupyterMixin):
     @property
     def models(self) -> dict[str, dict[str, float]]:
         """The numbers of the table, by the model's name and the metric's."""
-        return {name: self.task.summarise(values) for name, values in self.scores.items()}
+        return {name: summary(self.task, values) for name, values in self.scores.items()}
 
     def __rich__(self) -> Group:
         facts = {"task": self.task.name, "split": self.split, "device": self.device, "models": self.models}
@@ -141,17 +179,31 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
     if baselines is None:
         baselines = composed([f"task={task.name}"], {})["baselines"] if has_file("task", task.name) else ()
     baselines = [baselines] if isinstance(baselines, str) else baselines
-    scores = score(models, build_baselines(baselines, own, links.scene), links)
+    calibrations = {key: model.calibration for key, model in models.items()}
+    scores = score(models, build_baselines(baselines, own, links.scene), links, None, calibrations)
     return Evaluation(task, links.split.name, scores, device_name(device_of(model)))
 
 
+def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
+    """The numbers of a table, and those of intervals where a model has them."""
+    own = {name: score for name, score in scores.items() if not name.startswith(INTERVALS)}
+    return task.summarise(own) | summarise_intervals(
+        {name.removeprefix(INTERVALS): score for name, score in scores.items() if name not in own}
+    )
+
+
 def score(
-    models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links, folder: Path | None = None
+    models: Mapping[str, Model],
+    look_ups: Mapping[str, Model],
+    links: Links,
+    folder: Path | None = None,
+    calibrations: Mapping[str, Calibration | None] | None = None,
 ) -> Scores:
     """Scores of every test link by fitted models and by look-ups; a folder gets predictions of the first.
 
-    If subcarriers are held out, ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as
-    an uplink is taken for a downlink.
+    ``calibrations`` give those of their names scores of intervals too. If subcarriers are held out,
+    ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an uplink is taken for a
+    downlink.
     """
     asked, index = links.held_out or links, links.split.test
     task: Any = asked.task
@@ -176,7 +228,16 @@ def score(
 
     frequencies = None if links.held_out is None else task.frequencies
     for key in [*models, *look_ups]:
-        add(key, predict(models[key] if key in models else fitted(look_ups[key], links), links, index, frequencies))
+        model = models[key] if key in models else fitted(look_ups[key], links)
+        values = predict(model, links, index, frequencies)
+        add(key, values)
+        calibration = (calibrations or {}).get(key)
+        if calibration is not None and frequencies is None and (levels := calibration.levels((0.5, 0.9))):
+            deviations = spreads(model, links, index, values)
+            estimates = [calibration.estimate(values, deviations, query, level) for level in levels]
+            found = interval_scores(task, labels, *estimates)
+            scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
+            content.setdefault("deviation", task.packed(estimates[-1].std))
     if links.held_out is not None:
         own: Any = links.task
         nearest = (own.frequencies - frequencies[:, None]).abs().argmin(1)
@@ -187,11 +248,23 @@ def score(
     return scores
 
 
-def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
-    """Scores of every validation link, by models that have not been fitted to these links; empty without such links."""
+def validating(links: Links) -> Links:
+    """The links as models that have not been fitted to validation links see them, which are the test."""
+    return replace(links, split=links.split.validating(), held_out=None)
+
+
+def validate(
+    models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links
+) -> tuple[Scores, dict[str, Calibration | None]]:
+    """Scores of every validation link, by models that have not been fitted to these links; empty without such links.
+
+    And the calibrations of the look-ups.
+    """
     if not len(links.split.validation):
-        return {}
-    return score(models, look_ups, replace(links, split=links.split.validating(), held_out=None))
+        return {}, {}
+    unseen = {key: fitted(look_up, validating(links)) for key, look_up in look_ups.items()}
+    calibrations = {key: calibrated(look_up, links) for key, look_up in unseen.items()}
+    return score({**models, **unseen}, {}, validating(links)), calibrations
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:

@@ -27,7 +27,7 @@ from gaigs.model import Model
 from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
 from gaigs.registry import call, configuration_of, registry
-from gaigs.runs.evaluation import device_of, is_trained
+from gaigs.runs.evaluation import calibrated, device_of, fitted, is_trained, validating
 from gaigs.runs.folder import check_same_links, claim, fingerprint
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS, make_budget
@@ -101,7 +101,7 @@ class Fitted(NamedTuple):
 
     Attributes:
         models: The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
-        unseen: The same, not fitted to validation links; empty for a model without a training.
+        unseen: The same, not fitted to validation links; empty without such links.
         start: Number of Gaussians before the training.
         seconds: Duration of the training; None without one.
         kriging_seconds: Duration of kriging; None without it.
@@ -124,20 +124,28 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     kriged = Kriging(links.scene, model, config["kriging_fallback"]) if config["kriging"] else None
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
+    if not is_trained(model):
+        unseen = {name: fitted(model, validating(links))} if len(links.split.validation) else {}
+        model.fit(links)
+        model.calibration = calibrated(unseen[name], links) if unseen else None
+        return Fitted({name: model}, unseen, 0)
     model.fit(links)
     start = count_gaussians(model)
-    if not is_trained(model):
-        return Fitted({name: model}, {}, start)
     model, seconds = descend(model, loss, links, config, folder)
     if not is_first():
         return None
+    best = folder / "best.ckpt"
+    model.calibration = calibrated(model, links)
     if kriged is None:
+        checkpoint.add_calibration(best, model)
         return Fitted({name: model}, {name: model}, start, seconds)
     began = time.monotonic()
     validation_model = kriged.to(device_of(model)).krige(links)
-    checkpoint.exchange_model(folder / "best.ckpt", kriged, trained="trend")
+    kriging_seconds = time.monotonic() - began
+    kriged.calibration = calibrated(validation_model, links)
+    checkpoint.exchange_model(best, kriged, trained="trend")
     models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged, validation_model))
-    return Fitted(models, unseen, start, seconds, time.monotonic() - began)
+    return Fitted(models, unseen, start, seconds, kriging_seconds)
 
 
 def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Model, float]:

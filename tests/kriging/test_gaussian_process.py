@@ -129,7 +129,7 @@ def test_places_measured_twice_do_not_break_the_matrices(task):
     positions[4:40] = positions[:4].repeat(9, 1)
     model = fitted(links)
     model.process = model.process._replace(nugget=NUGGETS[0])
-    model.solved = [model._solve(index) for index in model.known]
+    model.solved = [model._solve(index, model._factor(index)) for index in model.known]
     found, expected = model.predict(positions[:2], 0), kriged(model, links, 0, positions[:2])
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
     copies = links.labels[:40].unflatten(0, (10, 4))[:, :2].mean(0)

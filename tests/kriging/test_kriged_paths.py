@@ -125,7 +125,7 @@ def test_variance_grows_away_from_known_places():
     links, trend = made(smooth=0.4)
     model = Kriging(links.scene, trend)
     model.fit(links)
-    variance = model.variance(links.batch(torch.arange(5)))
+    variance = model.deviations(links.batch(torch.arange(5))).square()
     assert variance.shape == (5, *links.task.shape)
     assert (variance > 0).all()
     process = Hyperparameters(*model.hyperparameters.tolist())

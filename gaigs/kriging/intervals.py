@@ -1,0 +1,229 @@
+"""Intervals of predictions, by conformal prediction on validation links that the predicting model has not seen."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Inexact, Int
+from torch import Tensor
+
+from gaigs.geometry import FAR
+from gaigs.kriging.links import distances
+from gaigs.query import Query
+from gaigs.task import Task
+
+ENOUGH = 50
+"""Validation links that a group needs for intervals of its own."""
+
+BINS = 8
+"""Groups of a spectrum's pixels by their predicted amplitude: where it is high, errors are larger."""
+
+NUMBERS = 1024
+"""Most numbers of a label that intervals are calibrated and scored with; arrays resolve fewer."""
+
+STEPS = 200
+"""Levels of the stored quantiles of errors."""
+
+
+class Estimate(NamedTuple):
+    """A prediction with its uncertainty, from ``model.predict(x, interval=0.9)``; tensors shaped as the value.
+
+    Attributes:
+        value: The prediction of ``predict`` without an interval.
+        std: Standard deviation of the label about it, in the label's unit; of channels that of the complex error.
+        lower, upper: Ends of the interval, which holds the label with the asked probability; None for channels.
+        radius: Of channels, that of a disc about the value which holds the channel with this probability, in the
+            label's unit; else None.
+        snr_db: Of channels, the expected signal-to-noise ratio of each link's prediction (b,) [dB]; else None.
+    """
+
+    value: Tensor
+    std: Tensor
+    lower: Tensor | None
+    upper: Tensor | None
+    radius: Tensor | None = None
+    snr_db: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Quantiles of the absolute errors of validation links over a model's own deviation, in groups.
+
+    Links are in one group per receiver, and by the distance to the nearest known place of their receiver, where each
+    has at least ``ENOUGH`` validation links. Pixels of a spectrum are in ``BINS`` groups by their predicted amplitude
+    too. A group of n links has an interval of level p by the quantile p (n + 1) / n of its errors: it then holds a new
+    link's label with probability p, if links are exchangeable.
+
+    Attributes:
+        edges: Of the distances (r or 1, g - 1) [m].
+        amplitudes: Edges of the predicted amplitudes (bins - 1,).
+        counts: Validation links (groups,).
+        quantiles: Of the errors at levels 0 to 1 (groups, bins, ``STEPS`` + 1).
+        sizes: Root mean square of the errors (groups, bins).
+        places, receivers: Of the known links, for the distance; empty with one group of distances.
+
+    Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; by groups of links: Dunn,
+    Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical models, 2022.
+    """
+
+    edges: Float[Tensor, "r e"]
+    amplitudes: Float[Tensor, " a"]
+    counts: Int[Tensor, " g"]
+    quantiles: Float[Tensor, "g b q"]
+    sizes: Float[Tensor, "g b"]
+    places: Float[Tensor, "k 3"]
+    receivers: Int[Tensor, " k"]
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        labels: Inexact[Tensor, " n *shape"],
+        values: Inexact[Tensor, " n *shape"],
+        deviations: Float[Tensor, " n ..."],
+        query: Query,
+        train: Query,
+    ) -> "Calibration":
+        """From validation links, predicted by a model that knows the training links alone."""
+        errors = (task.align(labels, values) - values).abs() / _shaped(deviations, values)
+        errors, values = (_thin(part) for part in (errors, values))
+        count = int(torch.cat((query.receivers, train.receivers)).max()) + 1
+        heard = query.receivers.bincount(minlength=count)
+        rows = query.receivers if heard.min() >= ENOUGH and count > 1 else torch.zeros_like(query.receivers)
+        near = nearest(query, train.transmitters, train.receivers).clamp_max(FAR)
+        groups = max(1, min(4, int(rows.bincount().min()) // ENOUGH))
+        levels = torch.arange(1, groups, dtype=torch.float64) / groups
+        edges = torch.stack([near[rows == row].quantile(levels) for row in range(int(rows.max()) + 1)])
+        own = rows * groups + torch.searchsorted(edges[rows], near[:, None])[:, 0]
+        amplitudes = values.new_zeros(0, dtype=torch.float64)
+        if values.shape[1] > 1 and not values.is_complex():
+            amplitudes = (
+                _thin(values.flatten()[None], 10**6)[0]
+                .double()
+                .quantile(torch.arange(1, BINS, dtype=torch.float64) / BINS)
+            )
+        bins = torch.bucketize(values.double(), amplitudes) if len(amplitudes) else torch.zeros_like(errors).long()
+        counts = own.bincount(minlength=len(edges) * groups)
+        quantiles = errors.new_zeros(len(counts), len(amplitudes) + 1, STEPS + 1, dtype=torch.float64)
+        sizes = quantiles[..., 0].clone()
+        for group in range(len(counts)):
+            for bin_ in range(len(amplitudes) + 1):
+                inside = errors[own == group][bins[own == group] == bin_].double()
+                # A bin without pixels in a group, as of receivers in different surroundings, has those of all groups.
+                inside = inside if len(inside) else errors[bins == bin_].double()
+                inside = inside if len(inside) else errors.flatten().double()
+                ranks = (torch.linspace(0, 1, STEPS + 1, dtype=torch.float64) * len(inside)).ceil().long() - 1
+                quantiles[group, bin_] = inside.sort().values[ranks.clamp_min(0)]
+                sizes[group, bin_] = inside.square().mean().sqrt()
+        parts = (train, query) if groups > 1 else (query[:0],)
+        places, receivers = (
+            torch.cat(every) for every in zip(*((p.transmitters, p.receivers) for p in parts), strict=True)
+        )
+        return cls(edges, amplitudes, counts, quantiles, sizes, places, receivers)
+
+    def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
+        """The interval of some predictions; raises a ``ValueError`` where it needs more validation links."""
+        rows = query.receivers if len(self.edges) > 1 else torch.zeros_like(query.receivers)
+        own = rows * (self.edges.shape[1] + 1)
+        if self.edges.shape[1]:
+            near = nearest(query, self.places.to(query.transmitters), self.receivers.to(query.receivers))
+            own = own + torch.searchsorted(self.edges.to(near)[rows], near[:, None])[:, 0]
+        counts = self.counts.to(own)[own]
+        need = math.ceil(level / (1 - level))
+        if len(counts) and (fewest := int(counts.min())) < need:
+            raise ValueError(
+                f"an interval of {100 * level:g} % needs {need} validation links, the model has {fewest}\n"
+                "ask for a narrower interval, or train with a larger split.validation"
+            )
+        numbers = value[..., None].flatten(1)
+        amplitudes = self.amplitudes.to(value.device)
+        bins = (
+            torch.bucketize(numbers.double(), amplitudes) if len(amplitudes) else torch.zeros_like(numbers.abs()).long()
+        )
+        ranks = (level * (counts + 1) / counts * STEPS).ceil().long().clamp_max(STEPS)
+        scale = _shaped(deviations, value)
+        factors = lambda table: table.reshape(value.shape).to(scale)
+        half = scale * factors(self.quantiles.to(value.device)[own[:, None], bins, ranks[:, None]])
+        std = scale * factors(self.sizes.to(value.device)[own[:, None], bins])
+        if value.is_complex():
+            powers, errors = (part.abs().square().flatten(1).sum(1) for part in (value, std))
+            return Estimate(value, std, None, None, half, 10 * (powers / errors).log10())
+        lower = (value - half).clamp_min(0) if len(amplitudes) else value - half  # no amplitude is negative
+        return Estimate(value, std, lower, value + half)
+
+    def levels(self, asked: Sequence[float]) -> Sequence[float]:
+        """The asked levels if there are enough links for all of them, else none."""
+        return asked if max(asked) <= int(self.counts.min()) / (int(self.counts.min()) + 1) else ()
+
+    def state(self) -> dict[str, Tensor]:
+        """Plain tensors for a checkpoint; ``Calibration(**state)`` makes it anew."""
+        return {name: getattr(self, name).cpu() for name in self.__dataclass_fields__}
+
+
+def nearest(query: Query, places: Float[Tensor, "k 3"], receivers: Int[Tensor, " k"]) -> Float[Tensor, " b"]:
+    """Distance of each link to the nearest known place of its receiver [m]; infinite without one."""
+    found = torch.full((len(query),), math.inf, dtype=torch.float64, device=places.device)
+    for receiver in query.receivers.unique().tolist():
+        asked, known = (query.receivers == receiver).nonzero()[:, 0], places[receivers == receiver].double()
+        for part in asked.split(1024) if len(known) else ():
+            found[part] = distances(query.transmitters[part].double(), known).amin(1)
+    return found
+
+
+def interval_scores(
+    task: Task, labels: Inexact[Tensor, " k *shape"], half: Estimate, most: Estimate
+) -> dict[str, Float[Tensor, " k"]]:
+    """Scores of each link's intervals of 50 % and 90 %: shares of its numbers inside, width, CRPS and -log p.
+
+    The last two are those of a normal distribution with the estimate's ``std``; of channels those of real and imaginary
+    parts. CRPS has the label's unit.
+
+    Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation, 2007.
+    """
+    value, std = most.value, most.std
+    labels = task.align(labels, value)
+    errors = labels - value
+    inside: list[Any] = []
+    for estimate in (half, most):
+        covered = (
+            errors.abs() <= estimate.radius
+            if estimate.radius is not None
+            else (estimate.lower <= labels) & (labels <= estimate.upper)
+        )
+        inside.append(covered)
+    width = 2 * most.radius if most.radius is not None else most.upper - most.lower
+    if errors.is_complex():
+        errors, std = torch.view_as_real(errors), (std / math.sqrt(2))[..., None].expand(*std.shape, 2)
+    # A deviation of 0, where the model is exact, has the least that float32 tells from it.
+    std = std.double().clamp_min(torch.finfo(torch.float32).tiny)
+    z = errors.double() / std
+    density = torch.exp(-z.square() / 2) / math.sqrt(2 * math.pi)
+    crps = std * (z * torch.erf(z / math.sqrt(2)) + 2 * density - 1 / math.sqrt(math.pi))
+    nll = z.square() / 2 + std.log() + math.log(2 * math.pi) / 2
+    parts = {"coverage_50": inside[0], "coverage_90": inside[1], "width_90": width, "crps": crps, "nll": nll}
+    return {name: part.double()[..., None].flatten(1).mean(1) for name, part in parts.items()}
+
+
+def summarise_intervals(scores: dict[str, Float[Tensor, " k"]]) -> dict[str, float]:
+    """Means over links, and the standard errors of both coverages, ``coverage_50_error`` and ``coverage_90_error``."""
+    numbers = {}
+    for name, score in scores.items():
+        numbers[name] = score.mean().item()
+        if name.startswith("coverage"):
+            numbers[f"{name}_error"] = score.std().item() / math.sqrt(len(score)) if len(score) > 1 else math.nan
+    return numbers
+
+
+def _shaped(deviations: Tensor, values: Tensor) -> Tensor:
+    """Deviations of links, or of all their numbers, in the shape of the values; above 0."""
+    real = values.abs()
+    shaped = deviations.reshape(*deviations.shape, *[1] * (values.ndim - deviations.ndim)).to(real)
+    return shaped.clamp_min(torch.finfo(real.dtype).tiny).expand(values.shape)
+
+
+def _thin(numbers: Tensor, most: int = NUMBERS) -> Tensor:
+    """At most ``most`` numbers of each label (n, m), evenly spread."""
+    flat = numbers[..., None].flatten(1)
+    return flat[:, :: math.ceil(flat.shape[1] / most)].contiguous()

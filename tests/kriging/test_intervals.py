@@ -1,0 +1,202 @@
+"""Intervals against draws whose errors are known, scipy, and numbers by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+from scipy.integrate import quad
+
+import gaigs
+from gaigs.data import Split
+from gaigs.kriging.intervals import Calibration, Estimate, interval_scores, nearest, summarise_intervals
+from gaigs.model.kriging import Kriging
+from gaigs.query import Query
+from gaigs.runs import evaluation
+from gaigs.testing import example_links
+
+TASKS = pytest.mark.parametrize("task", ["rssi", "spectrum", "csi"])
+BOX = torch.tensor([6.0, 4.0, 2.0])
+
+
+def made(task, count, seed=0, receivers=1, size=1.0):
+    """Labels about values of a model, with errors that are heavy-tailed and alike within a link; and queries."""
+    generator = torch.Generator().manual_seed(seed)
+    kind = example_links(task).task
+    values = torch.rand(count, *kind.shape, generator=generator).to(kind.dtype)
+    scales = size * 0.2 * torch.rand(count, generator=generator).reciprocal().sqrt().reshape(-1, *[1] * len(kind.shape))
+    errors = scales * torch.randn(count, *kind.shape, dtype=kind.dtype, generator=generator)
+    labels = (values + errors).to(kind.dtype)
+    labels = labels.clamp_min(0) if task == "spectrum" else labels
+    query = Query(BOX * torch.rand(count, 3, generator=generator), torch.arange(count) % receivers)
+    return kind, labels, values, query
+
+
+def shares(task, count, level, repeats=40, **options):
+    """Share of new links' numbers that intervals hold, mean over calibrations on ``count`` links."""
+    found = []
+    for seed in range(repeats):
+        kind, labels, values, query = made(task, count + 200, seed, **options)
+        held, new = slice(0, count), slice(count, None)
+        ones = torch.ones(len(query))
+        train = query[:1]
+        calibration = Calibration.of(kind, labels[held], values[held], ones[held], query[held], train)
+        estimate = calibration.estimate(values[new], ones[new], query[new], level)
+        found.append(interval_scores(kind, labels[new], estimate, estimate)["coverage_90"].mean().item())
+    return np.mean(found), np.std(found) / math.sqrt(repeats)
+
+
+@TASKS
+@pytest.mark.parametrize("count", [12, 60])
+@pytest.mark.parametrize("level", [0.5, 0.9])
+def test_intervals_hold_their_share_of_new_links(task, count, level):
+    share, error = shares(task, count, level)
+    # Of pixels of one link that err alike, a finite number of links gives the share but for one link's weight.
+    assert abs(share - level) <= 3 * error + 1 / (count + 1) * (0.5 if task == "rssi" else 1)
+
+
+def test_receivers_with_enough_links_have_intervals_of_their_own():
+    kind, labels, values, query = made("rssi", 400, receivers=2)
+    labels = torch.where(query.receivers == 1, values + 10 * (labels - values), labels)
+    calibration = Calibration.of(kind, labels, values, torch.ones(400), query, query[:1])
+    estimate = calibration.estimate(values[:2], torch.ones(2), query[:2], 0.9)
+    widths = estimate.upper - estimate.lower
+    assert widths[1] > 5 * widths[0]
+    few = slice(0, 80)
+    pooled = Calibration.of(kind, labels[few], values[few], torch.ones(80), query[few], query[:1])
+    estimate = pooled.estimate(values[:2], torch.ones(2), query[:2], 0.9)
+    torch.testing.assert_close(*(estimate.upper - estimate.lower))
+
+
+def test_intervals_widen_with_the_distance_to_known_places():
+    kind, labels, values, query = made("rssi", 400)
+    known = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long))
+    apart = query.transmitters.norm(dim=1)
+    calibration = Calibration.of(kind, values + apart * (labels - values), values, torch.ones(400), query, known)
+    at = Query(torch.tensor([[0.5, 0.0, 0.0], [30.0, 0.0, 0.0]]), torch.zeros(2, dtype=torch.long))
+    # The calibration's own links are known too, but far from the second place.
+    near, far = (x for x in calibration.estimate(torch.zeros(2), torch.ones(2), at, 0.9).upper)
+    assert far > near
+
+
+def test_a_models_own_deviation_scales_the_interval():
+    kind, labels, values, query = made("rssi", 200)
+    deviations = 1 + query.transmitters[:, 0]
+    labels = values + deviations * (labels - values)
+    calibration = Calibration.of(kind, labels, values, deviations, query, query[:1])
+    found = calibration.estimate(values[:2], torch.tensor([1.0, 3.0]), query[:2], 0.9)
+    assert (found.upper - found.value)[1] == pytest.approx(3 * (found.upper - found.value)[0].item(), rel=1e-4)
+    assert found.std[1] == pytest.approx(3 * found.std[0].item())
+
+
+def test_amplitudes_are_not_negative_and_larger_ones_err_more():
+    kind, labels, values, query = made("spectrum", 100)
+    labels = (values + values * (labels - values)).clamp_min(0)
+    calibration = Calibration.of(kind, labels, values, torch.ones(100), query, query[:1])
+    found = calibration.estimate(values, torch.ones(100), query, 0.9)
+    assert found.lower.min() == 0
+    half = found.upper - found.value
+    assert half[values > 0.9].mean() > 3 * half[values < 0.1].mean()
+
+
+def test_discs_and_the_expected_snr_of_channels():
+    kind, labels, values, query = made("csi", 300, size=0.1)
+    held = slice(0, 40)  # too few for groups of distances: the calibration's own links may be asked
+    calibration = Calibration.of(kind, labels[held], values[held], torch.ones(40), query[held], query[:1])
+    labels, values, query = labels[held], values[held], query[held]
+    found = calibration.estimate(values, torch.ones(40), query, 0.9)
+    assert (found.lower, found.upper) == (None, None)
+    inside = ((labels - values).abs() <= found.radius).double().mean()
+    assert inside == pytest.approx(0.9 * 41 / 40, abs=0.01)
+    errors = (labels - values).abs().double().square()
+    expected = 10 * (values.abs().double().square().mean() / errors.mean()).log10()
+    assert found.snr_db.double().mean() == pytest.approx(expected.item(), abs=0.5)
+
+
+def test_scores_are_those_of_the_normal_distribution():
+    task = example_links("rssi").task
+    labels, value, std = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 3.0]), torch.tensor([0.7, 2.0])
+    estimate = Estimate(value, std, value - 1, value + 1)
+    found = interval_scores(task, labels, estimate, estimate._replace(lower=value - 6, upper=value + 6))
+    assert found["coverage_50"].tolist() == [1, 0]
+    assert found["coverage_90"].tolist() == [1, 1]
+    assert found["width_90"].tolist() == [12, 12]
+    for i in range(2):
+        normal = stats.norm(value[i].item(), std[i].item())
+        steps = lambda x, i=i, normal=normal: (normal.cdf(x) - (x >= labels[i].item())) ** 2
+        expected, _ = quad(steps, -30, 30, points=[labels[i].item(), value[i].item()], limit=200)
+        assert found["crps"][i].item() == pytest.approx(expected, rel=1e-5)
+        assert found["nll"][i].item() == pytest.approx(-normal.logpdf(labels[i].item()), rel=1e-6)
+    numbers = summarise_intervals(found)
+    assert (numbers["coverage_50"], numbers["coverage_50_error"]) == (0.5, pytest.approx(0.5))
+
+
+def test_distances_are_those_to_the_same_receivers_places():
+    places, receivers = torch.tensor([[0.0, 0, 0], [1, 0, 0]]), torch.tensor([0, 1])
+    query = Query(torch.tensor([[0.0, 2, 0], [0.0, 2, 0], [0, 0, 0]]), torch.tensor([0, 1, 2]))
+    assert nearest(query, places, receivers).tolist() == [2, pytest.approx(5**0.5), math.inf]
+
+
+# --- models ---
+
+
+@TASKS
+@pytest.mark.parametrize("name", ["mean", "knn", "gaussian_process", "gaigs"])
+def test_trained_models_and_look_ups_have_intervals(task, name, tmp_path):
+    links = example_links(task)
+    few = {"enable_progress_bar": False, "max_steps": 2, "count": 10, "accelerator": "cpu"} if name == "gaigs" else {}
+    links = replace(
+        links, split=Split("halves", *torch.arange(len(links)).split((len(links) // 2, len(links) // 2 - 2, 2)))
+    )
+    model = gaigs.train(name, links, **few)
+    places = BOX * torch.rand(2, 1, 3)
+    found, narrow = model.predict(places, interval=0.8), model.predict(places, interval=0.4)
+    assert torch.equal(found.value, model.predict(places))
+    assert found.std.shape == found.value.shape == (2, 1, *links.task.shape)
+    if task == "csi":
+        assert (narrow.radius <= found.radius).all()
+        assert found.snr_db.shape == (2, 1)
+    else:
+        assert (found.lower <= narrow.lower).all()
+        assert (narrow.upper <= found.upper).all()
+    if model.state_dict():
+        model.save(tmp_path / "model.ckpt")
+        again = gaigs.load(tmp_path / "model.ckpt").predict(places, interval=0.8)
+        for a, b in zip(found, again, strict=True):
+            assert a is b is None or torch.equal(a, b)
+
+
+def test_intervals_that_the_links_cannot_give_are_refused():
+    links = example_links("rssi")
+    none = replace(links, split=replace(links.split, validation=links.split.validation[:0]))
+    with pytest.raises(ValueError, match="no validation links have measured its errors"):
+        gaigs.train("knn", none).predict([1.0, 1.0, 1.0], interval=0.9)
+    model = gaigs.train("knn", links)
+    with pytest.raises(ValueError, match=r"99.9 % needs 999 validation links, the model has \d+"):
+        model.predict([1.0, 1.0, 1.0], interval=0.999)
+    for wrong in (0.0, 1.0, 90):
+        with pytest.raises(ValueError, match="interval must be a probability"):
+            model.predict([1.0, 1.0, 1.0], interval=wrong)
+
+
+def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch):
+    links = gaigs.links("synthetic_rssi", transmitters=100, order=0, validation=0.3)
+    trend = gaigs.train(
+        "gaigs", links, enable_progress_bar=False, max_steps=1, count=10, accelerator="cpu", kriging=False
+    )
+    chosen, predicted = [], []
+    krige, predict = Kriging.krige, evaluation.predict
+    monkeypatch.setattr(Kriging, "krige", lambda *a, **k: chosen.append(a[1].split.validation) or krige(*a, **k))
+    monkeypatch.setattr(evaluation, "predict", lambda *a: predicted.append(a[2]) or predict(*a))
+    kriged = Kriging(links.scene, trend)
+    calibration = evaluation.calibrated(kriged.krige(links), links)
+    assert torch.equal(chosen[0], links.split.validation)
+    assert len(chosen) == 3
+    assert calibration.counts.sum() == len(links.split.validation)
+    assert torch.equal(torch.cat(predicted).sort().values, links.split.validation.sort().values)
+    for own, other in zip(chosen[1:], predicted, strict=True):
+        assert not torch.isin(own, other).any()
+        places = links.query.transmitters
+        assert not (places[own][:, None] == places[other]).all(-1).any(), "halves share no place"
