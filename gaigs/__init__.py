@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gaigs.data import Links
     from gaigs.data.links import links
     from gaigs.geometry import Grid, Pose, Rays
+    from gaigs.kriging.intervals import Estimate
     from gaigs.model import Model
     from gaigs.query import Query
     from gaigs.radio_maps import radio_map
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from gaigs.runs.evaluation import evaluate
     from gaigs.runs.training import train
     from gaigs.scene import Scene
+    from gaigs.surveying import SurveyPlan, survey
     from gaigs.task import Metric
 
 log = logging.getLogger(__name__)
@@ -43,13 +45,14 @@ PLACES = {
     "compose": "configuration", "rasterize": "rasterizer", "radio_map": "radio_maps", "register": "registry",
     "registries": "registry", "Model": "model", "Links": "data", "Query": "query", "Grid": "geometry",
     "Rays": "geometry", "Receiver": "antenna", "Array": "antenna", "Pose": "geometry", "Scene": "scene",
-    "Metric": "task",
+    "Metric": "task", "survey": "surveying", "SurveyPlan": "surveying", "Estimate": "kriging.intervals",
 }  # fmt: skip
 """The module of each public name, which is imported when the name is first used: torch is slow to import."""
 
 __all__ = [
-    "Array", "Grid", "Links", "Metric", "Model", "Pose", "Query", "Rays", "Receiver", "Scene", "__version__", "compose",
-    "evaluate", "links", "load", "radio_map", "rasterize", "register", "registries", "run", "train",
+    "Array", "Estimate", "Grid", "Links", "Metric", "Model", "Pose", "Query", "Rays", "Receiver", "Scene",
+    "SurveyPlan", "__version__", "compose", "evaluate", "links", "load", "radio_map", "rasterize", "register",
+    "registries", "run", "survey", "train",
 ]  # fmt: skip
 
 
@@ -126,6 +129,11 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
 
             with processes.limited_threads(config["threads"]):
                 agreement.run(config, folder)
+        case "survey":
+            from gaigs import surveying
+
+            with processes.limited_threads(config["threads"]):
+                surveying.run(config, folder)
         case unknown:
-            raise ValueError(f"command must be train, benchmark, agreement or devices, got {unknown!r}")
+            raise ValueError(f"command must be train, benchmark, agreement, survey or devices, got {unknown!r}")
     return None

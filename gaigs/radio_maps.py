@@ -36,6 +36,7 @@ class RadioMap:
         quantity: Name of the predicted quantity.
         unit: Unit of a value; empty for a ratio.
         frequency: Carrier [Hz]; None if unknown.
+        deviations: Standard deviations of the labels (receivers, rows, columns); None if the model has no intervals.
     """
 
     values: Float[ndarray, "receivers rows columns"]
@@ -46,6 +47,7 @@ class RadioMap:
     quantity: str = "RSSI"
     unit: str = "dBm"
     frequency: float | None = None
+    deviations: Float[ndarray, "receivers rows columns"] | None = None
 
     def save(self, path: str | Path) -> None:
         """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and all other attributes that are known.
@@ -54,8 +56,7 @@ class RadioMap:
         """
         arrays = {_key(self.unit): self.values, "x": self.x, "y": self.y, "height": self.height}
         arrays |= {"receivers": self.receivers, "quantity": self.quantity, "unit": self.unit}
-        if self.frequency is not None:
-            arrays["frequency"] = self.frequency
+        arrays |= {name: getattr(self, name) for name in ("frequency", "deviations") if getattr(self, name) is not None}
         with atomic_write(path) as part, open(part, "wb") as file:  # given a name, numpy would append .npz
             np.savez_compressed(file, **arrays)
 
@@ -67,7 +68,8 @@ class RadioMap:
                 quantity, unit = str(file["quantity"]), str(file["unit"])
                 frequency = float(file["frequency"]) if "frequency" in file.files else None
                 axes = file["x"], file["y"], float(file["height"]), tuple(file["receivers"].tolist())
-                return cls(file[_key(unit)], *axes, quantity, unit, frequency)
+                deviations = file["deviations"] if "deviations" in file.files else None
+                return cls(file[_key(unit)], *axes, quantity, unit, frequency, deviations)
         except FileNotFoundError:
             raise
         except Exception as error:  # numpy raises many types for a file of another format
@@ -145,13 +147,16 @@ def radio_map(
     if frequency is None and len(scene.frequencies):
         frequency = float(scene.frequencies[len(scene.frequencies) // 2])
 
+    level = None if model.calibration is None else next(iter(model.calibration.levels((0.5,))), None)
+
     def predict(points: ndarray) -> ndarray:
         shape = (*points.shape[:-1], len(names))
         links = torch.from_numpy(np.broadcast_to(points[..., None, :], (*shape, 3)).astype(np.float32))
         index = torch.from_numpy(np.broadcast_to(heard, shape).copy())
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", r"\d+ of \d+ positions are up to", ExtrapolationWarning)
-            return model.predict(links, index, frequency=frequency, batch_size=POINTS * len(names)).cpu().numpy()
+            found = model.predict(links, index, frequency=frequency, batch_size=POINTS * len(names), interval=level)
+            return torch.stack([part.cpu() for part in (found[:2] if level else (found,))]).numpy()
 
     if pitch is None:
         pitch = max(0.1, longest / POINTS)
@@ -165,8 +170,8 @@ def radio_map(
             pitch *= 2
     x, y = _axes(lower, upper, pitch)
     values = predict(np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1))
-    values = np.ascontiguousarray(np.moveaxis(values, -1, 0))
-    return RadioMap(values, x, y, height, names, scene.task.quantity, scene.task.unit, frequency)
+    values, *deviations = (np.ascontiguousarray(np.moveaxis(part, -1, 0)) for part in values)
+    return RadioMap(values, x, y, height, names, scene.task.quantity, scene.task.unit, frequency, *deviations)
 
 
 def _axes(lower: ndarray, upper: ndarray, pitch: float) -> list[ndarray]:

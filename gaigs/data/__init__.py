@@ -47,6 +47,10 @@ class Split:
         """The split whose test are the validation links, for models that have not seen them."""
         return replace(self, validation=self.validation[:0], test=self.validation)
 
+    def only(self, train: Int[Tensor, " k"]) -> "Split":
+        """The split with some training links, and nothing to validate."""
+        return replace(self, train=train, validation=self.validation[:0])
+
     def choosing(self, validation: Int[Tensor, " v"]) -> "Split":
         """The split with other validation links, such as some of its own."""
         return replace(self, validation=validation)

@@ -65,14 +65,18 @@ class Field(nn.Module):
 
     def deviations(self, places: Float[Tensor, "b d"], process: Hyperparameters) -> Float[Tensor, " b"]:
         """Standard deviations of noisy labels at some places, means over a label's numbers."""
-        if self.signal is None:  # the most likely standard deviation of the process
+        return self.size(process) * local_deviations(places, self.places, process)
+
+    def size(self, process: Hyperparameters) -> Tensor:
+        """Most likely standard deviation of the process, a mean over a label's numbers."""
+        if self.signal is None:
             covariances = kernel(self.places, self.places, process.length)
             covariances.diagonal().add_(process.nugget)
             kept = self.widened.reshape(len(self.components), -1)
             products = self.weights.mH @ covariances.to(self.weights) @ self.weights
             squares = (products.mT * (kept @ kept.mH).to(products)).sum().real / (len(self.places) * kept.shape[1])
             self.signal = squares.clamp_min(0).sqrt()
-        return self.signal * local_deviations(places, self.places, process)
+        return self.signal
 
     def _widen(self) -> None:
         components = self.components.float()

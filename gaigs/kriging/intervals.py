@@ -14,7 +14,7 @@ from gaigs.kriging.links import distances
 from gaigs.query import Query
 from gaigs.task import Task
 
-ENOUGH = 50
+ENOUGH = 100
 """Validation links that a group needs for intervals of its own."""
 
 BINS = 8
@@ -37,6 +37,12 @@ class Estimate(NamedTuple):
         radius: Of channels, that of a disc about the value which holds the channel with this probability, in the
             label's unit; else None.
         snr_db: Of channels, the expected signal-to-noise ratio of each link's prediction (b,) [dB]; else None.
+
+    Example:
+        >>> model = gaigs.train("knn", gaigs.links("synthetic_rssi", transmitters=100))
+        >>> found = model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]], interval=0.9)
+        >>> found.upper.shape, bool((found.lower < found.value).all())
+        (torch.Size([2]), True)
     """
 
     value: Tensor
@@ -51,10 +57,10 @@ class Estimate(NamedTuple):
 class Calibration:
     """Quantiles of the absolute errors of validation links over a model's own deviation, in groups.
 
-    Links are in one group per receiver, and by the distance to the nearest known place of their receiver, where each
-    has at least ``ENOUGH`` validation links. Pixels of a spectrum are in ``BINS`` groups by their predicted amplitude
-    too. A group of n links has an interval of level p by the quantile p (n + 1) / n of its errors: it then holds a new
-    link's label with probability p, if links are exchangeable.
+    Links are in one group per receiver where each has at least ``ENOUGH`` validation links; of a model that states no
+    deviation also by the distance to the nearest known place of their receiver. Pixels of a spectrum are in ``BINS``
+    groups by their predicted amplitude too. A group of n links has an interval of level p by the quantile p (n + 1) / n
+    of its errors: it then holds a new link's label with probability p, if links are exchangeable.
 
     Attributes:
         edges: Of the distances (r or 1, g - 1) [m].
@@ -85,15 +91,20 @@ class Calibration:
         deviations: Float[Tensor, " n ..."],
         query: Query,
         train: Query,
+        by_distance: bool,
     ) -> "Calibration":
-        """From validation links, predicted by a model that knows the training links alone."""
+        """From validation links, predicted by a model that knows the training links alone.
+
+        Args:
+            deviations: As the model states them; ``by_distance``, if it states none.
+        """
         errors = (task.align(labels, values) - values).abs() / _shaped(deviations, values)
         errors, values = (_thin(part) for part in (errors, values))
         count = int(torch.cat((query.receivers, train.receivers)).max()) + 1
         heard = query.receivers.bincount(minlength=count)
         rows = query.receivers if heard.min() >= ENOUGH and count > 1 else torch.zeros_like(query.receivers)
         near = nearest(query, train.transmitters, train.receivers).clamp_max(FAR)
-        groups = max(1, min(4, int(rows.bincount().min()) // ENOUGH))
+        groups = max(1, min(4, int(rows.bincount().min()) // ENOUGH)) if by_distance else 1
         levels = torch.arange(1, groups, dtype=torch.float64) / groups
         edges = torch.stack([near[rows == row].quantile(levels) for row in range(int(rows.max()) + 1)])
         own = rows * groups + torch.searchsorted(edges[rows], near[:, None])[:, 0]
@@ -134,7 +145,7 @@ class Calibration:
         need = math.ceil(level / (1 - level))
         if len(counts) and (fewest := int(counts.min())) < need:
             raise ValueError(
-                f"an interval of {100 * level:g} % needs {need} validation links, the model has {fewest}\n"
+                f"an interval of {100 * level:g} % needs {need} links to calibrate it, the model has {fewest}\n"
                 "ask for a narrower interval, or train with a larger split.validation"
             )
         numbers = value[..., None].flatten(1)
@@ -207,12 +218,16 @@ def interval_scores(
 
 
 def summarise_intervals(scores: dict[str, Float[Tensor, " k"]]) -> dict[str, float]:
-    """Means over links, and the standard errors of both coverages, ``coverage_50_error`` and ``coverage_90_error``."""
+    """Means over links, and the standard errors of both coverages, ``coverage_50_error`` and ``coverage_90_error``.
+
+    The errors are those of the test's links and of the ``calibration_links`` together.
+    """
     numbers = {}
     for name, score in scores.items():
         numbers[name] = score.mean().item()
         if name.startswith("coverage"):
-            numbers[f"{name}_error"] = score.std().item() / math.sqrt(len(score)) if len(score) > 1 else math.nan
+            links = 1 / len(score) + 1 / scores["calibration_links"].mean().item()
+            numbers[f"{name}_error"] = score.std().item() * math.sqrt(links) if len(score) > 1 else math.nan
     return numbers
 
 

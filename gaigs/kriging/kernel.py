@@ -1,10 +1,31 @@
 """The Matern-1/2 kernel exp(-d / l), and kriging weights with their variance."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.kriging.links import distances
+
+
+@dataclass(frozen=True)
+class Process:
+    """The Gaussian process of one receiver's labels over places, and the readings that it knows.
+
+    Attributes:
+        covariances: Of the process at two sets of places (m, d) and (n, d), in the label's unit squared.
+        places: Of the known readings, see ``coordinates`` (k, d) [m].
+        noises: Variances of the noise of the known readings (k,).
+        noise: Variance of the noise of a new reading.
+    """
+
+    covariances: Callable[[Tensor, Tensor], Tensor]
+    places: Float[Tensor, "k d"]
+    noises: Float[Tensor, " k"]
+    noise: float
+
 
 LIMIT = 6000
 """Most known links of a receiver that enter one covariance matrix, for memory's sake."""

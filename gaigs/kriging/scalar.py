@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.optimize import minimize
 from torch import Tensor, nn
 
 from gaigs.kriging.fit import EDGES
+from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import distances, evenly, scale_bounds
 from gaigs.scene import Scene
 
@@ -135,6 +137,14 @@ class ScalarProcess(nn.Module):
             found.append((variances + spread * noises).sqrt())
         return torch.cat(found)
 
+    def at(self, receiver: int) -> Process:
+        """The process of one receiver."""
+        own, degrees = self.receivers == receiver, self.choice[1].item()
+        noise = math.exp(2 * self.logarithms[receiver, 2].item())
+        noise *= 1.0 if math.isinf(degrees) else degrees / (degrees - 2)
+        covariances = partial(self._covariances, receiver=receiver)
+        return Process(covariances, self.places[own], self.variances[own], noise)
+
     def facts(self) -> dict[str, float]:
         """Medians over the receivers of length and nugget; smoothness; degrees of freedom, 0 if the noise is normal."""
         length, signal, noise = self.logarithms.exp().unbind(1)
@@ -185,6 +195,23 @@ class ScalarProcess(nn.Module):
         _, self.logarithms, choice = self._maximise(values, *around(most), choice, logarithms, has_deviations=True)
         self.choice = torch.tensor(choice, dtype=torch.float64)
         return index
+
+    def refit(
+        self,
+        places: Float[Tensor, "k d"],
+        receivers: Int[Tensor, " k"],
+        values: Float[Tensor, " k"],
+        folds: Int[Tensor, " k"],
+        most: int = 300,
+    ) -> None:
+        """Fits the hyperparameters to other readings, from those that it has; kernel and noise stay."""
+        self.places, self.receivers = places, receivers
+        rows = [(receivers == receiver).nonzero()[:, 0] for receiver in receivers.unique()]
+        asked = torch.cat([evenly(own, max(16, most // len(rows))) for own in rows])
+        nearest = self._nearest(places[asked], receivers[asked], folds[asked], folds, reach=True)
+        around, choice = self._around(places[asked], receivers[asked], nearest), Choice(*self.choice.tolist())
+        _, self.logarithms, choice = self._maximise(values, asked, around, choice, self.logarithms, has_deviations=True)
+        self.choice = torch.tensor(choice, dtype=torch.float64)
 
     def solve(self, places: Float[Tensor, "k d"], receivers: Int[Tensor, " k"], values: Float[Tensor, " k"]) -> None:
         """Takes known residuals, whose process ``fit`` has found."""

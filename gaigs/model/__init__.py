@@ -16,6 +16,7 @@ from gaigs.data import Links
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Directions, ExtrapolationWarning
 from gaigs.kriging.intervals import Calibration, Estimate
+from gaigs.kriging.kernel import Process
 from gaigs.query import ROUNDING, Batch, Query, as_directions, as_subcarriers
 from gaigs.registry import check_type, registry
 from gaigs.scene import Scene
@@ -307,8 +308,14 @@ class OptionalMethods(Protocol):
     def export(self, folder: Path) -> None:
         """Writes files for other programs into a run's folder."""
 
+    def process_at(self, receiver: int) -> Process | None:
+        """The Gaussian process of a receiver's labels, which plans surveys."""
+
     def deviations(self, batch: Batch) -> Tensor:
         """Standard deviations of the labels (b,), or of each of their numbers (b, *shape), but for a common factor."""
+
+    def refit(self, links: Links) -> None:
+        """As ``fit``, for some of the links of an earlier fit, whose choices may stay; it may be faster."""
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
         """Changes the model between two training steps, such as by a search, and gives a sentence for the log.

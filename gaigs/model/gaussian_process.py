@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations, thin_labels
-from gaigs.kriging.kernel import LIMIT, cholesky_factor, kernel, kriging_weights
+from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
 from gaigs.kriging.links import PART, at_directions, coordinates, distances, evenly, folds_of, known_links, thinned
 from gaigs.kriging.scalar import ScalarProcess, is_scalar
 from gaigs.model import Model, Prediction, build_trend
@@ -93,12 +93,25 @@ class GaussianProcess(Model):
             white = wide / root if factor is None else torch.linalg.solve_triangular(factor.to(wide), wide, upper=False)
             self.signals.append(white.abs().square().mean().sqrt().item())
 
-    def _fit_scalar(self, links: Links) -> None:
+    def refit(self, links: Links) -> None:
+        """As ``fit``, for some of the known links; of labels of one number kernel, noise and trend stay."""
+        if not self.scalar:
+            self.fit(links)
+            return
+        self.links, self.known = links, known_links(links)
+        self.trend.fit(links)
+        self._fit_scalar(thinned(links, LIMIT), chooses=False)
+
+    @torch.no_grad()
+    def _fit_scalar(self, links: Links, chooses: bool = True) -> None:
         index = torch.cat(known_links(links))
         query, process = links.query[index], self.scalar[0]
         residuals = [(links.labels[index] - trend(Batch(query)).value).double() for trend in self.trends]
-        known = coordinates(self.scene, query, 1.0), query.receivers
-        self.chosen = process.fit(*known, residuals, folds_of(links, index), torch.arange(len(index)))
+        known, folds = (coordinates(self.scene, query, 1.0), query.receivers), folds_of(links, index)
+        if chooses:
+            self.chosen = process.fit(*known, residuals, folds, torch.arange(len(index)))
+        else:
+            process.refit(*known, residuals[self.chosen], folds)
         process.solve(*known, residuals[self.chosen])
 
     @property
@@ -140,6 +153,15 @@ class GaussianProcess(Model):
             own, known = query.receivers == receiver, self._places(self.links.query[self.known[receiver]])
             found[own] = self.signals[receiver] * local_deviations(self._places(query[own]), known, self.process)
         return found
+
+    def process_at(self, receiver: int) -> Process:
+        """The process of one receiver."""
+        if self.scalar:
+            return self.scalar[0].at(receiver)
+        places, signal = self._places(self.links.query[self.known[receiver]]), self.signals[receiver] ** 2
+        noise = self.process.nugget * signal
+        covariances = lambda a, b: signal * kernel(a, b, self.process.length)
+        return Process(covariances, places, places.new_full((len(places),), noise), noise)
 
     def _places(self, query: Query) -> Tensor:
         return coordinates(self.scene, query, self.process.scale)

@@ -22,7 +22,7 @@ from gaigs.kriging.fit import (
     fit_hyperparameters,
     thin_labels,
 )
-from gaigs.kriging.kernel import LIMIT
+from gaigs.kriging.kernel import LIMIT, Process, kernel
 from gaigs.kriging.links import PART, coordinates, folds_of, thinned
 from gaigs.kriging.paths import Equations, PathField, candidates
 from gaigs.kriging.scalar import ScalarProcess, is_scalar
@@ -182,6 +182,18 @@ class Kriging(Model):
             self._log()
         self.fields.to(device)
         return validation_model.to(device)
+
+    def process_at(self, receiver: int) -> Process | None:
+        """The process of one receiver; None for kriged paths, whose strengths are processes."""
+        if self.is_scalar:
+            return self.process.at(receiver)
+        if self.by_paths:
+            return None
+        field, process = self.fields[receiver], Hyperparameters(*self.hyperparameters.tolist())
+        signal = field.size(process).item() ** 2
+        noises = field.places.new_full((len(field.places),), process.nugget * signal)
+        covariances = lambda a, b: signal * kernel(a, b, process.length)
+        return Process(covariances, field.places, noises, process.nugget * signal)
 
     def _log(self) -> None:
         log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))

@@ -7,6 +7,7 @@ from gaigs.model import Model
 from gaigs.report import figures, style
 from gaigs.report.csi import CsiFigures
 from gaigs.report.curves import loss_curves, read_log
+from gaigs.report.intervals import intervals
 from gaigs.report.room import paths, room
 from gaigs.report.scalar import ScalarFigures
 from gaigs.report.spectrum import SpectrumFigures
@@ -36,7 +37,10 @@ def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
         drawn["paths"] = paths(links, learnt)
     if losses := read_log(folder):
         drawn["loss"] = loss_curves(losses)
-    drawn |= figures_of(type(links.task)).of_run((links.held_out or links).task, folder, links)
+    task = (links.held_out or links).task
+    if (drawn_intervals := intervals(folder, task, links.split.name)) is not None:
+        drawn["intervals"] = drawn_intervals
+    drawn |= figures_of(type(links.task)).of_run(task, folder, links)
     (folder / "figures").mkdir(exist_ok=True)
     files = {folder / "figures" / f"{name}.png": figure for name, figure in drawn.items()}
     for file, figure in files.items():

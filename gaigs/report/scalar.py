@@ -1,6 +1,7 @@
 """Figures of one real number a link: predicted against measured values, radio maps, the distribution of errors."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import ceil
 from pathlib import Path
 
@@ -43,8 +44,13 @@ class ScalarFigures(TaskFigures):
             "predicted_against_measured": predicted_against_measured(labels, predictions, receiver, [*gateways], task),
             "radio_map": radio_maps(radio_map, gateways, measured, edges, task),
         }
+        if radio_map.deviations is not None:
+            unit = {"quantity": "standard deviation", "unit": task.error_unit}
+            deviations = replace(radio_map, values=radio_map.deviations, **unit)
+            none = {name: rows[:0] for name, rows in measured.items()}
+            paged["deviation_map"] = radio_maps(deviations, gateways, none, edges, task)
         # The last hundredth would squeeze all others.
-        furthest = max(np.quantile(error, 0.99) for error in errors.values()) or None
+        furthest = float(max(np.quantile(error, 0.99) for error in errors.values())) or None
         title = with_unit("|error|", task.error_unit)
         figures = {"error_cdf": cdf(errors, title, "readings", links.split.name, (0, furthest))}
         for name, pages in paged.items():
@@ -135,7 +141,7 @@ def radio_maps(
     place = {"origin": "lower", "extent": (left, right, bottom, top), "interpolation": "bilinear"}
     lines = {"colors": "white", "linestyles": "solid", "linewidths": 0.4, "alpha": 0.5}
     carrier = "" if radio_map.frequency is None else f" at {radio_map.frequency / 1e9:.6g} GHz"
-    title = f"Predicted {task.quantity} of a transmitter at z = {radio_map.height:.2f} m{carrier}"
+    title = f"Predicted {radio_map.quantity} of a transmitter at z = {radio_map.height:.2f} m{carrier}"
     figures = []
     with rc_context(STYLE):
         for first in range(0, len(radio_map.receivers), PANELS):
@@ -154,10 +160,12 @@ def radio_maps(
                 ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), title=name)
                 ax.locator_params(nbins=5, steps=(1, 2, 5, 10))
             figure.suptitle(f"{title}, a line every {f'{step:g} {task.error_unit}'.strip()}", size=8)
-            label = with_unit(task.quantity, task.unit)
+            label = with_unit(radio_map.quantity, radio_map.unit)
             figure.colorbar(image, ax=axes, label=label, aspect=30, shrink=0.7, extend="both")
             dot = Line2D([], [], linestyle="", marker="o", markersize=4, color=GREY)
-            key = {"receiver": gateway, "test readings, in the map's colours": dot}
+            key = {"receiver": gateway}
+            if any(len(rows) for rows in dots.values()):
+                key["test readings, in the map's colours"] = dot
             figure.legend(key.values(), key, loc="outside lower center", ncols=2)
             figures.append(figure)
     return figures
@@ -171,7 +179,7 @@ def _scale(
     low, high = quantiles.min(), quantiles.max()
     # A flat map has no range: the scale's width then suits its size, or is 1.
     span = float(high - low) or float(abs(high)) or 1.0
-    rounded, contour = (5, 10) if error_unit == "dB" else (round_step(span, 20), round_step(span, 8))
+    rounded, contour = (5, 10) if error_unit == "dB" and span > 10 else (round_step(span, 20), round_step(span, 8))
     return {"vmin": rounded * np.floor(low / rounded), "vmax": rounded * (np.floor(high / rounded) + 1)}, contour
 
 

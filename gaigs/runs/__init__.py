@@ -3,12 +3,15 @@
 import json
 import logging
 from pathlib import Path
+from typing import Any
 
+from omegaconf import OmegaConf
 from rich.console import Console
 
+from gaigs import checkpoint
 from gaigs.data import load
 from gaigs.io.files import write_text
-from gaigs.model import call_optional
+from gaigs.model import Model, call_optional
 from gaigs.processes import is_first, limited_threads, only_run
 from gaigs.radio_maps import has_radio_map, radio_map
 from gaigs.registry import registry
@@ -56,6 +59,25 @@ def run(config: dict, folder: Path) -> dict | None:
     return metrics
 
 
+def model_of(folder: str | Path) -> Model:
+    """The model of a finished run: that of its checkpoint or, for a look-up, fitted anew to the run's data."""
+    folder = Path(folder)
+    if not is_configuration(folder / "config.yaml"):
+        raise FileNotFoundError(f"{folder} holds no run; give the folder with config.yaml, as folder=runs/...")
+    if (folder / "best.ckpt").is_file():
+        trained: Any = checkpoint.load(folder / "best.ckpt")
+        return trained
+    from gaigs.runs.training import fit
+
+    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    links = load(config["data"], config["split"], config["task"]["name"])
+    built = registry("model").build(config["model"], scene=links.scene)
+    if [*built.parameters()]:
+        raise FileNotFoundError(f"{folder} has no best.ckpt: the run is not finished; start it again")
+    fitted = fit(built, registry("loss").build(config["loss"], task=links.task), links, config, folder)
+    return fitted.models[config["model"]["name"]]
+
+
 def train_and_test(config: dict, folder: Path) -> dict | None:
     """Contents of ``metrics.json`` of a run in a claimed folder; None in all but the first process."""
     import lightning
@@ -81,9 +103,8 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     if fitted is None:
         return None
     model, is_trained = fitted.models[name], fitted.seconds is not None
-    validation, calibrations = evaluation.validate(fitted.unseen, baselines, links)
-    calibrations |= {key: own.calibration for key, own in fitted.models.items()}
-    scores = evaluation.score(fitted.models, baselines, links, folder, calibrations)
+    validation = evaluation.validate(fitted.unseen, baselines, links)
+    scores = evaluation.score(fitted.models, baselines, links, folder)
     metrics = {
         "task": task.name,
         "data": links.remarks,

@@ -2,6 +2,7 @@
 
 import copy
 import io
+import math
 import platform
 import statistics
 import time
@@ -22,10 +23,10 @@ from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
 from gaigs.kriging.intervals import Calibration, interval_scores, summarise_intervals
-from gaigs.kriging.links import folds_of
+from gaigs.kriging.links import evenly, folds_of
 from gaigs.model import Model, call_optional
 from gaigs.model.kriging import Kriging
-from gaigs.query import Batch
+from gaigs.query import Batch, Query
 from gaigs.registry import name_of, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.scene import Scene
@@ -33,6 +34,9 @@ from gaigs.task import Task
 
 BATCH = 64
 """Links predicted at a time."""
+
+CALIBRATION_FOLDS, MOST = 5, 1000
+"""Folds of known links that calibrate a look-up, and most links that they ask for."""
 
 INTERVALS = "interval_"
 """Beginning of the names of scores of intervals."""
@@ -90,28 +94,47 @@ def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor
     return torch.cat([model.spread(batch, part).cpu() for batch, part in batches])
 
 
-def calibrated(unseen: Model, links: Links) -> Calibration | None:
-    """The calibration of a model, by what it predicts for validation links that it is not fitted to.
+def calibrated(model: Model, links: Links) -> Calibration | None:
+    """The calibration of a model: errors where it has not seen the label; None without such links.
 
-    A kriged model chose weights and hyperparameters on these links: for each half of them they are chosen anew on the
-    other half. The step of a training stays the one chosen on all of them.
+    A look-up is fitted anew without each fold of the known links. A trained model is asked for the validation links;
+    the step of its training stays the one chosen on all of them. ``model`` of kriging is its validation model. It chose
+    weights and hyperparameters on these links: for each half of them they are chosen anew on the other half.
     """
-    split, index = links.split, links.split.validation
-    if not len(index) or links.held_out is not None:
+    split = links.split
+    if links.held_out is not None:
         return None
-    halves = folds_of(links, index) % 2
-    answers = [(unseen, index)]
-    if isinstance(unseen, Kriging) and 0 < halves.sum() < len(halves):
-        parts = index[halves == 0], index[halves == 1]
-        answers = []
-        for own, other in (parts, parts[::-1]):
-            kriged = Kriging(links.scene, unseen.trend, unseen.fallback_options).to(device_of(unseen))
-            answers.append((kriged.krige(replace(links, split=split.choosing(own)), is_final=False), other))
+    answers: list[tuple[Model, Int[Tensor, " k"]]] = [(model, split.validation)]
+    if not (is_trained(model) or isinstance(model, Kriging)):
+        index = torch.cat((split.train, split.validation))
+        folds, asked, answers = (
+            folds_of(links, index) % CALIBRATION_FOLDS,
+            torch.zeros(len(index), dtype=torch.bool),
+            [],
+        )
+        asked[evenly(torch.arange(len(index)), MOST)] = True
+        for fold in range(CALIBRATION_FOLDS):
+            part, known = index[(folds == fold) & asked], replace(links, split=split.only(index[folds != fold]))
+            if len(part) and all(len(known.known(receiver)) for receiver in range(len(links.receivers))):
+                copied = copy.deepcopy(model)
+                (copied.refit if hasattr(copied, "refit") else copied.fit)(known)
+                answers.append((copied, part))
+    elif isinstance(model, Kriging):
+        halves = folds_of(links, split.validation) % 2
+        parts = split.validation[halves == 0], split.validation[halves == 1]
+        if all(map(len, parts)):
+            answers = []
+            for own, other in (parts, parts[::-1]):
+                kriged = Kriging(links.scene, model.trend, model.fallback_options).to(device_of(model))
+                answers.append((kriged.krige(replace(links, split=split.choosing(own)), is_final=False), other))
+    if not sum(len(part) for _, part in answers):
+        return None
     index = torch.cat([part for _, part in answers])
-    values = [predict(model, links, part) for model, part in answers]
-    own = [spreads(model, links, part, value) for (model, part), value in zip(answers, values, strict=True)]
+    values = [predict(one, links, part) for one, part in answers]
+    own = [spreads(one, links, part, value) for (one, part), value in zip(answers, values, strict=True)]
     query, train = links.query[index], links.query[split.train]
-    return Calibration.of(links.task, links.labels[index], torch.cat(values), torch.cat(own), query, train)
+    by_distance = not hasattr(model, "deviations")
+    return Calibration.of(links.task, links.labels[index], torch.cat(values), torch.cat(own), query, train, by_distance)
 
 
 @dataclass(frozen=True)
@@ -179,8 +202,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
     if baselines is None:
         baselines = composed([f"task={task.name}"], {})["baselines"] if has_file("task", task.name) else ()
     baselines = [baselines] if isinstance(baselines, str) else baselines
-    calibrations = {key: model.calibration for key, model in models.items()}
-    scores = score(models, build_baselines(baselines, own, links.scene), links, None, calibrations)
+    scores = score(models, build_baselines(baselines, own, links.scene), links)
     return Evaluation(task, links.split.name, scores, device_name(device_of(model)))
 
 
@@ -197,11 +219,11 @@ def score(
     look_ups: Mapping[str, Model],
     links: Links,
     folder: Path | None = None,
-    calibrations: Mapping[str, Calibration | None] | None = None,
+    has_intervals: bool = True,
 ) -> Scores:
     """Scores of every test link by fitted models and by look-ups; a folder gets predictions of the first.
 
-    ``calibrations`` give those of their names scores of intervals too. If subcarriers are held out,
+    Look-ups and models with a calibration have scores of intervals too. If subcarriers are held out,
     ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an uplink is taken for a
     downlink.
     """
@@ -231,13 +253,20 @@ def score(
         model = models[key] if key in models else fitted(look_ups[key], links)
         values = predict(model, links, index, frequencies)
         add(key, values)
-        calibration = (calibrations or {}).get(key)
-        if calibration is not None and frequencies is None and (levels := calibration.levels((0.5, 0.9))):
+        calibration = model.calibration if key in models or not has_intervals else calibrated(model, links)
+        if (
+            has_intervals
+            and calibration is not None
+            and frequencies is None
+            and (levels := calibration.levels((0.5, 0.9)))
+        ):
             deviations = spreads(model, links, index, values)
             estimates = [calibration.estimate(values, deviations, query, level) for level in levels]
             found = interval_scores(task, labels, *estimates)
+            found["calibration_links"] = torch.full((len(index),), float(calibration.counts.sum()))
             scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
             content.setdefault("deviation", task.packed(estimates[-1].std))
+            content[f"shares_{key}"] = shares(calibration, task, labels, values, deviations, query)
     if links.held_out is not None:
         own: Any = links.task
         nearest = (own.frequencies - frequencies[:, None]).abs().argmin(1)
@@ -248,23 +277,32 @@ def score(
     return scores
 
 
+def shares(
+    calibration: Calibration, task: Task, labels: Tensor, values: Tensor, deviations: Tensor, query: Query
+) -> np.ndarray:
+    """Shares of the labels of at most 300 links within intervals of the levels 0.05 to 0.95 (19,)."""
+    some = evenly(torch.arange(len(labels)), 300)
+    parts = labels[some], values[some], deviations[some], query[some]
+    found = []
+    for level in np.arange(1, 20) / 20:
+        if not calibration.levels((level,)):
+            found.append(math.nan)
+            continue
+        estimate = calibration.estimate(*parts[1:], level)
+        found.append(interval_scores(task, parts[0], estimate, estimate)["coverage_90"].mean().item())
+    return np.array(found)
+
+
 def validating(links: Links) -> Links:
     """The links as models that have not been fitted to validation links see them, which are the test."""
     return replace(links, split=links.split.validating(), held_out=None)
 
 
-def validate(
-    models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links
-) -> tuple[Scores, dict[str, Calibration | None]]:
-    """Scores of every validation link, by models that have not been fitted to these links; empty without such links.
-
-    And the calibrations of the look-ups.
-    """
+def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
+    """Scores of every validation link, by models that have not been fitted to these links; empty without such links."""
     if not len(links.split.validation):
-        return {}, {}
-    unseen = {key: fitted(look_up, validating(links)) for key, look_up in look_ups.items()}
-    calibrations = {key: calibrated(look_up, links) for key, look_up in unseen.items()}
-    return score({**models, **unseen}, {}, validating(links)), calibrations
+        return {}
+    return score(models, look_ups, validating(links), has_intervals=False)
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:

@@ -127,7 +127,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     if not is_trained(model):
         unseen = {name: fitted(model, validating(links))} if len(links.split.validation) else {}
         model.fit(links)
-        model.calibration = calibrated(unseen[name], links) if unseen else None
+        model.calibration = calibrated(model, links)
         return Fitted({name: model}, unseen, 0)
     model.fit(links)
     start = count_gaussians(model)

@@ -42,7 +42,7 @@ def shares(task, count, level, repeats=40, **options):
         held, new = slice(0, count), slice(count, None)
         ones = torch.ones(len(query))
         train = query[:1]
-        calibration = Calibration.of(kind, labels[held], values[held], ones[held], query[held], train)
+        calibration = Calibration.of(kind, labels[held], values[held], ones[held], query[held], train, True)
         estimate = calibration.estimate(values[new], ones[new], query[new], level)
         found.append(interval_scores(kind, labels[new], estimate, estimate)["coverage_90"].mean().item())
     return np.mean(found), np.std(found) / math.sqrt(repeats)
@@ -60,12 +60,12 @@ def test_intervals_hold_their_share_of_new_links(task, count, level):
 def test_receivers_with_enough_links_have_intervals_of_their_own():
     kind, labels, values, query = made("rssi", 400, receivers=2)
     labels = torch.where(query.receivers == 1, values + 10 * (labels - values), labels)
-    calibration = Calibration.of(kind, labels, values, torch.ones(400), query, query[:1])
+    calibration = Calibration.of(kind, labels, values, torch.ones(400), query, query[:1], True)
     estimate = calibration.estimate(values[:2], torch.ones(2), query[:2], 0.9)
     widths = estimate.upper - estimate.lower
     assert widths[1] > 5 * widths[0]
-    few = slice(0, 80)
-    pooled = Calibration.of(kind, labels[few], values[few], torch.ones(80), query[few], query[:1])
+    few = slice(0, 180)
+    pooled = Calibration.of(kind, labels[few], values[few], torch.ones(180), query[few], query[:1], True)
     estimate = pooled.estimate(values[:2], torch.ones(2), query[:2], 0.9)
     torch.testing.assert_close(*(estimate.upper - estimate.lower))
 
@@ -74,7 +74,7 @@ def test_intervals_widen_with_the_distance_to_known_places():
     kind, labels, values, query = made("rssi", 400)
     known = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long))
     apart = query.transmitters.norm(dim=1)
-    calibration = Calibration.of(kind, values + apart * (labels - values), values, torch.ones(400), query, known)
+    calibration = Calibration.of(kind, values + apart * (labels - values), values, torch.ones(400), query, known, True)
     at = Query(torch.tensor([[0.5, 0.0, 0.0], [30.0, 0.0, 0.0]]), torch.zeros(2, dtype=torch.long))
     # The calibration's own links are known too, but far from the second place.
     near, far = (x for x in calibration.estimate(torch.zeros(2), torch.ones(2), at, 0.9).upper)
@@ -85,7 +85,7 @@ def test_a_models_own_deviation_scales_the_interval():
     kind, labels, values, query = made("rssi", 200)
     deviations = 1 + query.transmitters[:, 0]
     labels = values + deviations * (labels - values)
-    calibration = Calibration.of(kind, labels, values, deviations, query, query[:1])
+    calibration = Calibration.of(kind, labels, values, deviations, query, query[:1], True)
     found = calibration.estimate(values[:2], torch.tensor([1.0, 3.0]), query[:2], 0.9)
     assert (found.upper - found.value)[1] == pytest.approx(3 * (found.upper - found.value)[0].item(), rel=1e-4)
     assert found.std[1] == pytest.approx(3 * found.std[0].item())
@@ -94,7 +94,7 @@ def test_a_models_own_deviation_scales_the_interval():
 def test_amplitudes_are_not_negative_and_larger_ones_err_more():
     kind, labels, values, query = made("spectrum", 100)
     labels = (values + values * (labels - values)).clamp_min(0)
-    calibration = Calibration.of(kind, labels, values, torch.ones(100), query, query[:1])
+    calibration = Calibration.of(kind, labels, values, torch.ones(100), query, query[:1], True)
     found = calibration.estimate(values, torch.ones(100), query, 0.9)
     assert found.lower.min() == 0
     half = found.upper - found.value
@@ -104,7 +104,7 @@ def test_amplitudes_are_not_negative_and_larger_ones_err_more():
 def test_discs_and_the_expected_snr_of_channels():
     kind, labels, values, query = made("csi", 300, size=0.1)
     held = slice(0, 40)  # too few for groups of distances: the calibration's own links may be asked
-    calibration = Calibration.of(kind, labels[held], values[held], torch.ones(40), query[held], query[:1])
+    calibration = Calibration.of(kind, labels[held], values[held], torch.ones(40), query[held], query[:1], True)
     labels, values, query = labels[held], values[held], query[held]
     found = calibration.estimate(values, torch.ones(40), query, 0.9)
     assert (found.lower, found.upper) == (None, None)
@@ -129,8 +129,8 @@ def test_scores_are_those_of_the_normal_distribution():
         expected, _ = quad(steps, -30, 30, points=[labels[i].item(), value[i].item()], limit=200)
         assert found["crps"][i].item() == pytest.approx(expected, rel=1e-5)
         assert found["nll"][i].item() == pytest.approx(-normal.logpdf(labels[i].item()), rel=1e-6)
-    numbers = summarise_intervals(found)
-    assert (numbers["coverage_50"], numbers["coverage_50_error"]) == (0.5, pytest.approx(0.5))
+    numbers = summarise_intervals({**found, "calibration_links": torch.tensor([2.0, 2.0])})
+    assert (numbers["coverage_50"], numbers["coverage_50_error"]) == (0.5, pytest.approx(0.5**0.5))
 
 
 def test_distances_are_those_to_the_same_receivers_places():
@@ -171,10 +171,12 @@ def test_trained_models_and_look_ups_have_intervals(task, name, tmp_path):
 def test_intervals_that_the_links_cannot_give_are_refused():
     links = example_links("rssi")
     none = replace(links, split=replace(links.split, validation=links.split.validation[:0]))
+    few = {"enable_progress_bar": False, "max_steps": 1, "count": 10, "accelerator": "cpu"}
+    model = gaigs.train("gaigs", none, **few)
     with pytest.raises(ValueError, match="no validation links have measured its errors"):
-        gaigs.train("knn", none).predict([1.0, 1.0, 1.0], interval=0.9)
+        model.predict([1.0, 1.0, 1.0], interval=0.9)
     model = gaigs.train("knn", links)
-    with pytest.raises(ValueError, match=r"99.9 % needs 999 validation links, the model has \d+"):
+    with pytest.raises(ValueError, match=r"99.9 % needs 999 links to calibrate it, the model has \d+"):
         model.predict([1.0, 1.0, 1.0], interval=0.999)
     for wrong in (0.0, 1.0, 90):
         with pytest.raises(ValueError, match="interval must be a probability"):

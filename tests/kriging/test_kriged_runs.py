@@ -78,7 +78,7 @@ def test_the_checkpoint_holds_the_kriged_model(finished):
 def test_a_run_killed_after_its_kriging_continues(finished, tmp_path, monkeypatch):
     config, folder, metrics = finished
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "score", lambda *_: 1 / 0)
+        patch.setattr(evaluation, "score", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             runs.run(config, tmp_path)
     assert checkpoint.read(tmp_path / "best.ckpt")[checkpoint.KEY]["model"]["name"] == "kriging"

@@ -1,0 +1,56 @@
+"""Error after n places that a survey plans, beside n and 1.4 n random ones: python benchmarks/survey.py [--flat DIR].
+
+15 random places are measured first; the other known places are candidates. A new plan is made at 15, 20, 40 and 60. A
+Gaussian process is fitted to the chosen places, and scored on the official test. Seeds 0 to 4 draw the first and the
+random places.
+"""
+
+import argparse
+from dataclasses import replace
+
+import torch
+
+import gaigs
+
+START, COUNTS = 15, (20, 40, 60, 100)
+
+
+def score(links, places):
+    """Mean absolute error, or 1 - mean SSIM, of a Gaussian process of some places."""
+    train = torch.cat((links.split.train, links.split.validation))
+    rows = train[(links.query.transmitters[train][:, None] == places).all(-1).any(1)]
+    known = replace(links, split=replace(links.split, train=rows, validation=rows[:0]))
+    model = gaigs.train("gaussian_process", known)
+    numbers = gaigs.evaluate(model, known, []).models["gaussian_process"]
+    return model, 1 - numbers["ssim_mean"] if links.task.name == "spectrum" else numbers["mae_db"]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--flat", help="folder of ble-flat")
+    arguments = parser.parse_args()
+    sets = {"built-in RSSI": gaigs.links("synthetic_rssi"), "built-in spectra": gaigs.links("synthetic")}
+    if arguments.flat:
+        sets["ble-flat"] = gaigs.links("nerf2_rssi", root=arguments.flat)
+    print("| data | places | planned | as many random | 1.4 times as many random |\n|---|---|---|---|---|")
+    for name, links in sets.items():
+        known = torch.cat((links.split.train, links.split.validation))
+        places = links.query.transmitters[known].unique(dim=0)
+        rows = {count: [] for count in COUNTS}
+        for seed in range(5):
+            order = places[torch.randperm(len(places), generator=torch.Generator().manual_seed(seed))]
+            chosen = order[:START]
+            random, candidates = order.flip(0), order[START : START + 1500]  # random ones are not the first
+            for count in COUNTS:  # a round of measurements each, with a new plan
+                model, _ = score(links, chosen)
+                left = candidates[~(candidates[:, None] == chosen).all(-1).any(1)]
+                chosen = torch.cat((chosen, gaigs.survey(model, count=count - len(chosen), candidates=left).places))
+                parts = chosen, random[:count], random[: round(1.4 * count)]
+                rows[count].append([score(links, part)[1] for part in parts])
+        for count, values in rows.items():
+            means = torch.tensor(values).mean(0).tolist()
+            print(f"| {name} | {count} | " + " | ".join(f"{mean:.3f}" for mean in means) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

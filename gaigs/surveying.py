@@ -1,0 +1,272 @@
+"""Survey planning: where to measure next, and which measured places could have been left out."""
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from gaigs.io.files import write_text
+from gaigs.kriging.kernel import LIMIT, Process
+from gaigs.kriging.links import coordinates, evenly
+from gaigs.model import Model, call_optional
+from gaigs.query import Query, as_positions
+from gaigs.registry import call
+from gaigs.report import style
+from gaigs.runs import model_of
+
+POINTS = 1000
+"""Approximate number of candidates, and of places at which the error is stated, of a region."""
+
+MEAN = math.sqrt(2 / math.pi)
+"""Mean absolute value of a normal variable over its standard deviation."""
+
+COMPARED = 1500
+"""Most readings of a receiver among which those that could be left out are searched."""
+
+TOLERATED = 1.05
+"""Largest rise of the mean error for which known places count as superfluous together."""
+
+
+@dataclass(frozen=True)
+class SurveyPlan:
+    """The next places to measure, and the mean error that is expected after each.
+
+    Attributes:
+        places: To measure, the most useful first (n, 3) [m].
+        errors: Expected mean absolute error of a label over the region and all receivers, before and after each place,
+            in the label's unit (n + 1,).
+        known: Places that were measured (k, 3) [m].
+        losses: Rise of the mean error if one of them had been left out (k,).
+        superfluous: Known places that together raise the error by at most 5 % if left out (k,).
+        unit: Of the errors.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> print(gaigs.survey(gaigs.train("gaussian_process", links), count=3))
+        3 more places bring the expected mean error from ...
+    """
+
+    places: Float[Tensor, "n 3"]
+    errors: Float[Tensor, " n1"]
+    known: Float[Tensor, "k 3"]
+    losses: Float[Tensor, " k"]
+    superfluous: Bool[Tensor, " k"]
+    unit: str = ""
+
+    def __str__(self) -> str:
+        first, last = (f"{error:.3g}" for error in (self.errors[0], self.errors[-1]))
+        few = int(self.superfluous.sum())
+        words = (
+            f"{len(self.places)} more places bring the expected mean error from {first} to {last} {self.unit}".rstrip()
+        )
+        return f"{words}; {few} of {len(self.known)} measured places could have been left out for 5 % more"
+
+    def save(self, path: str | Path) -> None:
+        """Writes a CSV table: places to measure, each with the error after it, then measured ones to leave out."""
+        table = io.StringIO()
+        rows = csv.writer(table, lineterminator="\n")
+        rows.writerow(["use", "x", "y", "z", "mean_error"])
+        for place, error in zip(self.places.tolist(), self.errors[1:].tolist(), strict=True):
+            rows.writerow(["measure", *(f"{x:.3f}" for x in place), f"{error:.4g}"])
+        for place, loss in zip(
+            self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist(), strict=True
+        ):
+            rows.writerow(["leave out", *(f"{x:.3f}" for x in place), f"{self.errors[0] + loss:.4g}"])
+        write_text(Path(path), table.getvalue())
+
+
+@torch.no_grad()
+def survey(
+    model: Model,
+    region: object = None,
+    count: int = 20,
+    candidates: object = None,
+    frequency: float | None = None,
+) -> SurveyPlan:
+    """The next places to measure: each lowers the mean variance over a region most, at all receivers together.
+
+    Labels do not enter beyond the fitted process, so a plan is made before anything is measured. The largest variance
+    would be a poor guide: it is in the corners.
+
+    Args:
+        model: ``gaussian_process``, or a trained model with kriging.
+        region: Two corners of a box [[x, y, z], [x, y, z]] [m], over which the error is stated; None: the candidates
+            or, without these, the box of the training transmitters.
+        count: Number of places; at most as many as there are candidates.
+        candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
+        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
+
+    Raises:
+        ValueError: The model has no process over places, the count is less than 1, or a place is impossible.
+
+    Example:
+        >>> model = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=60))
+        >>> plan = gaigs.survey(model, count=5)
+        >>> plan.places.shape, bool(plan.errors[-1] < plan.errors[0])
+        (torch.Size([5, 3]), True)
+        >>> plan.save("survey.csv")
+
+    Source: Krause, Singh and Guestrin, Near-optimal sensor placements in Gaussian processes, 2008; the criterion is the
+    A-optimal one of Cohn, Neural network exploration using optimal experiment design, 1996.
+    """
+    scene = model.scene
+    found = [call_optional(model, "process_at", receiver) for receiver in range(len(scene.receivers))]
+    processes: list[Process] = [process for process in found if process is not None]
+    if not processes:
+        raise ValueError(
+            "a survey takes a process over places; take model=gaussian_process, or kriging=true for RSSI or spectra"
+        )
+    if count < 1:
+        raise ValueError(f"count must be at least 1 place, got {count}")
+    box = torch.stack((scene.lower, scene.upper)) if region is None else as_positions("region", region).reshape(-1, 3)
+    if len(box) != 2:
+        raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points")
+    places = grid(*box) if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
+    beside = places[:0] if candidates is None or region is None else grid(*box)
+    if frequency is None and len(scene.frequencies):
+        frequency = float(scene.frequencies[len(scene.frequencies) // 2])
+    points = torch.cat((places, beside))
+    carriers = None if frequency is None else torch.full((len(points),), frequency)
+    asked = coordinates(scene, Query(points, torch.zeros(len(points), dtype=torch.long), carriers), 1.0)
+    asked = asked.to(processes[0].places)
+    stated = slice(len(places) if len(beside) else 0, None)
+    factor = 1.0 if model.calibration is None else model.calibration.sizes.square().mean().sqrt().item()
+    posteriors = [posterior(process, asked) for process in processes]
+    noises = [process.noise for process in processes]
+    error = lambda parts: (
+        MEAN
+        * factor
+        * np.mean(
+            [
+                (part.diagonal()[stated].clamp_min(0) + noise).sqrt().mean().item()
+                for part, noise in zip(parts, noises, strict=True)
+            ]
+        )
+    )
+    chosen, errors = [], [error(posteriors)]
+    free = torch.ones(len(places), dtype=torch.bool)
+    for _ in range(min(count, len(places))):
+        gains = sum(
+            part[stated, : len(places)].square().mean(0) / (part.diagonal()[: len(places)] + noise)
+            for part, noise in zip(posteriors, noises, strict=True)
+        )
+        best = int(gains.cpu().masked_fill(~free, -math.inf).argmax())
+        free[best] = False
+        chosen.append(best)
+        for part, noise in zip(posteriors, noises, strict=True):
+            part -= torch.outer(part[best], part[best]) / (part[best, best] + noise)
+        errors.append(error(posteriors))
+    known, losses, superfluous = without(processes, asked[stated], MEAN * factor)
+    unit = getattr(scene.task, "error_unit", scene.task.unit)
+    return SurveyPlan(places[chosen], torch.tensor(errors), known, losses, superfluous, unit)
+
+
+def run(config: dict, folder: Path) -> None:
+    """Plans a survey by the model of a finished run; writes ``survey.csv`` and ``survey.png`` into a folder."""
+    if config["folder"] is None:
+        raise ValueError("command=survey needs the folder of a finished run; add folder=runs/...")
+    plan = call("survey", survey, config["survey"], model=model_of(config["folder"]))
+    folder.mkdir(parents=True, exist_ok=True)
+    plan.save(folder / "survey.csv")
+    style.save(figure(plan), folder / "survey.png")
+    print(plan)
+    print(f"results: {folder}")
+
+
+def figure(plan: SurveyPlan) -> Figure:
+    """Places from above, and the expected error after each new one."""
+    with rc_context(style.STYLE):
+        drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
+        left, right = drawn.subplots(1, 2)
+        for rows, look, words in (
+            (~plan.superfluous, {"color": style.GREY}, "measured"),
+            (plan.superfluous, {"markeredgecolor": style.GREY, "color": "none"}, "measured, could be left out"),
+        ):
+            left.plot(*plan.known[rows, :2].T.numpy(), "o", markersize=3, label=words, **look)
+        left.plot(
+            *plan.places[:, :2].T.numpy(), "o", markersize=8, color=style.ORANGE, label="to measure, in this order"
+        )
+        for number, place in enumerate(plan.places.tolist(), 1):
+            left.annotate(str(number), place[:2], ha="center", va="center", color="white", size=5)
+        left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+        drawn.legend(loc="outside lower left", ncols=3)
+        right.plot(range(len(plan.errors)), plan.errors.numpy(), color=style.BLUE)
+        right.set(
+            xlabel="new places", ylabel=f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
+        )
+        right.xaxis.get_major_locator().set_params(integer=True)
+        right.grid()
+        right.set_axisbelow(True)
+    return drawn
+
+
+def grid(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> Float[Tensor, "g 3"]:
+    """About ``POINTS`` evenly spaced places in a box; an edge far shorter than the others has one."""
+    lower, edges = torch.minimum(lower, upper), (upper - lower).abs()
+    long = edges[edges > 0.2 * edges.max()]
+    pitch = float(long.prod() / POINTS) ** (1 / max(len(long), 1)) or 1.0
+    counts = [max(1, round(edge / pitch)) for edge in edges.tolist()]
+    axes = [low + edge * (torch.arange(n) + 0.5) / n for low, edge, n in zip(lower, edges, counts, strict=True)]
+    return torch.cartesian_prod(*axes)
+
+
+def posterior(process: Process, asked: Float[Tensor, "g d"]) -> Float[Tensor, "g g"]:
+    """Covariances of the process at places, given its readings; of many an even part."""
+    rows = evenly(torch.arange(len(process.places)), LIMIT).to(process.places.device)
+    left, _ = whitened(process, rows, asked)
+    return process.covariances(asked, asked) - left.mT @ left
+
+
+def whitened(
+    process: Process, rows: Int[Tensor, " j"], asked: Float[Tensor, "g d"]
+) -> tuple[Float[Tensor, "j g"], Float[Tensor, "j j"]]:
+    """Covariances of some known readings with places over the readings' Cholesky factor; and this factor."""
+    places = process.places[rows]
+    own = process.covariances(places, places)
+    own.diagonal().add_(process.noises[rows])
+    factor = torch.linalg.cholesky(own)
+    return torch.linalg.solve_triangular(factor, process.covariances(places, asked), upper=False), factor
+
+
+def without(
+    processes: list[Process], asked: Float[Tensor, "g d"], factor: float
+) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Bool[Tensor, " k"]]:
+    """Known places, the rise of the mean error without each, and those that together raise it by little."""
+    rows = [evenly(torch.arange(len(process.places)), COMPARED).to(asked.device) for process in processes]
+    known = torch.cat([process.places[own] for process, own in zip(processes, rows, strict=True)]).unique(dim=0)
+    which = [torch.cdist(process.places[own], known).argmin(1) for process, own in zip(processes, rows, strict=True)]
+    prior = [process.covariances(asked[:1], asked[:1])[0, 0] for process in processes]  # the same everywhere
+
+    def error(kept: Bool[Tensor, " k"]) -> float:
+        parts = []
+        for process, own, place, variance in zip(processes, rows, which, prior, strict=True):
+            left, _ = whitened(process, own[kept[place]], asked)
+            parts.append((variance - left.square().sum(0) + process.noise).sqrt().mean().item())
+        return float(np.mean(parts))
+
+    losses = known.new_zeros(len(known))
+    for process, own, place, variance in zip(processes, rows, which, prior, strict=True):
+        left, root = whitened(process, own, asked)
+        deviations = (variance - left.square().sum(0) + process.noise).sqrt()
+        weights = torch.linalg.solve_triangular(root.mT, left, upper=True)
+        # Without reading i variances rise by w_i² over the inverse's diagonal; roots by half of it over themselves.
+        rises = (weights.square() / (2 * deviations)).mean(1) / torch.cholesky_inverse(root).diagonal()
+        losses.index_add_(0, place, rises / len(processes))
+    order, before = losses.argsort(), error(torch.ones(len(known), dtype=torch.bool, device=known.device))
+    fewest, most = 0, len(known) - 1  # places that may, and may not be left out together
+    superfluous = torch.zeros(len(known), dtype=torch.bool)
+    while most - fewest > max(1, len(known) // 32):
+        middle = (fewest + most) // 2
+        kept = torch.ones(len(known), dtype=torch.bool, device=known.device)
+        kept[order[:middle]] = False
+        fewest, most = (middle, most) if error(kept) <= TOLERATED * before else (fewest, middle)
+    superfluous[order[:fewest].cpu()] = True
+    return known[:, :3].float().cpu(), factor * losses.cpu(), superfluous

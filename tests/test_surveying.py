@@ -1,0 +1,122 @@
+"""Survey plans against covariances by numpy, and against places drawn at random."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+
+import gaigs
+from gaigs.kriging import scalar
+from gaigs.kriging.kernel import Process
+from gaigs.surveying import MEAN, grid, posterior, without
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(scalar, "NEAREST", 8)
+
+
+def process(seed=0, known=12, noise=0.3):
+    rng = np.random.default_rng(seed)
+    places = torch.from_numpy(rng.uniform(0, 4, (known, 3)))
+    covariances = lambda a, b: 4 * torch.from_numpy(np.exp(-cdist(a, b) / 1.5))
+    return Process(covariances, places, torch.full((known,), noise, dtype=torch.float64), noise)
+
+
+def variances(process, rows, asked):
+    """Variances at places given some of the known readings, in numpy."""
+    places, cover = process.places[rows], lambda a, b: process.covariances(a, b).numpy()
+    own = cover(places, places) + np.diag(process.noises[rows])
+    return np.diag(cover(asked, asked) - cover(asked, places) @ np.linalg.solve(own, cover(places, asked)))
+
+
+def test_covariances_are_those_given_the_readings():
+    own, asked = process(), torch.rand(5, 3, dtype=torch.float64) * 4
+    np.testing.assert_allclose(posterior(own, asked).diagonal(), variances(own, range(12), asked), atol=1e-9)
+
+
+def test_losses_are_those_of_leaving_a_place_out():
+    own, asked = process(noise=1.0), torch.rand(60, 3, dtype=torch.float64) * 4
+    known, losses, superfluous = without([own], asked, MEAN)
+    error = lambda rows: MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
+    every = error(range(12))
+    for place, loss in zip(known, losses, strict=True):
+        kept = (own.places.float() != place).any(1).nonzero()[:, 0]
+        assert loss.item() == pytest.approx(error(kept) - every, rel=0.15)
+    kept = [i for i in range(12) if not superfluous[(known == own.places[i].float()).all(1)]]
+    assert error(kept) <= 1.05 * every
+    assert 0 < superfluous.sum() < 12
+
+
+def test_each_place_lowers_the_mean_variance_most():
+    links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
+    model = gaigs.train("gaussian_process", links)
+    candidates = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) * 3
+    box = candidates.amin(0), candidates.amax(0)
+    plan = gaigs.survey(model, region=torch.stack(box), count=3, candidates=candidates)
+    processes, asked = [model.process_at(receiver) for receiver in range(4)], grid(*box).double()
+    known = []
+    for place in plan.places:
+        means = []
+        for candidate in candidates:
+            parts = []
+            for own in processes:
+                extra = torch.stack([*known, candidate]).double()
+                noises = torch.cat((own.noises, torch.full((len(extra),), own.noise, dtype=torch.float64)))
+                more = replace(own, places=torch.cat((own.places, extra)), noises=noises)
+                parts.append(variances(more, range(len(more.places)), asked).mean())
+            means.append(np.mean(parts))
+        assert torch.equal(candidates[int(np.argmin(means))], place)
+        known.append(place)
+    assert (plan.errors.diff() < 0).all()
+
+
+def test_planned_places_are_worth_more_than_random_ones():
+    links = gaigs.links("synthetic", transmitters=200, order=1)
+    split, places = links.split, links.query.transmitters
+    train = torch.cat((split.train, split.validation))
+    order = places[train][torch.randperm(len(train), generator=torch.Generator().manual_seed(1))]
+
+    def trained(chosen):
+        rows = train[(places[train][:, None] == chosen).all(-1).any(1)]
+        known = replace(links, split=replace(split, train=rows, validation=rows[:0]))
+        return gaigs.train("gaussian_process", known), known
+
+    first, _ = trained(order[:15])
+    plan = gaigs.survey(first, count=25, candidates=order[15:])
+    planned, random = (
+        gaigs.evaluate(*trained(chosen), []).models["gaussian_process"]["ssim_mean"]
+        for chosen in (torch.cat((order[:15], plan.places)), order[:40])
+    )
+    assert planned > random + 0.01
+
+
+def test_plans_are_written_and_wrong_ones_are_refused(tmp_path):
+    links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
+    model = gaigs.train("gaussian_process", links)
+    plan = gaigs.survey(model, count=4)
+    plan.save(tmp_path / "survey.csv")
+    lines = (tmp_path / "survey.csv").read_text().splitlines()
+    assert lines[0] == "use,x,y,z,mean_error"
+    assert [line.split(",")[0] for line in lines[1:]] == ["measure"] * 4 + ["leave out"] * int(plan.superfluous.sum())
+    assert str(plan).startswith("4 more places bring the expected mean error from ")
+    with pytest.raises(ValueError, match="count must be at least 1"):
+        gaigs.survey(model, count=0)
+    with pytest.raises(ValueError, match="two corners"):
+        gaigs.survey(model, region=[[0.0, 0.0, 0.0]])
+    with pytest.raises(ValueError, match="a survey takes a process over places"):
+        gaigs.survey(gaigs.train("mean", links))
+
+
+def test_the_command_plans_by_a_finished_run(tmp_path, capsys):
+    words = ("+experiment=rssi", "model=gaussian_process", "data.transmitters=40", "data.order=0", "baselines=[]")
+    gaigs.run(gaigs.compose(*words), tmp_path / "run")
+    gaigs.run(gaigs.compose("command=survey", f"folder={tmp_path / 'run'}", "survey.count=2"), tmp_path / "plan")
+    assert {path.name for path in (tmp_path / "plan").iterdir()} == {"survey.csv", "survey.png"}
+    assert "2 more places bring" in capsys.readouterr().out
+    with pytest.raises(FileNotFoundError, match="holds no run"):
+        gaigs.run(gaigs.compose("command=survey", f"folder={tmp_path}"), tmp_path / "plan")
+    with pytest.raises(ValueError, match="needs the folder of a finished run"):
+        gaigs.run(gaigs.compose("command=survey"), tmp_path / "plan")
