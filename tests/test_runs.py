@@ -213,8 +213,11 @@ def test_metrics(finished):
     best = torch.load(folder / "best.ckpt", weights_only=True)["callbacks"]
     (kept,) = (state["best"] for name, state in best.items() if name.startswith("KeepBest"))
     assert metrics["validation_score"] == metrics["validation"]["gaigs"]["ssim_mean"] == pytest.approx(kept, abs=1e-6)
-    for scores in metrics["models"].values():
-        assert list(scores) == ["ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae"]
+    numbers = ["ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae"]
+    intervals = ["coverage_50", "coverage_50_error", "coverage_90", "coverage_90_error", "width_90", "crps", "nll"]
+    for name, scores in metrics["models"].items():  # two validation links are too few for intervals of 90 %
+        assert list(scores) == numbers + [*intervals, "calibration_links"] * (name != "gaigs")
+        assert list(metrics["validation"][name]) == numbers
 
 
 def test_predictions_belong_to_the_test_links(finished):
@@ -546,7 +549,7 @@ def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch):
 def test_a_run_killed_behind_its_training_only_tests_anew(finished, tmp_path, monkeypatch):
     config, folder, metrics = finished
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "score", lambda *_: 1 / 0)
+        patch.setattr(evaluation, "score", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             runs.run(config, tmp_path)
     monkeypatch.setattr(Descent, "training_step", lambda *_: 1 / 0)

@@ -193,14 +193,14 @@ class Model(nn.Module):
             parts, shape = self._values(*arguments)
             values = torch.cat([*parts])
             return values.reshape(shape + values.shape[1:])
-        if not isinstance(interval, float) or not 0 < interval < 1:
+        if not 0 < interval < 1:
             raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
         if self.calibration is None:
             raise ValueError(
                 "the model has no intervals: no validation links have measured its errors\n"
                 "train it by gaigs.train or a run, on links with split.validation above 0"
             )
-        estimates, shape = self._values(*arguments, interval)
+        estimates, shape = self._values(*arguments, float(interval))
         parts = (None if part[0] is None else torch.cat(part) for part in zip(*estimates, strict=True))
         return Estimate(*(None if part is None else part.reshape(shape + part.shape[1:]) for part in parts))
 
