@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,11 @@ from torch import Tensor
 
 from gaigs.io.files import write_text
 from gaigs.kriging.kernel import LIMIT, Process
-from gaigs.kriging.links import coordinates, evenly
+from gaigs.kriging.links import coordinates, distances, evenly
+from gaigs.kriging.scalar import is_scalar
 from gaigs.model import Model, call_optional
 from gaigs.query import Query, as_positions
-from gaigs.registry import call
+from gaigs.registry import call, check_type
 from gaigs.report import style
 from gaigs.runs import model_of
 
@@ -27,6 +28,9 @@ POINTS = 1000
 
 MEAN = math.sqrt(2 / math.pi)
 """Mean absolute value of a normal variable over its standard deviation."""
+
+MEMORY = 2e9
+"""Bytes of the covariances of all receivers."""
 
 COMPARED = 1500
 """Most readings of a receiver among which those that could be left out are searched."""
@@ -117,6 +121,8 @@ def survey(
     Source: Krause, Singh and Guestrin, Near-optimal sensor placements in Gaussian processes, 2008; the criterion is the
     A-optimal one of Cohn, Neural network exploration using optimal experiment design, 1996.
     """
+    check_type("model", model, Model)
+    check_type("count", count, int)
     scene = model.scene
     found = [call_optional(model, "process_at", receiver) for receiver in range(len(scene.receivers))]
     processes: list[Process] = [process for process in found if process is not None]
@@ -131,12 +137,17 @@ def survey(
         raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points")
     places = grid(*box) if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
     beside = places[:0] if candidates is None or region is None else grid(*box)
+    most = int((MEMORY / 8 / len(processes)) ** 0.5)
+    if not 0 < len(places) <= most:
+        raise ValueError(f"a survey takes 1 to {most} candidates, got {len(places)}; leave some out")
     if frequency is None and len(scene.frequencies):
         frequency = float(scene.frequencies[len(scene.frequencies) // 2])
-    points = torch.cat((places, beside))
-    carriers = None if frequency is None else torch.full((len(points),), frequency)
-    asked = coordinates(scene, Query(points, torch.zeros(len(points), dtype=torch.long), carriers), 1.0)
+    points, names = torch.cat((places, beside)), [receiver.name for receiver in scene.receivers]
+    query, _ = Query.from_positions(points, 0, frequency, names, scene.frequencies)
+    asked = coordinates(scene, query, 1.0)
     asked = asked.to(processes[0].places)
+    centres = scene.positions(asked) if is_scalar(scene) else [None] * len(processes)
+    processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
     stated = slice(len(places) if len(beside) else 0, None)
     factor = 1.0 if model.calibration is None else model.calibration.sizes.square().mean().sqrt().item()
     posteriors = [posterior(process, asked) for process in processes]
@@ -218,6 +229,25 @@ def grid(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> Float[Tensor, 
     return torch.cartesian_prod(*axes)
 
 
+def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process:
+    """The process with the coefficients of its trend, which readings have to determine too.
+
+    They are a constant and, for labels of one number, a slope over the logarithm of the distance to the receiver, with
+    a standard deviation of ten times that of the readings (universal kriging).
+    """
+    scale = 10 * float(process.covariances(process.places[:1], process.places[:1])[0, 0] + process.noise) ** 0.5
+    decades = lambda places: (places[:, :3] - receiver).norm(dim=1).clamp_min(0.1).log10()
+    middle = decades(process.places).mean() if receiver is not None else 0.0
+
+    def covariances(a: Tensor, b: Tensor) -> Tensor:
+        products = torch.ones(len(a), len(b), dtype=a.dtype, device=a.device)
+        if receiver is not None:
+            products = products + torch.outer(decades(a) - middle, decades(b) - middle)
+        return process.covariances(a, b) + scale**2 * products
+
+    return replace(process, covariances=covariances)
+
+
 def posterior(process: Process, asked: Float[Tensor, "g d"]) -> Float[Tensor, "g g"]:
     """Covariances of the process at places, given its readings; of many an even part."""
     rows = evenly(torch.arange(len(process.places)), LIMIT).to(process.places.device)
@@ -241,21 +271,23 @@ def without(
 ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Bool[Tensor, " k"]]:
     """Known places, the rise of the mean error without each, and those that together raise it by little."""
     rows = [evenly(torch.arange(len(process.places)), COMPARED).to(asked.device) for process in processes]
-    known = torch.cat([process.places[own] for process, own in zip(processes, rows, strict=True)]).unique(dim=0)
-    which = [torch.cdist(process.places[own], known).argmin(1) for process, own in zip(processes, rows, strict=True)]
-    prior = [process.covariances(asked[:1], asked[:1])[0, 0] for process in processes]  # the same everywhere
+    measured = [process.places[own, :3] for process, own in zip(processes, rows, strict=True)]
+    known = torch.cat(measured).unique(dim=0)
+    which = [distances(places, known).argmin(1) for places in measured]
+    one_by_one = lambda process: torch.cat([process.covariances(x, x).diagonal() for x in asked.split(1)])
+    prior = [one_by_one(process) for process in processes]
 
     def error(kept: Bool[Tensor, " k"]) -> float:
         parts = []
         for process, own, place, variance in zip(processes, rows, which, prior, strict=True):
             left, _ = whitened(process, own[kept[place]], asked)
-            parts.append((variance - left.square().sum(0) + process.noise).sqrt().mean().item())
+            parts.append(((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt().mean().item())
         return float(np.mean(parts))
 
     losses = known.new_zeros(len(known))
     for process, own, place, variance in zip(processes, rows, which, prior, strict=True):
         left, root = whitened(process, own, asked)
-        deviations = (variance - left.square().sum(0) + process.noise).sqrt()
+        deviations = ((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt()
         weights = torch.linalg.solve_triangular(root.mT, left, upper=True)
         # Without reading i variances rise by w_i² over the inverse's diagonal; roots by half of it over themselves.
         rises = (weights.square() / (2 * deviations)).mean(1) / torch.cholesky_inverse(root).diagonal()
@@ -269,4 +301,4 @@ def without(
         kept[order[:middle]] = False
         fewest, most = (middle, most) if error(kept) <= TOLERATED * before else (fewest, middle)
     superfluous[order[:fewest].cpu()] = True
-    return known[:, :3].float().cpu(), factor * losses.cpu(), superfluous
+    return known.float().cpu(), factor * losses.cpu(), superfluous

@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 import gaigs
 from gaigs.kriging import scalar
 from gaigs.kriging.kernel import Process
-from gaigs.surveying import MEAN, grid, posterior, without
+from gaigs.surveying import MEAN, grid, posterior, with_trend, without
 
 
 @pytest.fixture(autouse=True)
@@ -56,7 +56,8 @@ def test_each_place_lowers_the_mean_variance_most():
     candidates = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) * 3
     box = candidates.amin(0), candidates.amax(0)
     plan = gaigs.survey(model, region=torch.stack(box), count=3, candidates=candidates)
-    processes, asked = [model.process_at(receiver) for receiver in range(4)], grid(*box).double()
+    centres, asked = links.scene.positions(candidates.double()), grid(*box).double()
+    processes = [with_trend(model.process_at(receiver), centres[receiver]) for receiver in range(4)]
     known = []
     for place in plan.places:
         means = []
@@ -93,6 +94,18 @@ def test_planned_places_are_worth_more_than_random_ones():
     assert planned > random + 0.01
 
 
+def test_places_that_the_trend_needs_are_not_superfluous():
+    rng = torch.Generator().manual_seed(0)
+    places, gateway = 8 * torch.rand(50, 3, generator=rng), torch.tensor([0.0, 0.0, 2.0])
+    labels = -40 - 30 * (places - gateway).norm(dim=1).log10() + 2 * torch.randn(50, generator=rng)
+    links = gaigs.links(task="rssi", transmitters=places, receivers=gateway[None], labels=labels[:, None])
+    plan = gaigs.survey(gaigs.train("gaussian_process", links), count=1)
+    kept = plan.known[~plan.superfluous]
+    assert len(kept) >= 6
+    apart = (kept - gateway).norm(dim=1).log10()
+    assert apart.max() - apart.min() > 0.3
+
+
 def test_plans_are_written_and_wrong_ones_are_refused(tmp_path):
     links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
     model = gaigs.train("gaussian_process", links)
@@ -104,6 +117,10 @@ def test_plans_are_written_and_wrong_ones_are_refused(tmp_path):
     assert str(plan).startswith("4 more places bring the expected mean error from ")
     with pytest.raises(ValueError, match="count must be at least 1"):
         gaigs.survey(model, count=0)
+    with pytest.raises(ValueError, match="candidates, got 0"):
+        gaigs.survey(model, candidates=torch.zeros(0, 3))
+    with pytest.raises(ValueError, match="carrier in Hz"):
+        gaigs.survey(model, frequency=2.4)
     with pytest.raises(ValueError, match="two corners"):
         gaigs.survey(model, region=[[0.0, 0.0, 0.0]])
     with pytest.raises(ValueError, match="a survey takes a process over places"):

@@ -69,6 +69,7 @@ class Calibration:
         quantiles: Of the errors at levels 0 to 1 (groups, bins, ``STEPS`` + 1).
         sizes: Root mean square of the errors (groups, bins).
         places, receivers: Of the known links, for the distance; empty with one group of distances.
+        lowest: Least possible label.
 
     Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; by groups of links: Dunn,
     Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical models, 2022.
@@ -81,6 +82,7 @@ class Calibration:
     sizes: Float[Tensor, "g b"]
     places: Float[Tensor, "k 3"]
     receivers: Int[Tensor, " k"]
+    lowest: Float[Tensor, ""]
 
     @classmethod
     def of(
@@ -90,24 +92,31 @@ class Calibration:
         values: Inexact[Tensor, " n *shape"],
         deviations: Float[Tensor, " n ..."],
         query: Query,
-        train: Query,
-        by_distance: bool,
+        near: Float[Tensor, " n"] | None,
+        known: Query,
     ) -> "Calibration":
-        """From validation links, predicted by a model that knows the training links alone.
+        """From links that were predicted by models that do not know them.
 
         Args:
-            deviations: As the model states them; ``by_distance``, if it states none.
+            deviations: As the model states them.
+            near: Distance of each link to the nearest place that its predicting model knows [m]; None if the model
+                states deviations, which need no groups of distances.
+            known: Links that the calibrated model knows.
         """
         errors = (task.align(labels, values) - values).abs() / _shaped(deviations, values)
         errors, values = (_thin(part) for part in (errors, values))
-        count = int(torch.cat((query.receivers, train.receivers)).max()) + 1
+        count = int(torch.cat((query.receivers, known.receivers)).max()) + 1
         heard = query.receivers.bincount(minlength=count)
         rows = query.receivers if heard.min() >= ENOUGH and count > 1 else torch.zeros_like(query.receivers)
-        near = nearest(query, train.transmitters, train.receivers).clamp_max(FAR)
-        groups = max(1, min(4, int(rows.bincount().min()) // ENOUGH)) if by_distance else 1
-        levels = torch.arange(1, groups, dtype=torch.float64) / groups
-        edges = torch.stack([near[rows == row].quantile(levels) for row in range(int(rows.max()) + 1)])
-        own = rows * groups + torch.searchsorted(edges[rows], near[:, None])[:, 0]
+        apart = torch.zeros(len(rows), dtype=torch.float64) if near is None else near.clamp_max(FAR)
+        groups = 1 if near is None else max(1, min(4, int(rows.bincount().min()) // ENOUGH))
+        while True:  # equal distances may leave a group with few links
+            levels = torch.arange(1, groups, dtype=torch.float64) / groups
+            edges = torch.stack([apart[rows == row].quantile(levels) for row in range(int(rows.max()) + 1)])
+            own = rows * groups + torch.searchsorted(edges[rows], apart[:, None])[:, 0]
+            if groups == 1 or own.bincount(minlength=len(edges) * groups).min() >= ENOUGH // 2:
+                break
+            groups -= 1
         amplitudes = values.new_zeros(0, dtype=torch.float64)
         if values.shape[1] > 1 and not values.is_complex():
             amplitudes = (
@@ -128,11 +137,9 @@ class Calibration:
                 ranks = (torch.linspace(0, 1, STEPS + 1, dtype=torch.float64) * len(inside)).ceil().long() - 1
                 quantiles[group, bin_] = inside.sort().values[ranks.clamp_min(0)]
                 sizes[group, bin_] = inside.square().mean().sqrt()
-        parts = (train, query) if groups > 1 else (query[:0],)
-        places, receivers = (
-            torch.cat(every) for every in zip(*((p.transmitters, p.receivers) for p in parts), strict=True)
-        )
-        return cls(edges, amplitudes, counts, quantiles, sizes, places, receivers)
+        known = known if groups > 1 else known[:0]
+        lowest = torch.tensor(task.lowest, dtype=torch.float64)
+        return cls(edges, amplitudes, counts, quantiles, sizes, known.transmitters, known.receivers, lowest)
 
     def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
         """The interval of some predictions; raises a ``ValueError`` where it needs more validation links."""
@@ -142,10 +149,10 @@ class Calibration:
             near = nearest(query, self.places.to(query.transmitters), self.receivers.to(query.receivers))
             own = own + torch.searchsorted(self.edges.to(near)[rows], near[:, None])[:, 0]
         counts = self.counts.to(own)[own]
-        need = math.ceil(level / (1 - level))
-        if len(counts) and (fewest := int(counts.min())) < need:
+        need = fewest(level)
+        if len(counts) and (few := int(counts.min())) < need:
             raise ValueError(
-                f"an interval of {100 * level:g} % needs {need} links to calibrate it, the model has {fewest}\n"
+                f"an interval of {100 * level:g} % needs {need} links to calibrate it, the model has {few}\n"
                 "ask for a narrower interval, or train with a larger split.validation"
             )
         numbers = value[..., None].flatten(1)
@@ -161,16 +168,20 @@ class Calibration:
         if value.is_complex():
             powers, errors = (part.abs().square().flatten(1).sum(1) for part in (value, std))
             return Estimate(value, std, None, None, half, 10 * (powers / errors).log10())
-        lower = (value - half).clamp_min(0) if len(amplitudes) else value - half  # no amplitude is negative
-        return Estimate(value, std, lower, value + half)
+        return Estimate(value, std, (value - half).clamp_min(self.lowest.item()), value + half)
 
     def levels(self, asked: Sequence[float]) -> Sequence[float]:
         """The asked levels if there are enough links for all of them, else none."""
-        return asked if max(asked) <= int(self.counts.min()) / (int(self.counts.min()) + 1) else ()
+        return asked if fewest(max(asked)) <= int(self.counts.min()) else ()
 
     def state(self) -> dict[str, Tensor]:
         """Plain tensors for a checkpoint; ``Calibration(**state)`` makes it anew."""
         return {name: getattr(self, name).cpu() for name in self.__dataclass_fields__}
+
+
+def fewest(level: float) -> int:
+    """Fewest links that give an interval of a level; 0.9 / (1 - 0.9) is above 9 by rounding."""
+    return math.ceil(level / (1 - level) - 1e-9)
 
 
 def nearest(query: Query, places: Float[Tensor, "k 3"], receivers: Int[Tensor, " k"]) -> Float[Tensor, " b"]:

@@ -260,9 +260,11 @@ class Model(nn.Module):
         query, directions = query.to(device), None if directions is None else directions.to(device)
         batches = (Batch(part, directions) for part in query.parts(batch_size))
         if interval is not None:
-            if model is not self or chosen is not None:
+            if messages or model is not self:
                 raise ValueError("intervals are those of the labels' own subcarriers; leave frequencies out")
-            return (self._estimate(batch, interval) for batch in batches), shape
+            estimates = (self._estimate(batch, interval) for batch in batches)
+            pick = lambda part: part if part is None or part.ndim < 3 or chosen is None else part[..., chosen]
+            return (Estimate(*map(pick, estimate)) for estimate in estimates), shape
         values = map(model._answer, batches)
         return values if chosen is None else (part[..., chosen] for part in values), shape
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
@@ -22,6 +23,7 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
         if not shares or "deviation" not in run.files:
             return None
         labels, predictions, deviations = (run[name] for name in ("labels", "prediction", "deviation"))
+    labels = task.align(torch.from_numpy(labels), torch.from_numpy(predictions)).numpy()
     flat = lambda numbers: np.abs(numbers).astype(float).reshape(len(labels), -1)
     errors, stated = (np.sqrt((flat(part) ** 2).mean(1)) for part in (predictions - labels, deviations))
     parts = [part for part in np.array_split(np.argsort(stated), BINS) if len(part)]

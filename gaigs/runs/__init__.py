@@ -64,12 +64,16 @@ def model_of(folder: str | Path) -> Model:
     folder = Path(folder)
     if not is_configuration(folder / "config.yaml"):
         raise FileNotFoundError(f"{folder} holds no run; give the folder with config.yaml, as folder=runs/...")
+    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
     if (folder / "best.ckpt").is_file():
         trained: Any = checkpoint.load(folder / "best.ckpt")
+        if config["kriging"] and not hasattr(trained, "krige"):
+            raise ValueError(f"the run in {folder} is not finished: it lacks its kriging\nstart it again, it goes on")
         return trained
     from gaigs.runs.training import fit
 
-    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    if config["data"]["name"] == "arrays":
+        raise ValueError(f"{folder} has no checkpoint, and its data were arrays; use the model in Python")
     links = load(config["data"], config["split"], config["task"]["name"])
     built = registry("model").build(config["model"], scene=links.scene)
     if [*built.parameters()]:

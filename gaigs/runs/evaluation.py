@@ -22,7 +22,7 @@ from gaigs.configuration import composed, has_file
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
-from gaigs.kriging.intervals import Calibration, interval_scores, summarise_intervals
+from gaigs.kriging.intervals import Calibration, interval_scores, nearest, summarise_intervals
 from gaigs.kriging.links import evenly, folds_of
 from gaigs.model import Model, call_optional
 from gaigs.model.kriging import Kriging
@@ -104,7 +104,7 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
     split = links.split
     if links.held_out is not None:
         return None
-    answers: list[tuple[Model, Int[Tensor, " k"]]] = [(model, split.validation)]
+    answers: list[tuple[Model, Int[Tensor, " k"], Int[Tensor, " j"]]] = [(model, split.validation, split.train)]
     if not (is_trained(model) or isinstance(model, Kriging)):
         index = torch.cat((split.train, split.validation))
         folds, asked, answers = (
@@ -118,7 +118,7 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
             if len(part) and all(len(known.known(receiver)) for receiver in range(len(links.receivers))):
                 copied = copy.deepcopy(model)
                 (copied.refit if hasattr(copied, "refit") else copied.fit)(known)
-                answers.append((copied, part))
+                answers.append((copied, part, known.split.train))
     elif isinstance(model, Kriging):
         halves = folds_of(links, split.validation) % 2
         parts = split.validation[halves == 0], split.validation[halves == 1]
@@ -126,15 +126,21 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
             answers = []
             for own, other in (parts, parts[::-1]):
                 kriged = Kriging(links.scene, model.trend, model.fallback_options).to(device_of(model))
-                answers.append((kriged.krige(replace(links, split=split.choosing(own)), is_final=False), other))
-    if not sum(len(part) for _, part in answers):
+                unseen = kriged.krige(replace(links, split=split.choosing(own)), is_final=False)
+                answers.append((unseen, other, split.train))
+    if not sum(len(part) for _, part, _ in answers):
         return None
-    index = torch.cat([part for _, part in answers])
-    values = [predict(one, links, part) for one, part in answers]
-    own = [spreads(one, links, part, value) for (one, part), value in zip(answers, values, strict=True)]
-    query, train = links.query[index], links.query[split.train]
-    by_distance = not hasattr(model, "deviations")
-    return Calibration.of(links.task, links.labels[index], torch.cat(values), torch.cat(own), query, train, by_distance)
+    found: dict[str, list[Tensor]] = {"index": [], "values": [], "deviations": [], "near": []}
+    for one, part, known in answers:
+        found["index"].append(part)
+        found["values"].append(predict(one, links, part))
+        found["deviations"].append(spreads(one, links, part, found["values"][-1]))
+        there = links.query[known]
+        found["near"].append(nearest(links.query[part], there.transmitters, there.receivers))
+    index, values, deviations, near = (torch.cat(parts) for parts in found.values())
+    everything = links.query[torch.cat((split.train, split.validation))]
+    near = None if hasattr(model, "deviations") else near
+    return Calibration.of(links.task, links.labels[index], values, deviations, links.query[index], near, everything)
 
 
 @dataclass(frozen=True)
@@ -265,7 +271,8 @@ def score(
             found = interval_scores(task, labels, *estimates)
             found["calibration_links"] = torch.full((len(index),), float(calibration.counts.sum()))
             scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
-            content.setdefault("deviation", task.packed(estimates[-1].std))
+            if key == next(iter(models), None):
+                content["deviation"] = task.packed(estimates[-1].std)
             content[f"shares_{key}"] = shares(calibration, task, labels, values, deviations, query)
     if links.held_out is not None:
         own: Any = links.task

@@ -1,5 +1,6 @@
 """Tasks: shape, unit and scores of a label, and the part of a batch that a training step reads."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
@@ -44,6 +45,7 @@ class Task(ABC):
         dtype: Of labels and predictions.
         is_noisy: True if labels of one place scatter, so that fine detail cannot be learnt.
         directions: Directions of a label's pixels; None for a label without.
+        lowest: Least possible number of a real label.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Task(ABC):
     dtype: torch.dtype = torch.float32
     is_noisy: bool = False
     directions: Grid | None = None
+    lowest: float = -math.inf
 
     @property
     @abstractmethod

@@ -34,6 +34,7 @@ class Spectrum(Task):
     monitor, higher_is_better = "ssim", True
     pair_score = "SSIM"
     normalisation = ""
+    lowest = 0.0
 
     def __init__(self, elevations: Float[Tensor, " rows"], azimuths: Float[Tensor, " columns"], normalisation: str):
         self.directions = Grid(elevations, azimuths)

@@ -41,8 +41,7 @@ def shares(task, count, level, repeats=40, **options):
         kind, labels, values, query = made(task, count + 200, seed, **options)
         held, new = slice(0, count), slice(count, None)
         ones = torch.ones(len(query))
-        train = query[:1]
-        calibration = Calibration.of(kind, labels[held], values[held], ones[held], query[held], train, True)
+        calibration = Calibration.of(kind, labels[held], values[held], ones[held], query[held], None, query[:1])
         estimate = calibration.estimate(values[new], ones[new], query[new], level)
         found.append(interval_scores(kind, labels[new], estimate, estimate)["coverage_90"].mean().item())
     return np.mean(found), np.std(found) / math.sqrt(repeats)
@@ -60,12 +59,12 @@ def test_intervals_hold_their_share_of_new_links(task, count, level):
 def test_receivers_with_enough_links_have_intervals_of_their_own():
     kind, labels, values, query = made("rssi", 400, receivers=2)
     labels = torch.where(query.receivers == 1, values + 10 * (labels - values), labels)
-    calibration = Calibration.of(kind, labels, values, torch.ones(400), query, query[:1], True)
+    calibration = Calibration.of(kind, labels, values, torch.ones(400), query, None, query[:1])
     estimate = calibration.estimate(values[:2], torch.ones(2), query[:2], 0.9)
     widths = estimate.upper - estimate.lower
     assert widths[1] > 5 * widths[0]
     few = slice(0, 180)
-    pooled = Calibration.of(kind, labels[few], values[few], torch.ones(180), query[few], query[:1], True)
+    pooled = Calibration.of(kind, labels[few], values[few], torch.ones(180), query[few], None, query[:1])
     estimate = pooled.estimate(values[:2], torch.ones(2), query[:2], 0.9)
     torch.testing.assert_close(*(estimate.upper - estimate.lower))
 
@@ -74,9 +73,9 @@ def test_intervals_widen_with_the_distance_to_known_places():
     kind, labels, values, query = made("rssi", 400)
     known = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long))
     apart = query.transmitters.norm(dim=1)
-    calibration = Calibration.of(kind, values + apart * (labels - values), values, torch.ones(400), query, known, True)
+    labels = values + apart * (labels - values)
+    calibration = Calibration.of(kind, labels, values, torch.ones(400), query, apart.double(), known)
     at = Query(torch.tensor([[0.5, 0.0, 0.0], [30.0, 0.0, 0.0]]), torch.zeros(2, dtype=torch.long))
-    # The calibration's own links are known too, but far from the second place.
     near, far = (x for x in calibration.estimate(torch.zeros(2), torch.ones(2), at, 0.9).upper)
     assert far > near
 
@@ -85,7 +84,7 @@ def test_a_models_own_deviation_scales_the_interval():
     kind, labels, values, query = made("rssi", 200)
     deviations = 1 + query.transmitters[:, 0]
     labels = values + deviations * (labels - values)
-    calibration = Calibration.of(kind, labels, values, deviations, query, query[:1], True)
+    calibration = Calibration.of(kind, labels, values, deviations, query, None, query[:1])
     found = calibration.estimate(values[:2], torch.tensor([1.0, 3.0]), query[:2], 0.9)
     assert (found.upper - found.value)[1] == pytest.approx(3 * (found.upper - found.value)[0].item(), rel=1e-4)
     assert found.std[1] == pytest.approx(3 * found.std[0].item())
@@ -94,7 +93,7 @@ def test_a_models_own_deviation_scales_the_interval():
 def test_amplitudes_are_not_negative_and_larger_ones_err_more():
     kind, labels, values, query = made("spectrum", 100)
     labels = (values + values * (labels - values)).clamp_min(0)
-    calibration = Calibration.of(kind, labels, values, torch.ones(100), query, query[:1], True)
+    calibration = Calibration.of(kind, labels, values, torch.ones(100), query, None, query[:1])
     found = calibration.estimate(values, torch.ones(100), query, 0.9)
     assert found.lower.min() == 0
     half = found.upper - found.value
@@ -104,7 +103,7 @@ def test_amplitudes_are_not_negative_and_larger_ones_err_more():
 def test_discs_and_the_expected_snr_of_channels():
     kind, labels, values, query = made("csi", 300, size=0.1)
     held = slice(0, 40)  # too few for groups of distances: the calibration's own links may be asked
-    calibration = Calibration.of(kind, labels[held], values[held], torch.ones(40), query[held], query[:1], True)
+    calibration = Calibration.of(kind, labels[held], values[held], torch.ones(40), query[held], None, query[:1])
     labels, values, query = labels[held], values[held], query[held]
     found = calibration.estimate(values, torch.ones(40), query, 0.9)
     assert (found.lower, found.upper) == (None, None)
@@ -166,6 +165,32 @@ def test_trained_models_and_look_ups_have_intervals(task, name, tmp_path):
         again = gaigs.load(tmp_path / "model.ckpt").predict(places, interval=0.8)
         for a, b in zip(found, again, strict=True):
             assert a is b is None or torch.equal(a, b)
+
+
+@pytest.mark.parametrize("validation", [0.0, 0.1])
+def test_look_ups_are_calibrated_by_all_known_links(validation):
+    links = gaigs.links("synthetic_rssi", transmitters=300, order=0, validation=validation)
+    model = gaigs.train("knn", links)
+    assert model.calibration.counts.min() >= 50, "groups of distances are of other folds' places"
+    assert model.calibration.edges.min() > 0
+    known = links.query.transmitters[links.split.train[:1]]
+    near, far = (model.predict(place, interval=0.9).std for place in (known, [10.0, 2.0, 1.5]))
+    assert (far > near).all()
+    scores = gaigs.evaluate(model, links, baselines=["mean"]).models
+    assert abs(scores["knn"]["coverage_90"] - 0.9) < 0.06
+    assert scores["mean"]["calibration_links"] > 900
+
+
+@pytest.mark.parametrize(("level", "need"), [(0.9, 9), (0.8, 4), (0.5, 1), (0.99, 99)])
+def test_as_many_links_as_a_level_needs_are_enough(level, need):
+    kind, labels, values, query = made("rssi", need)
+    calibration = Calibration.of(kind, labels, values, torch.ones(need), query, None, query[:1])
+    assert calibration.levels((level,))
+    calibration.estimate(values, torch.ones(need), query, level)
+    if need > 1:
+        few = slice(0, need - 1)
+        fewer = Calibration.of(kind, labels[few], values[few], torch.ones(need)[few], query[few], None, query[:1])
+        assert not fewer.levels((level,))
 
 
 def test_intervals_that_the_links_cannot_give_are_refused():
