@@ -81,7 +81,7 @@ def test_a_run_prints_what_it_does_and_nothing_else(uninterrupted):
 def test_a_run_folder(uninterrupted):
     folder, _, _ = uninterrupted
     figures = {path.name for path in (folder / "figures").iterdir()}
-    assert figures == {"room.png", "loss.png", "intervals.png", "spectra.png", "spectra_polar.png", "ssim_cdf.png"}
+    assert figures == {"room.png", "loss.png", "spectra.png", "spectra_polar.png", "ssim_cdf.png"}
     assert json.loads((folder / "metrics.json").read_text())["train_seconds"] > 0
     assert yaml.safe_load((folder / "config.yaml").read_text())["gaussians"]["count"] == 30
 
