@@ -147,7 +147,7 @@ def radio_map(
     if frequency is None and len(scene.frequencies):
         frequency = float(scene.frequencies[len(scene.frequencies) // 2])
 
-    level = None if model.calibration is None else next(iter(model.calibration.levels((0.5,))), None)
+    level = 0.5 if model.calibration is not None and model.calibration.gives(0.5) else None
 
     def predict(points: ndarray) -> ndarray:
         shape = (*points.shape[:-1], len(names))

@@ -152,16 +152,11 @@ def survey(
     factor = 1.0 if model.calibration is None else model.calibration.sizes.square().mean().sqrt().item()
     posteriors = [posterior(process, asked) for process in processes]
     noises = [process.noise for process in processes]
-    error = lambda parts: (
-        MEAN
-        * factor
-        * np.mean(
-            [
-                (part.diagonal()[stated].clamp_min(0) + noise).sqrt().mean().item()
-                for part, noise in zip(parts, noises, strict=True)
-            ]
-        )
-    )
+
+    def error(parts: list[Tensor]) -> float:
+        variances = (part.diagonal()[stated].clamp_min(0) + noise for part, noise in zip(parts, noises, strict=True))
+        return MEAN * factor * float(np.mean([own.sqrt().mean().item() for own in variances]))
+
     chosen, errors = [], [error(posteriors)]
     free = torch.ones(len(places), dtype=torch.bool)
     for _ in range(min(count, len(places))):

@@ -1,7 +1,6 @@
-"""Intervals of predictions, by conformal prediction on validation links that the predicting model has not seen."""
+"""Intervals of predictions, by conformal prediction on links that the predicting model has not seen."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from gaigs.query import Query
 from gaigs.task import Task
 
 ENOUGH = 100
-"""Validation links that a group needs for intervals of its own."""
+"""Links that a group needs for intervals of its own."""
 
 BINS = 8
 """Groups of a spectrum's pixels by their predicted amplitude: where it is high, errors are larger."""
@@ -55,9 +54,9 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibration:
-    """Quantiles of the absolute errors of validation links over a model's own deviation, in groups.
+    """Quantiles of the absolute errors at links not seen over a model's own deviation, in groups.
 
-    Links are in one group per receiver where each has at least ``ENOUGH`` validation links; of a model that states no
+    Links are in one group per receiver where each has at least ``ENOUGH`` of them; of a model that states no
     deviation also by the distance to the nearest known place of their receiver. Pixels of a spectrum are in ``BINS``
     groups by their predicted amplitude too. A group of n links has an interval of level p by the quantile p (n + 1) / n
     of its errors: it then holds a new link's label with probability p, if links are exchangeable.
@@ -65,7 +64,7 @@ class Calibration:
     Attributes:
         edges: Of the distances (r or 1, g - 1) [m].
         amplitudes: Edges of the predicted amplitudes (bins - 1,).
-        counts: Validation links (groups,).
+        counts: Links of each group (groups,).
         quantiles: Of the errors at levels 0 to 1 (groups, bins, ``STEPS`` + 1).
         sizes: Root mean square of the errors (groups, bins).
         places, receivers: Of the known links, for the distance; empty with one group of distances.
@@ -119,11 +118,8 @@ class Calibration:
             groups -= 1
         amplitudes = values.new_zeros(0, dtype=torch.float64)
         if values.shape[1] > 1 and not values.is_complex():
-            amplitudes = (
-                _thin(values.flatten()[None], 10**6)[0]
-                .double()
-                .quantile(torch.arange(1, BINS, dtype=torch.float64) / BINS)
-            )
+            some = _thin(values.flatten()[None], 10**6)[0].double()
+            amplitudes = some.quantile(torch.arange(1, BINS, dtype=torch.float64) / BINS)
         bins = torch.bucketize(values.double(), amplitudes) if len(amplitudes) else torch.zeros_like(errors).long()
         counts = own.bincount(minlength=len(edges) * groups)
         quantiles = errors.new_zeros(len(counts), len(amplitudes) + 1, STEPS + 1, dtype=torch.float64)
@@ -142,7 +138,7 @@ class Calibration:
         return cls(edges, amplitudes, counts, quantiles, sizes, known.transmitters, known.receivers, lowest)
 
     def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
-        """The interval of some predictions; raises a ``ValueError`` where it needs more validation links."""
+        """The interval of some predictions; raises a ``ValueError`` where it needs more links."""
         rows = query.receivers if len(self.edges) > 1 else torch.zeros_like(query.receivers)
         own = rows * (self.edges.shape[1] + 1)
         if self.edges.shape[1]:
@@ -170,9 +166,9 @@ class Calibration:
             return Estimate(value, std, None, None, half, 10 * (powers / errors).log10())
         return Estimate(value, std, (value - half).clamp_min(self.lowest.item()), value + half)
 
-    def levels(self, asked: Sequence[float]) -> Sequence[float]:
-        """The asked levels if there are enough links for all of them, else none."""
-        return asked if fewest(max(asked)) <= int(self.counts.min()) else ()
+    def gives(self, level: float) -> bool:
+        """True if every group has enough links for intervals of a level."""
+        return fewest(level) <= int(self.counts.min())
 
     def state(self) -> dict[str, Tensor]:
         """Plain tensors for a checkpoint; ``Calibration(**state)`` makes it anew."""

@@ -178,13 +178,7 @@ class ScalarProcess(nn.Module):
         """
         self.places, self.receivers = places, receivers
 
-        def around(count: int) -> tuple[Int[Tensor, " m"], Around]:
-            rows = [held[receivers[held] == receiver] for receiver in receivers[held].unique()]
-            asked = torch.cat([evenly(own, max(16, count // len(rows))) for own in rows])
-            nearest = self._nearest(places[asked], receivers[asked], folds[asked], folds, reach=True)
-            return asked, self._around(places[asked], receivers[asked], nearest)
-
-        few = around(most // 2)
+        few = self._held_out(held, folds, most // 2)
         tried = [(*self._maximise(values, *few, Choice()), index) for index, values in enumerate(candidates)]
         best = min(tried, key=lambda found: found[0])
         values = candidates[best[-1]]
@@ -192,7 +186,9 @@ class ScalarProcess(nn.Module):
             choice = best[2]._replace(smoothness=smoothness, degrees=degrees)
             best = min(best, (*self._maximise(values, *few, choice, best[1]), best[-1]), key=lambda found: found[0])
         _, logarithms, choice, index = best
-        _, self.logarithms, choice = self._maximise(values, *around(most), choice, logarithms, has_deviations=True)
+        _, self.logarithms, choice = self._maximise(
+            values, *self._held_out(held, folds, most), choice, logarithms, has_deviations=True
+        )
         self.choice = torch.tensor(choice, dtype=torch.float64)
         return index
 
@@ -206,10 +202,8 @@ class ScalarProcess(nn.Module):
     ) -> None:
         """Fits the hyperparameters to other readings, from those that it has; kernel and noise stay."""
         self.places, self.receivers = places, receivers
-        rows = [(receivers == receiver).nonzero()[:, 0] for receiver in receivers.unique()]
-        asked = torch.cat([evenly(own, max(16, most // len(rows))) for own in rows])
-        nearest = self._nearest(places[asked], receivers[asked], folds[asked], folds, reach=True)
-        around, choice = self._around(places[asked], receivers[asked], nearest), Choice(*self.choice.tolist())
+        asked, around = self._held_out(torch.arange(len(values)), folds, most)
+        choice = Choice(*self.choice.tolist())
         _, self.logarithms, choice = self._maximise(values, asked, around, choice, self.logarithms, has_deviations=True)
         self.choice = torch.tensor(choice, dtype=torch.float64)
 
@@ -284,6 +278,13 @@ class ScalarProcess(nn.Module):
             point = found.x
         own, made = unpacked(torch.from_numpy(point))
         return float(found.fun), own, made._replace(scale=float(made.scale))
+
+    def _held_out(self, held: Int[Tensor, " h"], folds: Int[Tensor, " k"], most: int) -> tuple[Tensor, Around]:
+        """About ``most`` of the rows that may be held out (m,), and the readings of other folds around each."""
+        own = [held[self.receivers[held] == receiver] for receiver in self.receivers[held].unique()]
+        asked = torch.cat([evenly(rows, max(16, most // len(own))) for rows in own])
+        nearest = self._nearest(self.places[asked], self.receivers[asked], folds[asked], folds, reach=True)
+        return asked, self._around(self.places[asked], self.receivers[asked], nearest)
 
     def _nearest(
         self,

@@ -106,8 +106,9 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     fitted = fit(None, loss, links, config, folder)
     if fitted is None:
         return None
-    model, is_trained = fitted.models[name], fitted.seconds is not None
-    validation = evaluation.validate(fitted.unseen, baselines, links)
+    model, is_trained = fitted.models[name], bool(fitted.unseen)
+    own = {} if is_trained else {name: registry("model").build(config["model"], scene=scene)}
+    validation = evaluation.validate(fitted.unseen, {**own, **baselines}, links)
     scores = evaluation.score(fitted.models, baselines, links, folder)
     metrics = {
         "task": task.name,

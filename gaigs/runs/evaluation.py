@@ -6,7 +6,7 @@ import math
 import platform
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -95,52 +95,53 @@ def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor
 
 
 def calibrated(model: Model, links: Links) -> Calibration | None:
-    """The calibration of a model: errors where it has not seen the label; None without such links.
-
-    A look-up is fitted anew without each fold of the known links. A trained model is asked for the validation links;
-    the step of its training stays the one chosen on all of them. ``model`` of kriging is its validation model. It chose
-    weights and hyperparameters on these links: for each half of them they are chosen anew on the other half.
-    """
-    split = links.split
+    """The calibration of a model, by errors at links that it has not seen, see ``unseen``; None without such links."""
     if links.held_out is not None:
         return None
-    answers: list[tuple[Model, Int[Tensor, " k"], Int[Tensor, " j"]]] = [(model, split.validation, split.train)]
-    if not (is_trained(model) or isinstance(model, Kriging)):
-        index = torch.cat((split.train, split.validation))
-        folds, asked, answers = (
-            folds_of(links, index) % CALIBRATION_FOLDS,
-            torch.zeros(len(index), dtype=torch.bool),
-            [],
-        )
-        asked[evenly(torch.arange(len(index)), MOST)] = True
-        for fold in range(CALIBRATION_FOLDS):
-            part, known = index[(folds == fold) & asked], replace(links, split=split.only(index[folds != fold]))
-            if len(part) and all(len(known.known(receiver)) for receiver in range(len(links.receivers))):
-                copied = copy.deepcopy(model)
-                (copied.refit if hasattr(copied, "refit") else copied.fit)(known)
-                answers.append((copied, part, known.split.train))
-    elif isinstance(model, Kriging):
-        halves = folds_of(links, split.validation) % 2
-        parts = split.validation[halves == 0], split.validation[halves == 1]
-        if all(map(len, parts)):
-            answers = []
-            for own, other in (parts, parts[::-1]):
-                kriged = Kriging(links.scene, model.trend, model.fallback_options).to(device_of(model))
-                unseen = kriged.krige(replace(links, split=split.choosing(own)), is_final=False)
-                answers.append((unseen, other, split.train))
-    if not sum(len(part) for _, part, _ in answers):
-        return None
-    found: dict[str, list[Tensor]] = {"index": [], "values": [], "deviations": [], "near": []}
-    for one, part, known in answers:
-        found["index"].append(part)
-        found["values"].append(predict(one, links, part))
-        found["deviations"].append(spreads(one, links, part, found["values"][-1]))
+    asked, values, deviations, near = [], [], [], []
+    for one, part, known in unseen(model, links):
+        asked.append(part)
+        values.append(predict(one, links, part))
+        deviations.append(spreads(one, links, part, values[-1]))
         there = links.query[known]
-        found["near"].append(nearest(links.query[part], there.transmitters, there.receivers))
-    index, values, deviations, near = (torch.cat(parts) for parts in found.values())
-    everything = links.query[torch.cat((split.train, split.validation))]
-    near = None if hasattr(model, "deviations") else near
-    return Calibration.of(links.task, links.labels[index], values, deviations, links.query[index], near, everything)
+        near.append(nearest(links.query[part], there.transmitters, there.receivers))
+    if not asked:
+        return None
+    index = torch.cat(asked)
+    parts = links.labels[index], torch.cat(values), torch.cat(deviations), links.query[index]
+    apart = None if hasattr(model, "deviations") else torch.cat(near)
+    known_ones = links.query[torch.cat((links.split.train, links.split.validation))]
+    return Calibration.of(links.task, *parts, apart, known_ones)
+
+
+def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"], Int[Tensor, " j"]]]:
+    """Models like a model, links that they have not seen, and the links that they know; each when it is asked for.
+
+    A look-up is fitted anew without each fold of the known links. A trained model has the validation links; the step of
+    its training stays the one chosen on all of them. ``model`` of kriging is its validation model. It chose weights and
+    hyperparameters on these links: for each half of them they are chosen anew on the other half.
+    """
+    split, validation = links.split, links.split.validation
+    if not (is_trained(model) or isinstance(model, Kriging)):
+        index = torch.cat((split.train, validation))
+        folds, asked = folds_of(links, index) % CALIBRATION_FOLDS, evenly(index, MOST)
+        for fold in range(CALIBRATION_FOLDS):
+            part, known = index[folds == fold], index[folds != fold]
+            part, rest = part[torch.isin(part, asked)], replace(links, split=split.only(known))
+            if len(part) and all(len(rest.known(receiver)) for receiver in range(len(links.receivers))):
+                copied = copy.deepcopy(model)
+                (copied.refit if hasattr(copied, "refit") else copied.fit)(rest)
+                yield copied, part, known
+        return
+    halves = folds_of(links, validation) % 2
+    parts = validation[halves == 0], validation[halves == 1]
+    if not isinstance(model, Kriging) or not all(map(len, parts)):
+        if len(validation):
+            yield model, validation, split.train
+        return
+    for own, other in (parts, parts[::-1]):
+        kriged = Kriging(links.scene, model.trend, model.fallback_options).to(device_of(model))
+        yield kriged.krige(replace(links, split=split.choosing(own)), is_final=False), other, split.train
 
 
 @dataclass(frozen=True)
@@ -260,14 +261,9 @@ def score(
         values = predict(model, links, index, frequencies)
         add(key, values)
         calibration = model.calibration if key in models or not has_intervals else calibrated(model, links)
-        if (
-            has_intervals
-            and calibration is not None
-            and frequencies is None
-            and (levels := calibration.levels((0.5, 0.9)))
-        ):
+        if has_intervals and frequencies is None and calibration is not None and calibration.gives(0.9):
             deviations = spreads(model, links, index, values)
-            estimates = [calibration.estimate(values, deviations, query, level) for level in levels]
+            estimates = [calibration.estimate(values, deviations, query, level) for level in (0.5, 0.9)]
             found = interval_scores(task, labels, *estimates)
             found["calibration_links"] = torch.full((len(index),), float(calibration.counts.sum()))
             scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
@@ -292,7 +288,7 @@ def shares(
     parts = labels[some], values[some], deviations[some], query[some]
     found = []
     for level in np.arange(1, 20) / 20:
-        if not calibration.levels((level,)):
+        if not calibration.gives(level):
             found.append(math.nan)
             continue
         estimate = calibration.estimate(*parts[1:], level)

@@ -27,7 +27,7 @@ from gaigs.model import Model
 from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
 from gaigs.registry import call, configuration_of, registry
-from gaigs.runs.evaluation import calibrated, device_of, fitted, is_trained, validating
+from gaigs.runs.evaluation import calibrated, device_of, is_trained
 from gaigs.runs.folder import check_same_links, claim, fingerprint
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS, make_budget
@@ -101,7 +101,7 @@ class Fitted(NamedTuple):
 
     Attributes:
         models: The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
-        unseen: The same, not fitted to validation links; empty without such links.
+        unseen: The same, not fitted to validation links; empty for a model without a training.
         start: Number of Gaussians before the training.
         seconds: Duration of the training; None without one.
         kriging_seconds: Duration of kriging; None without it.
@@ -124,13 +124,11 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     kriged = Kriging(links.scene, model, config["kriging_fallback"]) if config["kriging"] else None
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
-    if not is_trained(model):
-        unseen = {name: fitted(model, validating(links))} if len(links.split.validation) else {}
-        model.fit(links)
-        model.calibration = calibrated(model, links)
-        return Fitted({name: model}, unseen, 0)
     model.fit(links)
     start = count_gaussians(model)
+    if not is_trained(model):
+        model.calibration = calibrated(model, links)
+        return Fitted({name: model}, {}, start)
     model, seconds = descend(model, loss, links, config, folder)
     if not is_first():
         return None

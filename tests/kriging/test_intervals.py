@@ -185,12 +185,12 @@ def test_look_ups_are_calibrated_by_all_known_links(validation):
 def test_as_many_links_as_a_level_needs_are_enough(level, need):
     kind, labels, values, query = made("rssi", need)
     calibration = Calibration.of(kind, labels, values, torch.ones(need), query, None, query[:1])
-    assert calibration.levels((level,))
+    assert calibration.gives(level)
     calibration.estimate(values, torch.ones(need), query, level)
     if need > 1:
         few = slice(0, need - 1)
         fewer = Calibration.of(kind, labels[few], values[few], torch.ones(need)[few], query[few], None, query[:1])
-        assert not fewer.levels((level,))
+        assert not fewer.gives(level)
 
 
 def test_intervals_that_the_links_cannot_give_are_refused():
