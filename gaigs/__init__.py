@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from gaigs.data.links import links
     from gaigs.geometry import Grid, Pose, Rays
     from gaigs.kriging.intervals import Estimate
+    from gaigs.locating import Fingerprints, Location, fingerprints, locate
     from gaigs.model import Model
     from gaigs.query import Query
     from gaigs.radio_maps import radio_map
@@ -46,13 +47,14 @@ PLACES = {
     "registries": "registry", "Model": "model", "Links": "data", "Query": "query", "Grid": "geometry",
     "Rays": "geometry", "Receiver": "antenna", "Array": "antenna", "Pose": "geometry", "Scene": "scene",
     "Metric": "task", "survey": "surveying", "SurveyPlan": "surveying", "Estimate": "kriging.intervals",
+    "locate": "locating", "Location": "locating", "fingerprints": "locating", "Fingerprints": "locating",
 }  # fmt: skip
 """The module of each public name, which is imported when the name is first used: torch is slow to import."""
 
 __all__ = [
-    "Array", "Estimate", "Grid", "Links", "Metric", "Model", "Pose", "Query", "Rays", "Receiver", "Scene",
-    "SurveyPlan", "__version__", "compose", "evaluate", "links", "load", "radio_map", "rasterize", "register",
-    "registries", "run", "survey", "train",
+    "Array", "Estimate", "Fingerprints", "Grid", "Links", "Location", "Metric", "Model", "Pose", "Query", "Rays",
+    "Receiver", "Scene", "SurveyPlan", "__version__", "compose", "evaluate", "fingerprints", "links", "load", "locate",
+    "radio_map", "rasterize", "register", "registries", "run", "survey", "train",
 ]  # fmt: skip
 
 
@@ -124,16 +126,12 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
                 with processes.only_run(folder):
                     benchmark.run(folder, overrides, **limits)
             log.info("results: %s", folder)
-        case "agreement":
-            from gaigs import agreement
+        case "agreement" | "survey" | "locate" as command:
+            from gaigs import agreement, locating, surveying
 
+            module = {"agreement": agreement, "survey": surveying, "locate": locating}[command]
             with processes.limited_threads(config["threads"]):
-                agreement.run(config, folder)
-        case "survey":
-            from gaigs import surveying
-
-            with processes.limited_threads(config["threads"]):
-                surveying.run(config, folder)
+                module.run(config, folder)
         case unknown:
-            raise ValueError(f"command must be train, benchmark, agreement, survey or devices, got {unknown!r}")
+            raise ValueError(f"command must be train, benchmark, agreement, survey, locate or devices, got {unknown!r}")
     return None

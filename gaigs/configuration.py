@@ -29,7 +29,7 @@ from gaigs.registry.holders import plugin_packages
 log = logging.getLogger(__name__)
 
 HARMLESS = (
-    "command", "folder", "survey", "save_every", "tensorboard", "threads", "trainer.enable_progress_bar",
+    "command", "folder", "survey", "locate", "save_every", "tensorboard", "threads", "trainer.enable_progress_bar",
     "trainer.enable_model_summary",
 )  # fmt: skip
 """Keys that change no result: a run may be resumed with other values."""
@@ -40,7 +40,9 @@ MAY_BE_NULL = ("gaussians", "density", "benchmark", "projection", "rasterizer")
 KEYS = {
     **dict.fromkeys((*KINDS, "trainer"), dict), **dict.fromkeys(MAY_BE_NULL, dict | None),
     "kriging": bool, "kriging_fallback": dict | None, "baselines": list[dict], "command": str, "seed": int,
+    "ensemble": int,
     "save_every": float, "tensorboard": bool, "threads": int | None, "folder": str | None, "survey": dict,
+    "locate": dict,
 }  # fmt: skip
 """Top-level keys and their types."""
 
@@ -276,9 +278,8 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
         if not (is_new or last in has or is_open):
             raise ValueError(f"{place} has no key {suggest(last, has)}; it has: {listed(has)}")
         return name
-    keys = {
-        key: key.rpartition(".")[2] for key in _options(plain, sections or plain.keys() - {*READ_BY_LINKS, "survey"})
-    }
+    searched = sections or plain.keys() - {*READ_BY_LINKS, "survey", "locate"}
+    keys = {key: key.rpartition(".")[2] for key in _options(plain, searched)}
     found = sorted(key for key, last in keys.items() if last == name)
     if not sections and f"model.{name}" in found:  # a model's own option wins over those of its parts
         return f"model.{name}"

@@ -13,6 +13,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from gaigs.geometry import even_places
 from gaigs.io.files import write_text
 from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import coordinates, distances, evenly
@@ -135,8 +136,9 @@ def survey(
     box = torch.stack((scene.lower, scene.upper)) if region is None else as_positions("region", region).reshape(-1, 3)
     if len(box) != 2:
         raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points")
-    places = grid(*box) if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
-    beside = places[:0] if candidates is None or region is None else grid(*box)
+    even = even_places(box[0], box[1], POINTS)
+    places = even if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
+    beside = even[:0] if candidates is None or region is None else even
     most = int((MEMORY / 8 / len(processes)) ** 0.5)
     if not 0 < len(places) <= most:
         raise ValueError(f"a survey takes 1 to {most} candidates, got {len(places)}; leave some out")
@@ -212,16 +214,6 @@ def figure(plan: SurveyPlan) -> Figure:
         right.grid()
         right.set_axisbelow(True)
     return drawn
-
-
-def grid(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> Float[Tensor, "g 3"]:
-    """About ``POINTS`` evenly spaced places in a box; an edge far shorter than the others has one."""
-    lower, edges = torch.minimum(lower, upper), (upper - lower).abs()
-    long = edges[edges > 0.2 * edges.max()]
-    pitch = float(long.prod() / POINTS) ** (1 / max(len(long), 1)) or 1.0
-    counts = [max(1, round(edge / pitch)) for edge in edges.tolist()]
-    axes = [low + edge * (torch.arange(n) + 0.5) / n for low, edge, n in zip(lower, edges, counts, strict=True)]
-    return torch.cartesian_prod(*axes)
 
 
 def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process:

@@ -32,7 +32,7 @@ PAGES = sorted(
     [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/results/*.md"), *ROOT.glob("plugins/*/*.md")]
 )
 OURS = tuple(f"{folder}/" for folder in ("gaigs", "conf", "plugins", "tests", "docs", "benchmarks"))
-FILES = {".csv", ".png", ".ply", ".log"}
+FILES = {".csv", ".json", ".png", ".ply", ".log"}
 """Endings of files that look like keys."""
 
 PLUGINS = ROOT / "docs/plugins.md"

@@ -8,9 +8,10 @@ import torch
 from scipy.spatial.distance import cdist
 
 import gaigs
+from gaigs.geometry import even_places
 from gaigs.kriging import scalar
 from gaigs.kriging.kernel import Process
-from gaigs.surveying import MEAN, grid, posterior, with_trend, without
+from gaigs.surveying import MEAN, POINTS, posterior, with_trend, without
 
 
 @pytest.fixture(autouse=True)
@@ -56,7 +57,7 @@ def test_each_place_lowers_the_mean_variance_most():
     candidates = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) * 3
     box = candidates.amin(0), candidates.amax(0)
     plan = gaigs.survey(model, region=torch.stack(box), count=3, candidates=candidates)
-    centres, asked = links.scene.positions(candidates.double()), grid(*box).double()
+    centres, asked = links.scene.positions(candidates.double()), even_places(*box, POINTS).double()
     processes = [with_trend(model.process_at(receiver), centres[receiver]) for receiver in range(4)]
     known = []
     for place in plan.places:

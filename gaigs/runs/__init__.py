@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from gaigs import checkpoint
-from gaigs.data import load
+from gaigs.data import Links, load
 from gaigs.io.files import write_text
 from gaigs.model import Model, call_optional
 from gaigs.processes import is_first, limited_threads, only_run
@@ -61,10 +61,7 @@ def run(config: dict, folder: Path) -> dict | None:
 
 def model_of(folder: str | Path) -> Model:
     """The model of a finished run: that of its checkpoint or, for a look-up, fitted anew to the run's data."""
-    folder = Path(folder)
-    if not is_configuration(folder / "config.yaml"):
-        raise FileNotFoundError(f"{folder} holds no run; give the folder with config.yaml, as folder=runs/...")
-    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    folder, config = Path(folder), configuration_of(folder)
     if (folder / "best.ckpt").is_file():
         trained: Any = checkpoint.load(folder / "best.ckpt")
         if config["kriging"] and not hasattr(trained, "krige"):
@@ -72,14 +69,29 @@ def model_of(folder: str | Path) -> Model:
         return trained
     from gaigs.runs.training import fit
 
-    if config["data"]["name"] == "arrays":
-        raise ValueError(f"{folder} has no checkpoint, and its data were arrays; use the model in Python")
-    links = load(config["data"], config["split"], config["task"]["name"])
+    links = links_of(folder)
     built = registry("model").build(config["model"], scene=links.scene)
     if [*built.parameters()]:
         raise FileNotFoundError(f"{folder} has no best.ckpt: the run is not finished; start it again")
     fitted = fit(built, registry("loss").build(config["loss"], task=links.task), links, config, folder)
     return fitted.models[config["model"]["name"]]
+
+
+def configuration_of(folder: str | Path) -> dict:
+    """The configuration of a run."""
+    path = Path(folder) / "config.yaml"
+    if not is_configuration(path):
+        raise FileNotFoundError(f"{folder} holds no run; give the folder with config.yaml, as folder=runs/...")
+    config: Any = OmegaConf.to_container(OmegaConf.load(path))
+    return config
+
+
+def links_of(folder: str | Path) -> Links:
+    """The links of a run, read again."""
+    config = configuration_of(folder)
+    if config["data"]["name"] == "arrays":
+        raise ValueError(f"the data of {folder} were arrays, which are not stored; use the model in Python")
+    return load(config["data"], config["split"], config["task"]["name"])
 
 
 def train_and_test(config: dict, folder: Path) -> dict | None:

@@ -24,6 +24,7 @@ from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.loss import Loss
 from gaigs.model import Model
+from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
 from gaigs.registry import call, configuration_of, registry
@@ -121,7 +122,10 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         model = registry("model").build(config["model"], scene=links.scene)
     if isinstance(model, Kriging):
         raise ValueError("model=kriging has no training of its own; choose a trained model, and set kriging=true")
-    kriged = Kriging(links.scene, model, config["kriging_fallback"]) if config["kriging"] else None
+    if config["ensemble"] < 1:
+        raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
+    make_kriged = lambda trend: Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
+    kriged = make_kriged(model)
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
     model.fit(links)
@@ -132,7 +136,11 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     model, seconds = descend(model, loss, links, config, folder)
     if not is_first():
         return None
-    best = folder / "best.ckpt"
+    best, trained = folder / "best.ckpt", ""
+    if config["ensemble"] > 1:
+        model, more = with_others(model, loss, links, config, folder)
+        kriged, seconds, trained = make_kriged(model), seconds + more, "members.0"
+        checkpoint.exchange_model(best, model, trained)
     model.calibration = calibrated(model, links)
     if kriged is None:
         checkpoint.add_calibration(best, model)
@@ -141,9 +149,26 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     validation_model = kriged.to(device_of(model)).krige(links)
     kriging_seconds = time.monotonic() - began
     kriged.calibration = calibrated(validation_model, links)
-    checkpoint.exchange_model(best, kriged, trained="trend")
+    checkpoint.exchange_model(best, kriged, ".".join(filter(None, ("trend", trained))))
     models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged, validation_model))
     return Fitted(models, unseen, start, seconds, kriging_seconds)
+
+
+def with_others(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Ensemble, float]:
+    """An ensemble of a trained model and of others with the next seeds, each trained in a folder of its own."""
+    members, total = [model], 0.0
+    for number in range(1, config["ensemble"]):
+        place, seed = folder / "members" / str(number), config["seed"] + number
+        place.mkdir(parents=True, exist_ok=True)
+        lightning.seed_everything(seed, verbose=False)
+        other = registry("model").build(config["model"], scene=links.scene)
+        other.fit(links)
+        other, seconds = descend(other, loss, links, config | {"seed": seed}, place)
+        members.append(other)
+        total += seconds
+    ensemble = Ensemble(links.scene, members).eval().to(device_of(model))
+    ensemble.fit(links)
+    return ensemble, total
 
 
 def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Model, float]:

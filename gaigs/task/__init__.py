@@ -16,6 +16,10 @@ Thinning = Callable[[Batch, torch.Generator], Batch]
 """A batch of whole labels -> the part of it that a training step reads."""
 
 
+NUMBERS = 512
+"""Most numbers of a label by which places are told apart; arrays resolve fewer."""
+
+
 class Metric(NamedTuple):
     """A number of a table.
 
@@ -128,6 +132,12 @@ class Task(ABC):
         Losses, kriging and look-ups compare the result with the predictions. Shapes are (k, *shape); either k may be 1.
         """
         return labels
+
+    def fingerprint(self, values: Tensor) -> Tensor:
+        """Real numbers (k, m) of labels or predictions that change steadily with the place; by default at most
+        ``NUMBERS`` of their own, evenly spread."""
+        flat = values[..., None].flatten(1)
+        return flat[:, :: math.ceil(flat.shape[1] / NUMBERS)].float()
 
     def thinning(self) -> Thinning:
         """The part of a batch that a step reads, by default all; parameters are options of ``training.thinning``."""

@@ -91,6 +91,19 @@ class Csi(Task):
         gains = torch.where(is_heard, wanted, 1) / torch.where(is_heard, sizes, 1)
         return turned * gains[:, None, None].to(turned.real)
 
+    def fingerprint(self, values: Complex[Tensor, "k e s"]) -> Float[Tensor, "k m"]:
+        """Products of the elements' channels, and of those some subcarriers apart, over the link's power.
+
+        Both change slowly with the place, unlike phases.
+        """
+        power = values.abs().square().sum((1, 2), keepdim=True)
+        between = (values @ values.mH / power)[:, *torch.triu_indices(*[self.elements] * 2)]
+        count = len(self.frequencies)
+        lags = torch.fft.ifft(torch.fft.fft(values, 2 * count).abs().square()).sum(1)[:, :count] / power[:, 0]
+        lags = lags.abs().to(lags) if self.phase == "per_link_and_delay" else lags
+        parts = torch.cat((between, lags), 1)
+        return super().fingerprint(torch.cat((parts.real, parts.imag), 1))
+
     def phase_sign(
         self, labels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, " k"]
     ) -> int:

@@ -1,0 +1,585 @@
+"""Localisation: where a transmitter is, by the value that receivers measure of it."""
+
+import itertools
+import json
+import math
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from gaigs.data import Links
+from gaigs.geometry import ExtrapolationWarning, even_places
+from gaigs.io.files import write_text
+from gaigs.kriging.intervals import fewest
+from gaigs.kriging.links import distances, evenly, folds_of
+from gaigs.model import Model
+from gaigs.model.knn import COUNTS
+from gaigs.query import ROUNDING, as_positions
+from gaigs.registry import call, check_type
+from gaigs.report import style
+from gaigs.runs import links_of, model_of
+from gaigs.runs.evaluation import unseen
+from gaigs.task import Task
+
+POINTS, SECONDS, FEWEST = 20_000, 60.0, 1000
+"""Candidate places; fewer, down to the last, where the model takes longer than the seconds for them."""
+
+ELSEWHERE = 0.1
+"""Prior probability that a transmitter is not near a known place but anywhere in their box."""
+
+HELD_OUT, SCORED = 500, 200
+"""Most fingerprints of a fold whose errors give the axes, and most that set the posterior's width; two folds do."""
+
+DEGREES = (0.25, 1.0, 4.0, 30.0)
+"""Degrees of freedom of the likelihood to choose from."""
+
+TEMPERS = tuple(2.0 ** (power / 2) for power in range(-8, 17))
+"""Exponents of the likelihood to choose from."""
+
+JUMP = 1e-4
+"""Density of a move to any place over that of a move to the same one: a track may jump."""
+
+KEPT = 500
+"""Candidates of each value of a track that are linked to those before and after."""
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where transmitters may be, from ``locate``.
+
+    Attributes:
+        places: Candidate places (g, 3) [m].
+        probabilities: Of each candidate, for each value (n, g).
+        mean: Mean place of each value (n, 3) [m].
+        likeliest: Place of the highest density (n, 3) [m].
+        region: True for candidates in the region that holds the transmitter with the asked probability (n, g).
+    """
+
+    places: Float[Tensor, "g 3"]
+    probabilities: Float[Tensor, "n g"]
+    mean: Float[Tensor, "n 3"]
+    likeliest: Float[Tensor, "n 3"]
+    region: Bool[Tensor, "n g"]
+
+    def holds(self, places: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+        """True for each value whose region holds a place: that has the candidate nearest to it."""
+        near = distances(places.double(), self.places.double()).argmin(1)
+        return self.region.gather(1, near[:, None])[:, 0]
+
+
+@dataclass(frozen=True)
+class Fingerprints:
+    """Values that a model predicts at candidate places, from ``fingerprints``; ``locate`` looks a value up in them.
+
+    Attributes:
+        task: Of the values.
+        frequency: Carrier [Hz]; None if unknown.
+        places: Candidates (g, 3) [m].
+        prior: Logarithm of each candidate's probability before anything is received (g,).
+        density: Logarithm of the prior density there, but for a constant (g,).
+        axes: Of the numbers of a label, of independent errors of the same size (m, k).
+        values: Predictions at the candidates along these axes (g, r, k).
+        deviations: Standard deviations of labels of one number (g, r); else 1.
+        degrees, temper: Of the likelihood, see ``log_likelihood``.
+        drops: Logarithm of the best candidate's density over that at the true place, of held-out fingerprints,
+            ascending (h,); empty without links.
+    """
+
+    task: Task
+    frequency: float | None
+    places: Float[Tensor, "g 3"]
+    prior: Float[Tensor, " g"]
+    density: Float[Tensor, " g"]
+    axes: Float[Tensor, "m k"]
+    values: Float[Tensor, "g r k"]
+    deviations: Float[Tensor, "g r"]
+    degrees: float = 4.0
+    temper: float = 1.0
+    drops: Float[Tensor, " h"] = field(default_factory=lambda: torch.zeros(0))
+
+
+@torch.no_grad()
+def fingerprints(
+    model: Model,
+    links: Links | None = None,
+    region: object = None,
+    frequency: float | None = None,
+    points: int | None = None,
+) -> Fingerprints:
+    """The map of predictions in which ``locate`` looks values up; make it once for many of them.
+
+    Args:
+        model: Trained, fitted or loaded, with intervals.
+        links: Links that the model was trained on. Transmitters are then likely where the known ones are dense, and
+            held-out ones set the width of the likelihood and the size of regions. None: they are anywhere alike, and
+            the errors of a label's numbers are independent, which makes regions too small.
+        region: Two corners of a box [[x, y, z], [x, y, z]] [m] in which transmitters are anywhere alike; None: the box
+            of the training transmitters.
+        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
+        points: Number of candidate places; None: 20,000, fewer where the model takes more than a minute for them.
+
+    Raises:
+        ValueError: The model has no intervals, or an option is impossible.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> prints = gaigs.fingerprints(gaigs.train("gaussian_process", links), links, points=500)
+        >>> gaigs.locate(prints, [-50.0, -48.0, float("nan"), -61.0]).mean.shape
+        torch.Size([1, 3])
+    """
+    check_type("model", model, Model)
+    scene = model.scene
+    if points is not None and points < 2:
+        raise ValueError(f"points must be at least 2 candidates, got {points}")
+    box = torch.stack((scene.lower, scene.upper)) if region is None else as_positions("region", region).reshape(-1, 3)
+    if len(box) != 2:
+        raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points")
+    if frequency is None and len(scene.frequencies):
+        frequency = float(scene.frequencies[len(scene.frequencies) // 2])
+    if points is None:
+        some = even_places(box[0], box[1], 64)
+        predicted(model, some[:2], frequency)  # the first prediction compiles and loads
+        start = time.perf_counter()
+        predicted(model, some, frequency)
+        points = min(POINTS, max(FEWEST, int(SECONDS * len(some) / (time.perf_counter() - start))))
+
+    def mapped(one: Model, known: Tensor) -> Fingerprints:
+        places, prior, density = candidates(box, points, links if region is None else None, known)
+        values, deviations = predicted(one, places, frequency)
+        axes = torch.eye(values.shape[2])
+        return Fingerprints(scene.task, frequency, places, prior, density, axes, values, deviations)
+
+    known = torch.zeros(0).long() if links is None else at_carrier(links, frequency, "train", "validation")
+    made = mapped(model, known)
+    tries: list[Any] = []
+    for one, part, others in islice(unseen(model, links) if links is not None else (), 2):
+        one.calibration = model.calibration
+        asked, truth = received(links, whole(links, part, known))
+        some = evenly(torch.arange(len(truth)), HELD_OUT)
+        if len(some):
+            errors = asked[some] - predicted(one, truth[some], frequency)[0]
+            tries.append((mapped(one, others[torch.isin(others, known)]), asked[some], truth[some], errors))
+    if len(tries) == 1 and len(tries[0][1]) > 1:
+        one, *parts = tries[0]
+        tries = [(one, *(part[half::2] for part in parts)) for half in range(2)]
+    held = []
+    for number, (one, asked, truth, _) in enumerate(tries):
+        # Axes of the other errors: along those of its own a value would be too near.
+        one = along(one, [errors for other, (*_, errors) in enumerate(tries) if other != number])
+        some = evenly(torch.arange(len(truth)), SCORED)
+        held.append(Try(one, *squares(one, asked[some] @ one.axes), truth[some]))
+    made = along(made, [errors for *_, errors in tries])
+    return fitted(made, held) if held else made
+
+
+@torch.no_grad()
+def locate(
+    model: Model | Fingerprints,
+    value: object,
+    links: Links | None = None,
+    region: object = None,
+    unknown_power: bool = False,
+    step: float | None = None,
+    level: float = 0.9,
+) -> Location:
+    """Places where transmitters may be, by the values that receivers measure of them.
+
+    Args:
+        model: A model with intervals; or its ``fingerprints``, which then take a few milliseconds a value.
+        value: A label of each receiver (r, *shape), or those of several transmissions (n, r, *shape), scaled as the
+            training labels; with one receiver also (*shape) or (n, *shape). NaN, of channels also zeros, where a
+            receiver has not heard it.
+        links, region: As for ``fingerprints``.
+        unknown_power: True if all labels of a transmission share an unknown offset [dB], or factor of amplitudes.
+            Channels are always compared without their power and phase.
+        step: Standard deviation of the move from one value to the next along each axis, if values are a track [m].
+        level: Probability with which the region holds the transmitter. Held-out fingerprints measure it, or without
+            them, with too few (9 for 0.9) and on tracks the posterior, whose regions are often too small.
+
+    Raises:
+        ValueError: A value has another shape than the labels, or was heard by no receiver; or an option is impossible.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> prints = gaigs.fingerprints(gaigs.train("gaussian_process", links), links, points=500)
+        >>> walk = [[-50.0, -48.0, -55.0, -61.0], [-51.0, -47.0, -56.0, -60.0]]  # [dBm]
+        >>> found = gaigs.locate(prints, walk, step=0.5)
+        >>> found.mean.shape, found.region.shape == (2, len(prints.places))
+        (torch.Size([2, 3]), True)
+
+    Source: Haeberlen et al., Practical robust localization over large-scale 802.11 wireless networks, 2004, for the
+    posterior over places; Rabiner, A tutorial on hidden Markov models, 1989, for tracks.
+    """
+    if isinstance(model, Fingerprints):
+        if links is not None or region is not None:
+            raise ValueError("fingerprints have their links and region; leave links and region out")
+        prints = model
+    else:
+        prints = fingerprints(model, links, region)
+    return posterior(prints, as_fingerprints(value, prints), unknown_power, step, level)
+
+
+def posterior(
+    prints: Fingerprints, asked: Float[Tensor, "n r m"], unknown_power: bool, step: float | None, level: float
+) -> Location:
+    """``locate`` for the fingerprints of values."""
+    if not 0 < level < 1:
+        raise ValueError(f"level must be a probability between 0 and 1 such as 0.9, got {level!r}")
+    if step is not None and not 0 < step < math.inf:
+        raise ValueError(f"step must be above 0 m, got {step!r}")
+    parts = squares(prints, asked @ prints.axes, unknown_power)
+    logarithms, places = log_likelihood(*parts, prints.degrees, prints.temper) + prints.prior, prints.places
+    if step is not None:
+        logarithms = smoothed(logarithms, places.double(), step)
+    probabilities, heights = torch.softmax(logarithms, 1), logarithms - prints.prior + prints.density
+    order = heights.argsort(1, descending=True)
+    if len(prints.drops) >= fewest(level) and step is None:
+        rank = min(math.ceil(level * (len(prints.drops) + 1)), len(prints.drops)) - 1
+        region = heights >= heights.gather(1, order[:, :1]) - prints.drops[rank]
+    else:
+        ordered = probabilities.gather(1, order)
+        region = torch.zeros_like(order, dtype=torch.bool).scatter(1, order, ordered.cumsum(1) - ordered < level)
+    mean = (probabilities @ places.double()).float()
+    return Location(places, probabilities, mean, places[order[:, 0]], region)
+
+
+def run(config: dict, folder: Path) -> None:
+    """Locates the test transmitters of a finished run; writes ``locate.json``, ``.csv`` and ``.png`` into a folder."""
+    if config["folder"] is None:
+        raise ValueError("command=locate needs the folder of a finished run; add folder=runs/...")
+    model, links, options = model_of(config["folder"]), links_of(config["folder"]), dict(config["locate"])
+    own = {name: options.pop(name) for name in ("region", "frequency", "points")}
+    start = time.perf_counter()
+    prints = call("locate", fingerprints, own, model=model, links=links)
+    made = time.perf_counter() - start
+    index, rows = (at_carrier(links, prints.frequency, *parts) for parts in (("test",), ("train", "validation")))
+    if not len(index):
+        raise ValueError("the run has no test links at this carrier; take another split or locate.frequency")
+    (asked, truth), (known, places) = received(links, index), received(links, rows)
+    start = time.perf_counter()
+    found = call("locate", posterior, options, prints=prints, asked=asked)
+    taken = time.perf_counter() - start
+    _, groups = places.unique(dim=0, return_inverse=True)
+    guesses = {"locate": found.mean, "likeliest": found.likeliest, "knn": neighbours(asked, known, places, groups)}
+    errors = {name: (guess - truth).norm(dim=1) for name, guess in guesses.items()}
+    numbers: dict[str, Any] = {
+        name: {"median_m": error.median().item(), "mean_m": error.mean().item()} for name, error in errors.items()
+    }
+    numbers["locate"] |= {
+        f"region_{100 * options['level']:g}": found.holds(truth).double().mean().item(),
+        f"share_{100 * options['level']:g}": (found.region * prints.prior.softmax(0)).sum(1).mean().item(),
+        "milliseconds": 1e3 * taken / len(truth),
+    }
+    numbers |= {"transmissions": len(truth), "candidates": len(prints.places), "map_seconds": made}
+    numbers |= {"task": links.task.name, "split": links.split.name}
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "locate.json", json.dumps(numbers, indent=2) + "\n")
+    columns = torch.cat((truth, *guesses.values(), *(error[:, None] for error in errors.values())), 1)
+    names = [f"{part}{axis}" for part in ("", *(f"{name}_" for name in guesses)) for axis in "xyz"]
+    names += [f"{name}_error_m" for name in errors]
+    lines = (",".join(f"{x:.3f}" for x in row) for row in columns.tolist())
+    write_text(folder / "locate.csv", "\n".join((",".join(names), *lines, "")))
+    style.save(figure(truth, found.mean, places, errors), folder / "locate.png")
+    shown = numbers["locate"], numbers["knn"]
+    words = (f"median {part['median_m']:.3g} m, mean {part['mean_m']:.3g} m" for part in shown)
+    print(f"{len(truth)} transmitters: {'; nearest neighbours '.join(words)}\nresults: {folder}")
+
+
+def figure(
+    truth: Float[Tensor, "n 3"], mean: Float[Tensor, "n 3"], known: Float[Tensor, "k 3"], errors: dict[str, Tensor]
+) -> Figure:
+    """Transmitters from above with their estimates, and the shares of errors below a distance."""
+    with rc_context(style.STYLE):
+        drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
+        left, right = drawn.subplots(1, 2)
+        left.plot(*known[:, :2].T.numpy(), "o", markersize=1.5, color=style.GREY, label="known places")
+        some = evenly(torch.arange(len(truth)), 150)
+        left.plot(*torch.stack((truth[some], mean[some]))[..., :2].permute(2, 0, 1).numpy(), color=style.ORANGE, lw=0.6)
+        left.plot(*truth[some, :2].T.numpy(), "o", markersize=3, color=style.BLUE, label="transmitters")
+        left.plot(*mean[some, :2].T.numpy(), "o", markersize=3, color=style.ORANGE, label="estimates")
+        left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+        shares = (torch.arange(len(truth)) + 0.5) / len(truth)
+        for name, colour, words in (("locate", style.ORANGE, "estimates"), ("knn", style.GREY, "nearest neighbours")):
+            right.plot(errors[name].sort().values.numpy(), shares.numpy(), color=colour, label=words)
+        right.set(xlabel="error [m]", ylabel="share of transmitters", ylim=(0, 1), xlim=(0, None))
+        right.grid()
+        right.set_axisbelow(True)
+        right.legend(loc="lower right")
+        drawn.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=3)
+    return drawn
+
+
+# --- the map ---
+
+
+def candidates(
+    box: Float[Tensor, "2 3"], points: int, links: Links | None, known: Int[Tensor, " k"]
+) -> tuple[Float[Tensor, "g 3"], Float[Tensor, " g"], Float[Tensor, " g"]]:
+    """Places, and logarithms of their prior probability and density: a grid, with links denser about known places.
+
+    The density about known places is a sum of normal ones. Places of other folds are most likely under their width.
+    """
+    if links is None:
+        places = even_places(box[0], box[1], points)
+        return places, torch.full((len(places),), -math.log(len(places))), torch.zeros(len(places))
+    sites, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
+    folds = torch.zeros(len(sites), dtype=torch.long).index_copy(0, which, folds_of(links, known))
+    edges = (box[1] - box[0]).double()
+    extended = edges > 1e-3 * edges.max()
+    dimensions, volume = int(extended.sum()), edges[extended].prod()
+
+    def log_density(asked: Tensor, width: float, own: Tensor | None = None) -> Tensor:
+        squared = distances(asked[:, extended], sites[:, extended]).square_()
+        if own is not None:
+            squared = squared.masked_fill(own[:, None] == folds, math.inf)
+        size = math.log(1 - ELSEWHERE) - math.log(len(sites)) - dimensions * math.log(width * math.sqrt(2 * math.pi))
+        near = torch.logsumexp(squared / (-2 * width**2), 1) + size
+        return torch.logaddexp(near, (ELSEWHERE / volume).log())
+
+    some = evenly(torch.arange(len(sites)), POINTS // 20)
+    widths = torch.logspace(math.log10(links.scene.spacing / 4), math.log10(edges.norm()), 24).tolist()
+    width = max(widths, key=lambda width: log_density(sites[some], width, folds[some]).mean().item())
+    even, count = even_places(box[0], box[1], max(1, points // 4)), points - points // 4
+    noise = width * extended * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    places = torch.cat((even, (sites[torch.arange(count) * len(sites) // count] + noise).float()))
+    shares = torch.tensor([ELSEWHERE / len(even), (1 - ELSEWHERE) / count]).log()
+    density = torch.cat([log_density(part.double(), width) for part in places.split(1024)])
+    return places, shares.repeat_interleave(torch.tensor([len(even), count])), density.float()
+
+
+def predicted(
+    model: Model, places: Float[Tensor, "g 3"], frequency: float | None
+) -> tuple[Float[Tensor, "g r m"], Float[Tensor, "g r"]]:
+    """A model's values at places for all receivers, as ``task.fingerprint`` has them, and their deviations."""
+    count, task = len(model.scene.receivers), model.scene.task
+    found, deviations = [], []
+    with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):  # prior places may be outside
+        for part in places.split(max(1, (64 if task.shape else 8192) // count)):
+            asked = part[:, None].expand(-1, count, 3), torch.arange(count).expand(len(part), -1)
+            if task.shape:
+                value = model.predict(*asked, frequency=frequency, batch_size=64).cpu().flatten(0, 1)
+                deviations.append(torch.ones(len(part), count))
+            else:
+                estimate = model.predict(*asked, frequency=frequency, batch_size=8192, interval=0.5)
+                value = estimate.value.cpu().flatten()
+                deviations.append(estimate.std.cpu())
+            found.append(task.fingerprint(value).unflatten(0, (len(part), count)))
+    return torch.cat(found), torch.cat(deviations)
+
+
+def along(prints: Fingerprints, errors: list[Float[Tensor, "_ r m"]]) -> Fingerprints:
+    """Fingerprints along the axes of some errors; without any along those of their own differences."""
+    if not prints.task.shape:
+        return replace(prints, axes=torch.eye(1))
+    values = torch.cat(errors or [prints.values - prints.values.mean(0)]).flatten(0, 1)
+    axes = independent(values[~values.isnan().any(1)])
+    return replace(prints, axes=axes, values=prints.values @ axes)
+
+
+def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor, " k"]:
+    """Links of some parts of the split at a carrier."""
+    index = torch.cat([getattr(links.split, part) for part in parts])
+    if frequency is None or links.query.frequencies is None:
+        return index
+    return index[(links.query.frequencies[index] / frequency - 1).abs() < ROUNDING]
+
+
+def rows_of(links: Links) -> Int[Tensor, " n"]:
+    """Transmission of each link: its row or, where a set has no rows, its place."""
+    return links.query.transmitters.unique(dim=0, return_inverse=True)[1] if links.rows is None else links.rows
+
+
+def whole(links: Links, part: Int[Tensor, " j"], known: Int[Tensor, " k"]) -> Int[Tensor, " i"]:
+    """Those known links that share a transmission with a part."""
+    rows = rows_of(links)
+    return known[torch.isin(rows[known], rows[part])]
+
+
+def received(links: Links, index: Int[Tensor, " k"]) -> tuple[Float[Tensor, "n r m"], Float[Tensor, "n 3"]]:
+    """Fingerprints of the transmissions of some links, NaN where a receiver has none, and their places."""
+    rows, which = rows_of(links)[index].unique(return_inverse=True)
+    own = torch.cat([links.task.fingerprint(links.labels[part]) for part in index.split(256)])
+    found = own.new_full((len(rows), len(links.receivers), own.shape[1]), math.nan)
+    found[which, links.query.receivers[index]] = own
+    places = torch.zeros(len(rows), 3)
+    places[which] = links.query.transmitters[index]
+    return found, places
+
+
+def as_fingerprints(value: object, prints: Fingerprints) -> Float[Tensor, "n r m"]:
+    """The fingerprints of values that a user gives; raises a ``ValueError`` for other shapes."""
+    shape, count = tuple(prints.task.shape), prints.values.shape[1]
+    try:
+        given = torch.as_tensor(value).detach().cpu().to(prints.task.dtype)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"value must be numbers, got {error}") from None
+    values = given.reshape(-1, 1, *shape) if count == 1 and given.ndim - len(shape) in (0, 1) else given
+    values = values[None] if values.ndim == 1 + len(shape) else values
+    if values.ndim != 2 + len(shape) or values.shape[1:] != (count, *shape):
+        need = f"{(count, *shape)} or {('n', count, *shape)}, a label of each receiver"
+        raise ValueError(f"value must be {need}, got {tuple(given.shape)}")
+    flat = values.reshape(*values.shape[:2], -1)
+    missing = flat.isnan().any(2) | ((flat == 0).all(2) if values.is_complex() else False)
+    if missing.all(1).any():
+        raise ValueError(f"value {int(missing.all(1).int().argmax())} was heard by no receiver; leave it out")
+    if not flat[~missing].isfinite().all():
+        raise ValueError("value must be finite, or NaN where a receiver has not heard it")
+    found = prints.task.fingerprint(values.flatten(0, 1)).unflatten(0, values.shape[:2])
+    return found.masked_fill(missing[..., None], math.nan)
+
+
+# --- likelihood ---
+
+
+def independent(errors: Float[Tensor, "n m"]) -> Float[Tensor, "m k"]:
+    """Axes along which errors of a label's numbers are independent, scaled to a mean square of 1 a label.
+
+    Source: Ledoit and Wolf, A well-conditioned estimator for large-dimensional covariance matrices, 2004.
+    """
+    errors = errors[evenly(torch.arange(len(errors)), 4000)].double()
+    if not errors.any():
+        return torch.eye(errors.shape[1])
+    sizes, vectors = torch.linalg.eigh(errors.mT @ errors / len(errors))
+    scatter = (errors.square().sum(1).square().mean() - sizes.square().sum()) / len(errors)
+    share = (scatter / (sizes - sizes.mean()).square().sum()).nan_to_num(1.0).clamp(0, 1)  # 0 / 0 if all are equal
+    sizes = (1 - share) * sizes.clamp_min(0) + share * sizes.mean()
+    axes = vectors / sizes.clamp_min(1e-6 * sizes.max()).sqrt()  # numbers that never err have no infinite weight
+    return (axes / (errors @ axes).square().sum(1).mean().sqrt()).float()
+
+
+def squares(
+    prints: Fingerprints, asked: Float[Tensor, "n r k"], unknown_power: bool = False
+) -> tuple[Float[Tensor, "n g"], Float[Tensor, "n g"], Float[Tensor, " n"]]:
+    """Squared distances of values from the candidates' over the deviations, sums of the deviations' logarithms, and
+    numbers of receivers; with ``unknown_power`` the least distance with any offset or factor of the value."""
+    shape = len(asked), len(prints.places)
+    total, logarithms, count = torch.zeros(shape), torch.zeros(shape), torch.zeros(len(asked))
+    with_all, alone = torch.zeros(shape), torch.zeros(shape)
+    for receiver in range(asked.shape[1]):
+        heard = ~asked[:, receiver, 0].isnan()
+        own, values, deviations = asked[heard, receiver], prints.values[:, receiver], prints.deviations[:, receiver]
+        count[heard] += 1
+        if not prints.task.shape:
+            errors = (own - values[:, 0]) / deviations
+            total[heard] += errors.square()
+            with_all[heard] += errors / deviations
+            alone[heard] += deviations.square().reciprocal()
+            logarithms[heard] += deviations.log()
+            continue
+        sizes, products, powers = values.square().sum(1), own @ values.mT, own.square().sum(1, keepdim=True)
+        with_all[heard] += products
+        alone[heard] += powers
+        total[heard] += sizes if unknown_power else sizes - 2 * products + powers
+    if unknown_power:
+        total -= with_all.square() / alone.clamp_min(torch.finfo(torch.float32).tiny)
+        count = count - 1 if not prints.task.shape else count
+    return total.clamp_min(0), logarithms, count
+
+
+def log_likelihood(
+    total: Float[Tensor, "n g"],
+    logarithms: Float[Tensor, "n g"],
+    count: Float[Tensor, " n"],
+    degrees: float,
+    temper: float,
+) -> Float[Tensor, "n g"]:
+    """Student's t of all receivers together, to the power ``temper``; arguments as ``squares`` gives them.
+
+    The t lets one unlike place or receiver count little. The exponent stands for what the errors of receivers
+    have in common, and for what ``axes`` miss.
+    """
+    return -temper * ((degrees + count[:, None]) / 2 * torch.log1p(total / degrees) + logarithms).double()
+
+
+class Try(NamedTuple):
+    """Held-out values: ``squares`` of them in the map of a model that does not know them, and their places (n, 3)."""
+
+    prints: Fingerprints
+    total: Float[Tensor, "n g"]
+    logarithms: Float[Tensor, "n g"]
+    count: Float[Tensor, " n"]
+    truth: Float[Tensor, "n 3"]
+
+    def likelihood(self, degrees: float, temper: float) -> Float[Tensor, "n g"]:
+        return log_likelihood(self.total, self.logarithms, self.count, degrees, temper)
+
+
+def fitted(prints: Fingerprints, tries: Sequence[Try]) -> Fingerprints:
+    """The likelihood with the least energy score of held-out values, and how far the true place is from the best.
+
+    Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation, 2007, section 4.3.
+    """
+    rng = torch.Generator()
+
+    def score(degrees: float, temper: float) -> float:
+        total = []
+        for one in tries:
+            probabilities = torch.softmax(one.likelihood(degrees, temper) + one.prints.prior, 1)
+            drawn = one.prints.places[torch.multinomial(probabilities, 128, True, generator=rng.manual_seed(0))]
+            apart = (drawn[:, ::2] - drawn[:, 1::2]).norm(dim=2).mean(1)
+            total.append((drawn - one.truth[:, None]).norm(dim=2).mean(1) - apart / 2)
+        return torch.cat(total).mean().item()
+
+    degrees, temper = min(itertools.product(DEGREES, TEMPERS), key=lambda choice: score(*choice))
+    drops = []
+    for one in tries:
+        heights = one.likelihood(degrees, temper) + one.prints.density
+        near = distances(one.truth.double(), one.prints.places.double()).argmin(1)
+        drops.append(heights.amax(1) - heights.gather(1, near[:, None])[:, 0])
+    return replace(prints, degrees=degrees, temper=temper, drops=torch.cat(drops).sort().values)
+
+
+def smoothed(logarithms: Float[Tensor, "n g"], places: Float[Tensor, "g 3"], step: float) -> Float[Tensor, "n g"]:
+    """Posterior of each place of a track given all values, from those given each value alone: forward and backward."""
+    kept = min(KEPT, len(places))
+    best = logarithms.topk(kept, dim=1)
+    spacing = distances(places[best.indices[0]], places[best.indices[0]]).fill_diagonal_(math.inf).amin(1).median()
+    step = math.hypot(step, spacing.item())  # candidates are no finer
+
+    def moves(first: Tensor, second: Tensor) -> Tensor:
+        apart = distances(places[first], places[second])
+        return torch.logaddexp(-(apart / step).square() / 2, torch.tensor(math.log(JUMP), dtype=apart.dtype))
+
+    links = [moves(a, b) for a, b in itertools.pairwise(best.indices)]
+    forward, backward = [best.values[0]], [torch.zeros_like(best.values[0])]
+    for move, own in zip(links, best.values[1:], strict=True):
+        forward.append(own + torch.logsumexp(forward[-1][:, None] + move, 0).log_softmax(0))
+    for move, own in zip(links[::-1], best.values.flip(0)[:-1], strict=True):
+        backward.append(torch.logsumexp(move + own + backward[-1], 1).log_softmax(0))
+    found = torch.stack(forward) + torch.stack(backward[::-1])
+    return torch.full_like(logarithms, -math.inf).scatter(1, best.indices, found)
+
+
+def neighbours(
+    asked: Float[Tensor, "n r m"],
+    known: Float[Tensor, "k r m"],
+    places: Float[Tensor, "k 3"],
+    groups: Int[Tensor, " k"],
+) -> Float[Tensor, "n 3"]:
+    """Means of the known places with the nearest fingerprints, weighted by 1 / distance; the yardstick of ``locate``.
+
+    A receiver that has not heard a transmission counts as the least known value. The number of neighbours is that of
+    ``COUNTS`` with the least mean error of known transmissions, without those of the same group.
+    """
+    least = known[~known.isnan()].min() if known.shape[2] == 1 else 0.0
+    flat = lambda prints: prints.where(~prints.isnan(), least).flatten(1)
+
+    def guesses(apart: Tensor, count: int) -> Tensor:
+        near = apart.topk(min(count, apart.shape[1]), largest=False)
+        weights = 1 / near.values.clamp_min(1e-6)
+        return (places[near.indices] * (weights / weights.sum(1, keepdim=True))[..., None]).sum(1)
+
+    some = evenly(torch.arange(len(known)), 500)
+    apart = torch.cdist(flat(known[some]), flat(known)).masked_fill(groups[some][:, None] == groups, math.inf)
+    error = lambda count: (guesses(apart, count) - places[some]).norm(dim=1).mean().item()
+    return guesses(torch.cdist(flat(asked), flat(known)), min(COUNTS, key=error))

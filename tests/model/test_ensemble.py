@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+import torch
+
+import gaigs
+from gaigs import checkpoint
+from gaigs.model.ensemble import Ensemble
+
+FEW = {"max_steps": 2, "count": 20, "enable_progress_bar": False}
+
+
+@pytest.fixture(scope="module")
+def links():
+    return gaigs.links("synthetic_rssi", transmitters=60, order=0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("ensemble")
+
+
+@pytest.fixture(scope="module")
+def model(links, folder):
+    return gaigs.train("gaigs", links, ensemble=3, seed=4, folder=folder, **FEW)
+
+
+def test_members_are_the_models_of_successive_seeds(links, model):
+    places = [[1.0, 2.0, 1.5], [2.0, 1.0, 1.0]]
+    for seed, member in zip((4, 5, 6), model.members, strict=True):
+        alone = gaigs.train("gaigs", links, seed=seed, **FEW)
+        torch.testing.assert_close(member.predict(places), alone.predict(places))
+    values = np.stack([member.predict(places).numpy() for member in model.members])
+    np.testing.assert_allclose(model.predict(places), values.mean(0), rtol=1e-5)
+    assert (values.std(0) > 0).all()
+
+
+def test_deviations_are_those_of_the_members(links, model):
+    train = links.batch(links.split.train)
+    every = np.stack([member.predict(train.query).numpy() for member in model.members])
+    assert model.typical.item() == pytest.approx(every.var(0, ddof=1).mean(), rel=1e-4)
+    batch = links.batch(links.split.test[:5])
+    values = np.stack([member.predict(batch.query).numpy() for member in model.members])
+    expected = np.sqrt((2 * values.var(0, ddof=1) + 4 * model.typical.item()) / 6)
+    np.testing.assert_allclose(model.deviations(batch).detach(), expected, rtol=1e-4)
+
+
+def test_an_ensemble_is_stored_whole_and_a_finished_one_is_not_trained_again(links, model, folder):
+    loaded = gaigs.load(folder / "best.ckpt")
+    assert isinstance(loaded, Ensemble)
+    place = [1.0, 2.0, 1.5]
+    for own, other in zip(model.predict(place, interval=0.5), loaded.predict(place, interval=0.5), strict=True):
+        torch.testing.assert_close(own, other)
+    again = gaigs.train("gaigs", links, ensemble=3, seed=4, folder=folder, **FEW)
+    torch.testing.assert_close(again.predict(place), model.predict(place))
+    steps = [checkpoint.read(path)["global_step"] for path in folder.glob("members/*/last.ckpt")]
+    assert steps == [2, 2]
+
+
+def test_channels_deviate_by_the_size_of_their_complex_difference():
+    links = gaigs.links("synthetic_csi", transmitters=20, order=0)
+    friis = [gaigs.registries["model"].build("friis", scene=links.scene) for _ in range(2)]
+    for one in friis:
+        one.fit(links)
+    ensemble = Ensemble(links.scene, friis)
+    ensemble.members[1].forward = lambda batch: type(friis[0](batch))(1j * friis[0](batch).value, {})
+    batch = links.batch(links.split.test[:3])
+    power = friis[0](batch).value.abs().square().mean((1, 2))
+    torch.testing.assert_close(ensemble.deviations(batch), (power / 5).sqrt())
+
+
+def test_kriging_has_the_ensemble_as_its_trend(tmp_path):
+    links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
+    model = gaigs.train("gaigs", links, ensemble=2, kriging=True, folder=tmp_path, **FEW)
+    assert isinstance(gaigs.load(tmp_path / "best.ckpt").trend, Ensemble)
+    weights = checkpoint.trained_weights(checkpoint.read(tmp_path / "best.ckpt"))
+    first = model.trend.members[0].state_dict()
+    assert {f"model.{name}" for name in first} == weights.keys()
+
+
+def test_an_ensemble_has_a_member(links):
+    with pytest.raises(ValueError, match="ensemble must be at least 1"):
+        gaigs.train("gaigs", links, ensemble=0, **FEW)

@@ -1,0 +1,226 @@
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import gaigs
+from gaigs import locating
+from gaigs.locating import (
+    Fingerprints,
+    independent,
+    log_likelihood,
+    neighbours,
+    posterior,
+    received,
+    smoothed,
+    squares,
+)
+from gaigs.task.csi import Csi
+
+
+def scalars(values, deviations, **options):
+    """Fingerprints of RSSI at places along a line, one row a place."""
+    count = len(values)
+    places = torch.stack((torch.arange(count).float(), *torch.zeros(2, count)), 1)
+    even = torch.full((count,), -math.log(count)), torch.zeros(count)
+    task = gaigs.registries["task"].build("rssi")
+    parts = torch.tensor(values)[..., None], torch.tensor(deviations)
+    return Fingerprints(task, None, places, *even, torch.eye(1), *parts, **options)
+
+
+@pytest.fixture(scope="module")
+def rssi():
+    links = gaigs.links("synthetic_rssi", transmitters=120, order=0)
+    model = gaigs.train("knn", links)
+    return links, model, gaigs.fingerprints(model, links, points=3000)
+
+
+def test_posterior_is_that_of_a_plain_sum_over_the_receivers_that_hear():
+    values, deviations = [[-40.0, -60.0], [-50.0, -52.0], [-60.0, -45.0]], [[2.0, 3.0], [4.0, 3.0], [2.0, 1.5]]
+    prints = scalars(values, deviations, degrees=5.0, temper=0.7)
+    for asked in ([-48.0, -55.0], [-48.0, math.nan]):
+        found = gaigs.locate(prints, asked)
+        logs = []
+        for value, deviation in zip(values, deviations, strict=True):
+            heard = [i for i in range(2) if not math.isnan(asked[i])]
+            q = sum(((asked[i] - value[i]) / deviation[i]) ** 2 for i in heard)
+            logs.append(-0.7 * ((5 + len(heard)) / 2 * np.log1p(q / 5) + sum(np.log(deviation[i]) for i in heard)))
+        p = np.exp(logs) / np.exp(logs).sum()
+        np.testing.assert_allclose(found.probabilities[0], p, rtol=1e-5)
+        np.testing.assert_allclose(found.mean[0], [p @ [0, 1, 2], 0, 0], rtol=1e-5, atol=1e-6)
+        assert found.likeliest[0, 0] == np.argmax(p)
+
+
+def test_unknown_power_takes_the_offset_with_the_least_error():
+    prints = scalars([[-40.0, -60.0, -50.0], [-50.0, -52.0, -70.0]], [[2.0, 3.0, 1.0], [4.0, 3.0, 2.0]])
+    asked = torch.tensor([[[-47.0], [-66.0], [-58.0]]])
+    total, _, count = squares(prints, asked, unknown_power=True)
+    for place in range(2):
+        errors, deviations = asked[0, :, 0] - prints.values[place, :, 0], prints.deviations[place]
+        best = min(((errors - x) / deviations).square().sum().item() for x in torch.arange(-20, 20, 0.01))
+        assert total[0, place].item() == pytest.approx(best, abs=1e-3)
+    assert count.tolist() == [2]
+    found = gaigs.locate(prints, asked[..., 0] + 25, unknown_power=True).probabilities
+    torch.testing.assert_close(found, gaigs.locate(prints, asked[..., 0], unknown_power=True).probabilities)
+
+
+def test_spectra_of_unknown_power_may_have_any_factor():
+    links = gaigs.links("synthetic", transmitters=30, order=0)
+    prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=300)
+    label = links.labels[links.split.test[:1]]
+    with_power, without = (gaigs.locate(prints, 0.3 * label, unknown_power=unknown) for unknown in (False, True))
+    same = gaigs.locate(prints, label, unknown_power=True)
+    torch.testing.assert_close(without.probabilities, same.probabilities, rtol=1e-3, atol=1e-6)
+    assert not torch.allclose(with_power.probabilities, without.probabilities, atol=1e-3)
+
+
+def test_a_track_has_the_posterior_of_all_its_paths():
+    rng = torch.Generator().manual_seed(0)
+    places = torch.rand(4, 3, generator=rng, dtype=torch.float64)
+    values, step = torch.randn(3, 4, generator=rng, dtype=torch.float64), 0.4
+    found = torch.softmax(smoothed(values, places, step), 1)
+    spacing = torch.cdist(places, places).fill_diagonal_(math.inf).amin(1).median()
+    size = math.hypot(step, spacing)
+    expected = np.zeros((3, 4))
+    for path in itertools.product(range(4), repeat=3):
+        weight = np.exp(sum(values[t, i].item() for t, i in enumerate(path)))
+        for a, b in itertools.pairwise(path):
+            weight *= np.exp(-(((places[a] - places[b]).norm() / size) ** 2).item() / 2) + 1e-4
+        expected[range(3), path] += weight
+    np.testing.assert_allclose(found, expected / expected.sum(1, keepdims=True), rtol=1e-6)
+
+
+def test_transmitters_are_nearer_than_their_neighbours_and_in_their_regions():
+    links = gaigs.links("synthetic_csi", transmitters=120, order=0)
+    prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=2000)
+    known = torch.cat((links.split.train, links.split.validation))
+    (asked, truth), (prior, places) = received(links, links.split.test), received(links, known)
+    found = posterior(prints, asked, False, None, 0.9)
+    guess = neighbours(asked, prior, places, torch.arange(len(places)))
+    own, other = ((part - truth).norm(dim=1).mean() for part in (found.mean, guess))
+    assert own < other
+    assert found.holds(truth).double().mean() >= 0.75
+    assert posterior(prints, asked, False, None, 0.5).region.sum() < 0.7 * found.region.sum()
+    torch.testing.assert_close(prints.prior.exp().sum(), torch.tensor(1.0))
+
+
+def test_prior_follows_the_known_places_and_a_region_replaces_it(rssi):
+    links, model, prints = rssi
+    known = links.query.transmitters[links.split.train]
+    apart = lambda places: torch.cdist(places, known).amin(1).median()
+    box = torch.stack((known.amin(0), known.amax(0)))
+    even = gaigs.fingerprints(model, region=box, points=1000)
+    assert apart(prints.places) < 0.95 * apart(even.places)
+    assert even.prior.unique().numel() == 1
+    assert not len(even.drops)
+
+
+def test_held_out_fingerprints_are_located_among_the_other_places(monkeypatch):
+    # A density that knew them would put each region about its own place.
+    links = gaigs.links("synthetic_rssi", transmitters=60, order=0)
+    asked = []
+    own = locating.candidates
+    monkeypatch.setattr(locating, "candidates", lambda *parts: asked.append(parts[-1]) or own(*parts))
+    prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=300)
+    every, *others = (set(known.tolist()) for known in asked)
+    held = [every - known for known in others]
+    assert len(held) == 2
+    assert all(held)
+    assert not held[0] & held[1]
+    assert len(prints.drops) == sum(len({links.rows[row].item() for row in part}) for part in held)
+
+
+def test_channels_are_compared_without_power_phase_and_delay():
+    rng = torch.Generator().manual_seed(0)
+    h = torch.view_as_complex(torch.randn(2, 4, 8, 2, generator=rng))
+    frequencies = 5e9 + 1e6 * torch.arange(8)
+    known, none = Csi(4, frequencies), Csi(4, frequencies, "per_link_and_delay")
+    turned = 3 * torch.exp(1j * torch.tensor([1.0, 2.0]))[:, None, None] * h
+    torch.testing.assert_close(known.fingerprint(turned), known.fingerprint(h))
+    late = turned * torch.exp(-2j * math.pi * frequencies * 3e-8)
+    torch.testing.assert_close(none.fingerprint(late.to(h)), none.fingerprint(h), rtol=1e-3, atol=1e-4)
+    assert (known.fingerprint(late.to(h)) - known.fingerprint(h)).abs().max() > 0.05
+
+
+def test_errors_are_independent_along_their_axes():
+    rng = torch.Generator().manual_seed(0)
+    mix = torch.randn(6, 6, generator=rng)
+    errors = torch.randn(5000, 6, generator=rng) @ mix
+    along = errors @ independent(errors)
+    torch.testing.assert_close(along.T @ along / len(along), torch.eye(6) / 6, atol=0.02, rtol=0)
+    few = torch.randn(3, 6, generator=rng) @ mix
+    assert independent(few).isfinite().all()
+    assert independent(torch.zeros(3, 6)).isfinite().all()
+
+
+def test_neighbours_are_those_of_numpy():
+    rng = torch.Generator().manual_seed(0)
+    known, places, asked = (torch.rand(40, *shape, generator=rng) for shape in ((3, 1), (3,), (3, 1)))
+    known[0, 1] = math.nan
+    errors = {}
+    filled = np.nan_to_num(known[..., 0].numpy(), nan=np.nanmin(known.numpy()))
+
+    def guess(point, rows, count):
+        apart = np.linalg.norm(filled[rows] - point, axis=1)
+        near = np.argsort(apart)[:count]
+        weights = 1 / apart[near]
+        return weights @ places.numpy()[rows][near] / weights.sum()
+
+    for count in (1, 2, 3, 5, 8, 12, 20, 30, 50):
+        rows = lambda i: [j for j in range(40) if j != i]
+        errors[count] = np.mean(
+            [np.linalg.norm(guess(filled[i], rows(i), count) - places[i].numpy()) for i in range(40)]
+        )
+    best = min(errors, key=errors.get)
+    expected = [guess(point, list(range(40)), best) for point in asked[..., 0].numpy()]
+    np.testing.assert_allclose(neighbours(asked, known, places, torch.arange(40)), expected, rtol=1e-4)
+
+
+def test_likelihood_of_a_perfect_value_is_finite():
+    found = log_likelihood(torch.zeros(1, 2), torch.zeros(1, 2), torch.ones(1), 0.25, 16.0)
+    assert found.isfinite().all()
+
+
+def test_wrong_values_are_refused(rssi):
+    links, model, prints = rssi
+    for value, words in (
+        ([-50.0, -60.0], "a label of each receiver"),
+        ([math.nan] * 4, "heard by no receiver"),
+        ([-50.0, math.inf, -60.0, -70.0], "must be finite"),
+        ("loud", "value must be numbers"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            gaigs.locate(prints, value)
+    one = [-50.0, -60.0, -55.0, -70.0]
+    for options, words in (
+        ({"level": 1.0}, "level must be a probability"),
+        ({"step": 0.0}, "step must be above 0"),
+        ({"links": links}, "leave links and region out"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            gaigs.locate(prints, one, **options)
+    with pytest.raises(ValueError, match="points must be at least 2"):
+        gaigs.fingerprints(model, points=1)
+    with pytest.raises(ValueError, match="two corners"):
+        gaigs.fingerprints(model, region=[[0.0, 0.0, 0.0]])
+
+
+def test_the_command_locates_the_test_transmitters_of_a_run(tmp_path, capsys):
+    words = ("+experiment=rssi", "model=knn", "data.transmitters=40", "data.order=0", "baselines=[]")
+    gaigs.run(gaigs.compose(*words), tmp_path / "run")
+    command = ("command=locate", f"folder={tmp_path / 'run'}", "locate.points=300")
+    gaigs.run(gaigs.compose(*command), tmp_path / "found")
+    assert {path.name for path in (tmp_path / "found").iterdir()} == {"locate.csv", "locate.json", "locate.png"}
+    numbers = json.loads((tmp_path / "found" / "locate.json").read_text())
+    rows = (tmp_path / "found" / "locate.csv").read_text().splitlines()
+    assert numbers["transmissions"] == len(rows) - 1 == 8
+    errors = [float(row.split(",")[rows[0].split(",").index("locate_error_m")]) for row in rows[1:]]
+    assert numbers["locate"]["mean_m"] == pytest.approx(np.mean(errors), abs=1e-3)
+    assert {"median_m", "mean_m", "region_90", "share_90"} <= numbers["locate"].keys()
+    assert {"median_m", "mean_m"} == numbers["knn"].keys()
+    assert "8 transmitters: median" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="needs the folder of a finished run"):
+        gaigs.run(gaigs.compose("command=locate"), tmp_path / "found")
