@@ -100,6 +100,8 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
 
     lightning.seed_everything(config["seed"], verbose=False)
     links = load(config["data"], config["split"], config["task"]["name"])
+    if not len(links.split.test):
+        raise ValueError("a run takes links to test on; set split.test above 0, or use gaigs.train in Python")
     # Slow to import: errors in data come first.
     from gaigs.runs import evaluation
     from gaigs.runs.training import count_gaussians, fit

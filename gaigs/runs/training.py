@@ -122,8 +122,6 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         model = registry("model").build(config["model"], scene=links.scene)
     if isinstance(model, Kriging):
         raise ValueError("model=kriging has no training of its own; choose a trained model, and set kriging=true")
-    if config["ensemble"] < 1:
-        raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
     make_kriged = lambda trend: Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
     kriged = make_kriged(model)
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
@@ -133,6 +131,8 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     if not is_trained(model):
         model.calibration = calibrated(model, links)
         return Fitted({name: model}, {}, start)
+    if config["ensemble"] < 1:
+        raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
     model, seconds = descend(model, loss, links, config, folder)
     if not is_first():
         return None

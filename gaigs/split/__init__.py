@@ -27,7 +27,7 @@ def part(
         name: Name of the protocol, with its own options.
         links: All links.
         groups: Number of each link's group.
-        test: Fraction of the links to test on.
+        test: Fraction of the links to test on; 0 for none.
         validation: Fraction of the training links to validate on; 0 for none.
         seed: Seed of all random numbers.
         train: Groups to train and validate on; None for all that do not test.
@@ -35,7 +35,7 @@ def part(
     Raises:
         ValueError: An option is out of range, or there are too few groups.
     """
-    check("test", test, 0 < test < 1, "in (0, 1)")
+    check("test", test, 0 <= test < 1, "in [0, 1)")
     check("validation", validation, 0 <= validation < 1, "in [0, 1)")
     generator = generator_of(seed)
     training, testing = hold_out("test", torch.arange(len(links)), groups, test, generator)

@@ -121,7 +121,7 @@ def test_names_say_the_numbers(links, options, name):
         ({"name": "cubes"}, "unknown split 'cubes'.*; there are: blocks, .*official"),
         ({"name": "random", "edge": 0.5, "length": 3}, "'random' has no option 'edge' .*or 'length'.*; it has: test"),
         ({"name": "blocks"}, "'blocks' needs option edge"),
-        ({"name": "random", "test": 0}, r"split.test must be in \(0, 1\), got 0"),
+        ({"name": "random", "test": 1.0}, r"split.test must be in \[0, 1\), got 1"),
         ({"name": "random", "validation": 1}, r"split.validation must be in \[0, 1\), got 1"),
         ({"name": "official", "validation": 1.5}, "split.validation must be"),
         ({"name": "official", "length": 0}, "split.length must be a whole number of rows"),
