@@ -203,8 +203,8 @@ def locate(
         unknown_power: True if all labels of a transmission share an unknown offset [dB], or factor of amplitudes.
             Channels are always compared without their power and phase.
         step: Standard deviation of the move from one value to the next along each axis, if values are a track [m].
-        level: Probability with which the region holds the transmitter. Held-out fingerprints measure it, or without
-            them, with too few (9 for 0.9) and on tracks the posterior, whose regions are often too small.
+        level: Probability with which the region holds the transmitter, by held-out fingerprints (9 or more for 0.9).
+            With fewer, without links and on tracks the posterior counts, whose regions are often too small.
 
     Raises:
         ValueError: A value has another shape than the labels, or was heard by no receiver; or an option is impossible.
@@ -242,13 +242,12 @@ def posterior(
     if step is not None:
         logarithms = smoothed(logarithms, places.double(), step)
     probabilities, heights = torch.softmax(logarithms, 1), logarithms - prints.prior + prints.density
-    order = heights.argsort(1, descending=True)
-    if len(prints.drops) >= fewest(level) and step is None:
-        rank = min(math.ceil(level * (len(prints.drops) + 1)), len(prints.drops)) - 1
-        region = heights >= heights.gather(1, order[:, :1]) - prints.drops[rank]
-    else:
-        ordered = probabilities.gather(1, order)
-        region = torch.zeros_like(order, dtype=torch.bool).scatter(1, order, ordered.cumsum(1) - ordered < level)
+    order, count = heights.argsort(1, descending=True), len(prints.drops)
+    ordered = probabilities.gather(1, order)
+    region = torch.zeros_like(order, dtype=torch.bool).scatter(1, order, ordered.cumsum(1) - ordered < level)
+    if count and step is None:
+        near = heights >= heights.gather(1, order[:, :1]) - prints.drops[min(math.ceil(level * (count + 1)), count) - 1]
+        region = near if count >= fewest(level) else near | region
     mean = (probabilities @ places.double()).float()
     return Location(places, probabilities, mean, places[order[:, 0]], region)
 
