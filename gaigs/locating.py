@@ -28,7 +28,7 @@ from gaigs.query import ROUNDING, as_positions
 from gaigs.registry import call, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, model_of
-from gaigs.runs.evaluation import unseen
+from gaigs.runs.evaluation import is_trained, unseen
 from gaigs.task import Task
 
 POINTS, SECONDS, FEWEST = 20_000, 60.0, 1000
@@ -147,7 +147,7 @@ def fingerprints(
     if frequency is None and len(scene.frequencies):
         frequency = float(scene.frequencies[len(scene.frequencies) // 2])
     if points is None:
-        some = even_places(box[0], box[1], 64)
+        some = even_places(box[0], box[1], 512)
         predicted(model, some[:2], frequency)  # the first prediction compiles and loads
         start = time.perf_counter()
         predicted(model, some, frequency)
@@ -362,14 +362,16 @@ def predicted(
     """A model's values at places for all receivers, as ``task.fingerprint`` has them, and their deviations."""
     count, task = len(model.scene.receivers), model.scene.task
     found, deviations = [], []
+    # A look-up reads its labels once a batch.
+    size = 8192 if not task.shape else 64 if is_trained(model) else 512
     with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):  # prior places may be outside
-        for part in places.split(max(1, (64 if task.shape else 8192) // count)):
+        for part in places.split(max(1, size // count)):
             asked = part[:, None].expand(-1, count, 3), torch.arange(count).expand(len(part), -1)
             if task.shape:
-                value = model.predict(*asked, frequency=frequency, batch_size=64).cpu().flatten(0, 1)
+                value = model.predict(*asked, frequency=frequency, batch_size=size).cpu().flatten(0, 1)
                 deviations.append(torch.ones(len(part), count))
             else:
-                estimate = model.predict(*asked, frequency=frequency, batch_size=8192, interval=0.5)
+                estimate = model.predict(*asked, frequency=frequency, batch_size=size, interval=0.5)
                 value = estimate.value.cpu().flatten()
                 deviations.append(estimate.std.cpu())
             found.append(task.fingerprint(value).unflatten(0, (len(part), count)))
