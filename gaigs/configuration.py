@@ -235,8 +235,10 @@ def resolve(config: DictConfig) -> dict:
         plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
         key = error.full_key
-        if key == "model.trend" and config.model.name == "kriging":
-            raise ValueError("model 'kriging' is made from a trained model; set kriging=true, with any model") from None
+        words = {"model.trend": "kriging=true", "model.members": "ensemble=5"}
+        if key in words and config.model.name in ("kriging", "ensemble"):
+            message = f"model {config.model.name!r} is made from trained models; set {words[key]}, with any model"
+            raise ValueError(message) from None
         raise ValueError(f"{key} must be given, as it has no default; add {key}=...") from None
     except OmegaConfBaseException as error:
         raise ValueError(f"the configuration is not complete: {' '.join(str(error).split())}") from error

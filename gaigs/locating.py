@@ -29,6 +29,7 @@ from gaigs.registry import call, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, model_of
 from gaigs.runs.evaluation import is_trained, unseen
+from gaigs.split import rows_of
 from gaigs.task import Task
 
 POINTS, SECONDS, FEWEST = 20_000, 60.0, 1000
@@ -63,6 +64,12 @@ class Location:
         mean: Mean place of each value (n, 3) [m].
         likeliest: Place of the highest density (n, 3) [m].
         region: True for candidates in the region that holds the transmitter with the asked probability (n, g).
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> found = gaigs.locate(gaigs.train("knn", links), [-50.0, -48.0, -55.0, -61.0])
+        >>> found.holds(found.likeliest)
+        tensor([True])
     """
 
     places: Float[Tensor, "g 3"]
@@ -93,6 +100,12 @@ class Fingerprints:
         degrees, temper: Of the likelihood, see ``log_likelihood``.
         drops: Logarithm of the best candidate's density over that at the true place, of held-out fingerprints,
             ascending (h,); empty without links.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=500)
+        >>> len(prints.places) == len(prints.values), prints.degrees in (0.25, 1, 4, 30)
+        (True, True)
     """
 
     task: Task
@@ -164,7 +177,8 @@ def fingerprints(
     tries: list[Any] = []
     for one, part, others in islice(unseen(model, links) if links is not None else (), 2):
         one.calibration = model.calibration
-        asked, truth = received(links, whole(links, part, known))
+        rows = rows_of(links)  # those known links that share a transmission with the part
+        asked, truth = received(links, known[torch.isin(rows[known], rows[part])])
         some = evenly(torch.arange(len(truth)), HELD_OUT)
         if len(some):
             errors = asked[some] - predicted(one, truth[some], frequency)[0]
@@ -393,17 +407,6 @@ def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor
     if frequency is None or links.query.frequencies is None:
         return index
     return index[(links.query.frequencies[index] / frequency - 1).abs() < ROUNDING]
-
-
-def rows_of(links: Links) -> Int[Tensor, " n"]:
-    """Transmission of each link: its row or, where a set has no rows, its place."""
-    return links.query.transmitters.unique(dim=0, return_inverse=True)[1] if links.rows is None else links.rows
-
-
-def whole(links: Links, part: Int[Tensor, " j"], known: Int[Tensor, " k"]) -> Int[Tensor, " i"]:
-    """Those known links that share a transmission with a part."""
-    rows = rows_of(links)
-    return known[torch.isin(rows[known], rows[part])]
 
 
 def received(links: Links, index: Int[Tensor, " k"]) -> tuple[Float[Tensor, "n r m"], Float[Tensor, "n 3"]]:

@@ -57,7 +57,8 @@ SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "syntheti
 MADE_FOR = {
     "loss": {"l1_ssim": ["spectrum"], "relative_error": ["csi"], "log_relative_error": ["csi"]}
     | dict.fromkeys(("absolute", "squared", "huber"), ("spectrum", "rssi")),
-    "model": {"path_loss": ["rssi"], "friis": ["csi"], "kriging": []},  # kriging is made from a trained model
+    # The last two are made from trained models.
+    "model": {"path_loss": ["rssi"], "friis": ["csi"], "kriging": [], "ensemble": []},
     "pooling": dict.fromkeys(("array_response", "path_spectrum", "spectrum"), ("spectrum",))
     | dict.fromkeys(("path_rssi", "mean_power", "softmax_attention"), ("rssi",))
     | dict.fromkeys(("path_csi", "element_sum"), ("csi",)),
@@ -291,7 +292,7 @@ def test_training(device):
 )
 def test_a_task_that_a_component_is_not_made_for_is_refused(kind, name, task):
     links = example_links(task)
-    with pytest.raises(ValueError, match=r"label|needs option trend"):
+    with pytest.raises(ValueError, match=r"label|needs option (trend|members)"):
         registry(kind).build({"name": name}, scene=links.scene, task=links.task)
 
 

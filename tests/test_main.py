@@ -164,7 +164,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("data=nerf2_spectrum", "data.root must be given, as it has no default; add data.root=..."),
         ("data=nerf2_spectrum data.root=nowhere", "nowhere must be the folder of a data set"),
         ("-m model=knn,mean model.k=3", "in a sweep write ++model.k=... for a key that only the swept model has"),
-        ("model=kriging", "model 'kriging' is made from a trained model; set kriging=true, with any model"),
+        ("model=kriging", "model 'kriging' is made from trained models; set kriging=true, with any model"),
     ],
 )  # fmt: skip
 def test_a_wrong_word_gives_one_message(overrides, message, run):

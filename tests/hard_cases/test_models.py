@@ -20,7 +20,11 @@ OWN = {
 """Further options of a model."""
 
 CARRIER = 5e9
-WITHOUT_SETTINGS = {"kriging": "is made of a trained model", "ray_tracing": "needs a mesh of the room"}
+WITHOUT_SETTINGS = {
+    "kriging": "is made of a trained model",
+    "ensemble": "is made of trained models",
+    "ray_tracing": "needs a mesh of the room",
+}
 NAMES = [name for name in registry("model").names() if name not in WITHOUT_SETTINGS]
 FAR = torch.tensor([2.0**20, -(2.0**19), 2.0**18])
 
