@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex, Float, Int
@@ -19,6 +20,14 @@ FAINTEST = torch.finfo(torch.float32).tiny
 
 class ExtrapolationWarning(UserWarning):
     """A prediction is far from all measurements."""
+
+
+class Frame(NamedTuple):
+    """The place of the world frame on a map: its origin (x, y) in the projected system of an EPSG code [m]."""
+
+    epsg: int
+    x: float
+    y: float
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from gaigs.antenna import Array, Receiver
-from gaigs.geometry import Pose
+from gaigs.geometry import Frame, Pose
 from gaigs.propagation import free_space
 from gaigs.query import Query
 from gaigs.registry import registry
@@ -28,6 +28,7 @@ class Scene:
         frequencies: Distinct carriers of the training links, ascending (f,) [Hz]; empty if unknown.
         bandwidth: Band around each carrier over which a label's power is averaged, 0 for a carrier alone [Hz]; None if
             unknown.
+        frame: Place of the world frame on a map; None if unknown.
 
     Example:
         >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
@@ -42,6 +43,7 @@ class Scene:
     task: Task
     frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0))
     bandwidth: float | None = None
+    frame: Frame | None = None
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""
@@ -80,6 +82,7 @@ class Scene:
             ],
             "task": self.task.state(),
             **{name: getattr(self, name) for name in ("lower", "upper", "spacing", "frequencies", "bandwidth")},
+            "frame": self.frame and tuple(self.frame),
         }
 
     @classmethod
@@ -89,7 +92,8 @@ class Scene:
             Receiver(r["name"], Pose(r["position"], r["rotation"]), Array(r["elements"], r["pattern"]))
             for r in state["receivers"]
         )
-        return cls(**state | {"receivers": receivers, "task": registry("task").build(state["task"])})
+        task, frame = registry("task").build(state["task"]), state.get("frame")
+        return cls(**state | {"receivers": receivers, "task": task, "frame": frame and Frame(*frame)})
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gaigs.antenna import Receiver
+from gaigs.geometry import Frame
 from gaigs.io.images import GreyImages
 from gaigs.phases import unknown_phase
 from gaigs.query import Batch, Query
@@ -72,6 +73,7 @@ class Links:
         bandwidth: Band around each carrier that a label's power is averaged over, 0 for a carrier alone [Hz]; None if
             unknown.
         held_out: The same links at subcarriers that are held out, with the labels of the test; None if there are none.
+        frame: Place of the world frame on a map; None if unknown.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
         remarks: Counts of links read and left out, with the reason.
         origin: Configurations of ``data`` and ``split``; empty for arrays in memory.
@@ -94,6 +96,7 @@ class Links:
     split: Split | None = None
     bandwidth: float | None = None
     held_out: "Links | None" = None
+    frame: Frame | None = None
     edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
     remarks: str = ""
     origin: Mapping = field(default_factory=dict)
@@ -127,7 +130,7 @@ class Links:
             raise ValueError(f"training takes transmitters at two points or more, got {len(train)}; check the split")
         frequencies = torch.zeros(0) if training.frequencies is None else training.frequencies.unique()
         box = train.amin(0), train.amax(0), median_spacing(train)
-        return Scene(self.receivers, *box, self.task, frequencies, self.bandwidth)
+        return Scene(self.receivers, *box, self.task, frequencies, self.bandwidth, self.frame)
 
 
 def median_spacing(places: Float[Tensor, "n 3"]) -> float:
