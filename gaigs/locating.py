@@ -62,6 +62,7 @@ class Location:
         places: Candidate places (g, 3) [m].
         probabilities: Of each candidate, for each value (n, g).
         mean: Mean place of each value (n, 3) [m].
+        median: Place with the least expected distance from the transmitter (n, 3) [m].
         likeliest: Place of the highest density (n, 3) [m].
         region: True for candidates in the region that holds the transmitter with the asked probability (n, g).
 
@@ -75,6 +76,7 @@ class Location:
     places: Float[Tensor, "g 3"]
     probabilities: Float[Tensor, "n g"]
     mean: Float[Tensor, "n 3"]
+    median: Float[Tensor, "n 3"]
     likeliest: Float[Tensor, "n 3"]
     region: Bool[Tensor, "n g"]
 
@@ -263,7 +265,8 @@ def posterior(
         near = heights >= heights.gather(1, order[:, :1]) - prints.drops[min(math.ceil(level * (count + 1)), count) - 1]
         region = near if count >= fewest(level) else near | region
     mean = (probabilities @ places.double()).float()
-    return Location(places, probabilities, mean, places[order[:, 0]], region)
+    median = torch.cat([geometric_median(places, part) for part in probabilities.split(64)])
+    return Location(places, probabilities, mean, median, places[order[:, 0]], region)
 
 
 def run(config: dict, folder: Path) -> None:
@@ -283,7 +286,8 @@ def run(config: dict, folder: Path) -> None:
     found = call("locate", posterior, options, prints=prints, asked=asked)
     taken = time.perf_counter() - start
     _, groups = places.unique(dim=0, return_inverse=True)
-    guesses = {"locate": found.mean, "likeliest": found.likeliest, "knn": neighbours(asked, known, places, groups)}
+    guesses = {"locate": found.mean, "median": found.median, "likeliest": found.likeliest}
+    guesses["knn"] = neighbours(asked, known, places, groups)
     errors = {name: (guess - truth).norm(dim=1) for name, guess in guesses.items()}
     numbers: dict[str, Any] = {
         name: {"median_m": error.median().item(), "mean_m": error.mean().item()} for name, error in errors.items()
@@ -541,6 +545,21 @@ def fitted(prints: Fingerprints, tries: Sequence[Try]) -> Fingerprints:
         near = distances(one.truth.double(), one.prints.places.double()).argmin(1)
         drops.append(heights.amax(1) - heights.gather(1, near[:, None])[:, 0])
     return replace(prints, degrees=degrees, temper=temper, drops=torch.cat(drops).sort().values)
+
+
+def geometric_median(places: Float[Tensor, "g 3"], probabilities: Float[Tensor, "n g"]) -> Float[Tensor, "n 3"]:
+    """Places with the least mean distance from the candidates, weighted by each row of probabilities.
+
+    Source: Weiszfeld, Sur le point pour lequel la somme des distances de n points donnés est minimum, 1937.
+    """
+    places = places.double()
+    found = probabilities @ places
+    for _ in range(100):
+        weights = probabilities / distances(found, places).clamp_min(1e-3)  # [m]: a candidate may be the place itself
+        before, found = found, weights @ places / weights.sum(1, keepdim=True)
+        if (found - before).abs().max() < 1e-3:
+            break
+    return found.float()
 
 
 def smoothed(logarithms: Float[Tensor, "n g"], places: Float[Tensor, "g 3"], step: float) -> Float[Tensor, "n g"]:

@@ -5,11 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 
 import gaigs
 from gaigs import locating
 from gaigs.locating import (
     Fingerprints,
+    geometric_median,
     independent,
     log_likelihood,
     neighbours,
@@ -177,6 +179,18 @@ def test_neighbours_are_those_of_numpy():
     best = min(errors, key=errors.get)
     expected = [guess(point, list(range(40)), best) for point in asked[..., 0].numpy()]
     np.testing.assert_allclose(neighbours(asked, known, places, torch.arange(40)), expected, rtol=1e-4)
+
+
+def test_median_place_has_the_least_expected_distance():
+    rng = np.random.default_rng(0)
+    places, weights = rng.normal(size=(30, 3)), rng.dirichlet(np.full(30, 0.3), 2)
+    found = geometric_median(torch.tensor(places).float(), torch.tensor(weights))
+    for own, median in zip(weights, found.numpy(), strict=True):
+        expected = lambda place, own=own: own @ np.linalg.norm(places - place, axis=1)
+        best = minimize(expected, own @ places, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9})
+        np.testing.assert_allclose(expected(median), best.fun, rtol=1e-4)
+    alone = geometric_median(torch.eye(3), torch.tensor([[0.0, 1.0, 0.0]]).double())
+    torch.testing.assert_close(alone, torch.eye(3)[1:2])
 
 
 def test_likelihood_of_a_perfect_value_is_finite():
