@@ -217,6 +217,12 @@ def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str]
     return plain
 
 
+def presets(kind: str, name: str) -> list[DictConfig]:
+    """The configuration files of that kind and name, of gaigs and of plug-ins."""
+    files = (folder / kind / f"{name}.yaml" for folder in (conf_dir(), *plugin_conf_dirs()))
+    return [OmegaConf.load(file) for file in files if file.is_file()]  # type: ignore[misc]
+
+
 def has_file(kind: str, name: str) -> bool:
     """True if gaigs or a plug-in has a configuration file of that kind and name."""
     return any((folder / kind / f"{name}.yaml").is_file() for folder in (conf_dir(), *plugin_conf_dirs()))
