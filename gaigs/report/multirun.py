@@ -149,7 +149,8 @@ def _speed(runs: list[Run], rows: list[dict], shared: Mapping, titles: Mapping[s
     numbers = lambda key: np.array([np.nan if row.get(key) is None else row[key] for _, row in done], float)
     times = {"inference [ms a transmitter]": numbers("inference_ms"), "training [s]": numbers("train_seconds")}
     baselines = {f"{row['model']} {row.get('split', '')}".strip(): row[metric] for row in rows[len(runs) :]}
-    return speed_against_error(names, numbers(metric), times, titles[metric], baselines)
+    models = [row["model"] for _, row in done]
+    return speed_against_error(names, numbers(metric), times, titles[metric], baselines, models)
 
 
 def _text(value: float | int | str | Spread | None, between: str) -> str:
