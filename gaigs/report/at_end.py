@@ -18,8 +18,8 @@ class AtEnd(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         """Remembers the folder and the formats."""
-        formats: Any = OmegaConf.to_container(config)["figures"]["format"]
-        folders.append((Path(config.hydra.sweep.dir), formats))
+        plain: Any = OmegaConf.to_container(config)
+        folders.append((Path(config.hydra.sweep.dir), plain["figures"]["format"]))
 
 
 def write() -> None:

@@ -45,7 +45,13 @@ def cdf(
         ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
         for (name, sample), (colour, dash) in zip(values.items(), looks(values).values(), strict=True):
             median = float(np.median(sample))
-            ax.ecdf(sample, color=colour, linestyle=dash, label=f"{name} {median:#.3g}")
+            ax.ecdf(
+                sample,
+                color=colour,
+                linestyle=dash,
+                zorder=2.5 if name == next(iter(values)) else 2,
+                label=f"{name} {median:#.3g}",
+            )
             ax.plot(median, 0.5, "o", color=colour, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
         label = textwrap.fill(f"{quantity}, split {split}", LABEL)
         ax.set(xlabel=label, ylabel=f"share of test {samples}", ylim=(0, 1.01))

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from gaigs.report.figures import own_scores
 from gaigs.report.style import PAGE, STYLE, looks
@@ -45,6 +46,9 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
         right.axline((0, 0), slope=1, color="0.3", linewidth=0.7)
         unit = f" [{task.error_unit}]" if isinstance(task, Scalar) and task.error_unit else ""
         right.set(xlim=(0, furthest), ylim=(0, furthest), aspect="equal")
+        for axis in (right.xaxis, right.yaxis):
+            axis.set_major_locator(MaxNLocator(5))
+        right.ticklabel_format(scilimits=(-3, 4))
         right.set(xlabel=f"stated standard deviation{unit}", ylabel=f"root mean square error{unit}")
         right.set_title(f"{next(iter(shares))}, {len(errors):,} test links in {len(parts)} groups")
         for ax in (left, right):

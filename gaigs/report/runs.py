@@ -110,7 +110,7 @@ def read_runs(folder: Path) -> list[Run]:
             )
         typed = (override.partition("=") for override in _read_yaml(path, list))
         overrides = {key.lstrip("+"): re.sub(r"\\(.)", r"\1", value) for key, _, value in typed}  # without escapes
-        config = next((_read_yaml(path, dict) for path in (stored, started) if path.is_file()), {})
+        config: dict = next((_read_yaml(path, dict) for path in (stored, started) if path.is_file()), {})
         metrics, failure = (read_metrics(file), None) if file.is_file() else (None, _failure(own))
         doubts = _correct(overrides, config)
         runs.append(Run(own.relative_to(folder).as_posix(), overrides, metrics, failure, own, doubts))

@@ -49,7 +49,7 @@ LINES = tuple((COLOURS[i], DASHES[(i + shift) % 6]) for shift in range(6) for i 
 """Colour and dash of the first, second, ... line, no two of 36 alike."""
 
 PLACED = {
-    "gaigs": 0, "mirrored": 26, "mean": 1, "knn": 3, "gaussian_process": 4, "path_loss": 5, "friis": 11,
+    "gaigs": 0, "mirrored": 26, "mean": 1, "knn": 3, "gaussian_process": 4, "path_loss": 5, "friis": 17,
     "nearest_frequency": 7,
 }  # fmt: skip
 """Lines of built-in models, our two predictors unbroken; systems of ``conf/published.yaml`` have the next free ones."""
@@ -79,13 +79,15 @@ def looks(systems: Iterable[str]) -> dict[str, tuple]:
     placed, titles = _places()
     names = {name: name.removesuffix(" (baseline)").removesuffix("_trend") for name in systems}
     models = {name: titles.get(base, base) for name, base in names.items()}
+    known = {*placed.values()}
     taken = {placed[model] for model in models.values() if model in placed}
     found = {}
     for name, model in models.items():
         if model not in placed:
-            place = crc32(model.encode()) % len(LINES)
-            while place in taken and len(taken) < len(LINES):
-                place = (place + 1) % len(LINES)
+            turn = crc32(model.encode()) % len(LINES)
+            places = [*range(turn, len(LINES)), *range(turn)]
+            places.sort(key=lambda place: (place in taken, place in known))  # where no known system is, if possible
+            place = places[0]
             taken.add(place)
             placed = placed | {model: place}
         colour, dash = LINES[placed[model]]
