@@ -571,7 +571,7 @@ def test_tensorboard_logs_beside_the_csv(tmp_path):
 def test_the_first_page_names_every_key_of_the_metrics(tmp_path, monkeypatch, task):
     monkeypatch.setattr(runs, "has_radio_map", lambda _: False)  # which takes long
     words = [
-        f"+experiment={'mirrored' if task == 'spectrum' else f'mirrored_{task}'}", "data.transmitters=30",
+        f"+experiment={'mirrored' if task == 'spectrum' else f'mirrored_{task}'}", "data.transmitters=16",
         "trainer.max_steps=1", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "placement.order=1",
         "placement.planes=6", "placement.obstacles=2", "placement.fixed=true", "baselines=[mean]",
         "data.order=0", "split.validation=0.3",
