@@ -39,7 +39,8 @@ def cdf(
         limits: Ends of the axis of values; None for those of the data.
     """
     with rc_context(STYLE):
-        ncols = 3 if max(map(len, values)) <= 12 else 2  # letters that fit a third of a column
+        longest = max(map(len, values))
+        ncols = 3 if longest <= 12 else 2 if longest <= 20 else 1  # letters that fit a part of a column
         figure = Figure(figsize=(COLUMN, 2.45 + 0.15 * math.ceil(len(values) / ncols)), layout="constrained")
         ax = figure.subplots()
         ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)

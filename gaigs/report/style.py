@@ -79,6 +79,9 @@ def looks(systems: Iterable[str]) -> dict[str, tuple]:
     placed, titles = _places()
     names = {name: name.removesuffix(" (baseline)").removesuffix("_trend") for name in systems}
     models = {name: titles.get(base, base) for name, base in names.items()}
+    for name, model in models.items():  # the first variant of a system, such as "GAI-GS split=blocks"
+        own = next((known for title, known in titles.items() if model.startswith(f"{title} ")), model)
+        models[name] = model if own in models.values() else own
     known = {*placed.values()}
     taken = {placed[model] for model in models.values() if model in placed}
     found = {}

@@ -95,6 +95,8 @@ def test_a_system_has_one_look_in_all_figures(rng):
     assert looks(["GAI-GS", "knn (baseline)", "gaigs_trend"]) == {
         "GAI-GS": found["gaigs"], "knn (baseline)": found["knn"], "gaigs_trend": (found["gaigs"][0], ":")
     }  # fmt: skip
+    variants = looks(["GAI-GS split=a", "GAI-GS split=b"])
+    assert variants["GAI-GS split=a"] == found["gaigs"] != variants["GAI-GS split=b"]
     names = [f"a system of mine {k}" for k in range(20)]
     assert len({*looks([*known[:10], *names]).values()}) == 30
     assert looks(["gaigs", "knn", names[0]])[names[0]] == looks(names[:1])[names[0]]
