@@ -97,7 +97,8 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
         ['knn', 'mean']
     """
     from gaigs import configuration as configurations
-    from gaigs import processes
+    from gaigs.registry import call
+    from gaigs.report.formats import figure_formats
 
     if not isinstance(configuration, Mapping):
         raise TypeError(f"configuration must be the result of gaigs.compose, got {configuration!r:.80}")
@@ -110,6 +111,14 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
             print(f"{name}  <- rasterizer=opencl takes this one" if number == names.index(default) else name)
         return None
     configurations.check(config)
+    with call("figures", figure_formats, config["figures"]):
+        return _execute(config, folder, overrides)
+
+
+def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | None:
+    """Executes the command of a checked configuration."""
+    from gaigs import processes
+
     match config["command"]:
         case "train":
             from gaigs import runs

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Complex, Float, Int
 from torch import Tensor
@@ -50,8 +51,8 @@ class Pose:
     @classmethod
     def from_xyzw(cls, position, quaternion) -> "Pose":
         """A pose from a scalar-last quaternion of unit length (to 1e-3), as in scipy and the NeRF² files."""
-        position = torch.as_tensor(position, dtype=torch.float64)
-        quaternion = torch.as_tensor(quaternion, dtype=torch.float64)
+        plain = lambda values: values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, float))
+        position, quaternion = plain(position).double(), plain(quaternion).double()
         if position.shape != (3,) or quaternion.shape != (4,) or not position.isfinite().all():
             raise ValueError(
                 "a pose needs 3 finite coordinates [m] and a quaternion (x, y, z, w), got "

@@ -326,7 +326,8 @@ def figure(
         left.plot(*mean[some, :2].T.numpy(), "o", markersize=3, color=style.ORANGE, label="estimates")
         left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         shares = (torch.arange(len(truth)) + 0.5) / len(truth)
-        for name, colour, words in (("locate", style.ORANGE, "estimates"), ("knn", style.GREY, "nearest neighbours")):
+        neighbours, _ = style.looks(["knn"])["knn"]
+        for name, colour, words in (("locate", style.ORANGE, "estimates"), ("knn", neighbours, "nearest neighbours")):
             right.plot(errors[name].sort().values.numpy(), shares.numpy(), color=colour, label=words)
         right.set(xlabel="error [m]", ylabel="share of transmitters", ylim=(0, 1), xlim=(0, None))
         right.grid()

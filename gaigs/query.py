@@ -4,6 +4,7 @@ import math
 import reprlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,23 +36,43 @@ def check_carrier(name: str, frequencies: float | Tensor) -> None:
         raise ValueError(f"{name} must be {expected}, got {wrong:.7g}{unit_hint(wrong)}")
 
 
+def as_tensor(name: str, values: object, expected: str) -> Tensor:
+    """Numbers of any kind as a tensor of their own type; raises a ``ValueError`` for anything else."""
+    if isinstance(values, Tensor):
+        if values.is_meta or values.layout is not torch.strided:
+            kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
+            raise ValueError(f"{name} must be {expected}, got a {kind} tensor; give a dense tensor with values")
+        return values
+    if isinstance(values, list | tuple) and any(isinstance(value, Tensor) for value in values):
+        parts = [as_tensor(name, value, expected) for value in values]
+        if len({part.shape for part in parts}) == 1:
+            return torch.stack(parts)
+    try:
+        if np.ma.is_masked(values):
+            raise TypeError("masked")
+        array: Any = np.array(values)  # a copy, since torch warns of arrays that are read-only
+        if array.dtype == object:  # of numbers, such as a column of pandas
+            array = np.array(array.tolist())
+        # Torch takes no negative strides and no other byte order.
+        return torch.from_numpy(np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(array.shape))
+    except (TypeError, ValueError, RuntimeError, OverflowError):  # of words and ragged lists
+        raise ValueError(f"{name} must be {expected}, got {reprlib.repr(values)}") from None
+
+
 def as_numbers(name: str, values: object, expected: str) -> Tensor:
     """Real numbers of any kind as a float32 tensor; raises a ``ValueError`` for anything else."""
-    try:
-        native = values
-        if isinstance(values, np.ndarray):  # torch takes no negative strides and no other byte order
-            native = np.array(values, dtype=values.dtype.newbyteorder("="), order="C")
-        tensor = torch.as_tensor(native)
-        if tensor.is_complex() or tensor.dtype == torch.bool or np.ma.is_masked(values):
-            raise TypeError(str(tensor.dtype))
-    except (TypeError, ValueError, RuntimeError, OverflowError):  # torch's errors for words and ragged lists
-        raise ValueError(f"{name} must be {expected} in real numbers, got {reprlib.repr(values)}") from None
+    expected = f"{expected} in real numbers"
+    tensor = as_tensor(name, values, expected)
+    if tensor.is_complex() or tensor.dtype == torch.bool:
+        raise ValueError(f"{name} must be {expected}, got {reprlib.repr(values)}")
     return tensor.to(torch.float32)
 
 
 def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
     """Positions of any kind as a float32 tensor [m]; raises a ``ValueError`` unless all are finite and in range."""
     positions = as_numbers(name, values, "(..., 3) positions [m]")
+    if positions.shape == (0,):  # an empty list
+        positions = positions.reshape(0, 3)
     if not positions.ndim or positions.shape[-1] != 3:
         raise ValueError(f"{name} must be (..., 3) positions [m], got shape {tuple(positions.shape)}")
     points = positions.reshape(-1, 3)
@@ -64,18 +85,17 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
 
 def as_receivers(values: object, names: Sequence[str]) -> Int[Tensor, "*points"]:
     """Indices of receivers, given by name or index; raises a ``ValueError`` for an unknown receiver."""
-    expected = f"receiver must be one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
-    try:
-        indices = torch.as_tensor(names.index(values) if isinstance(values, str) else values)
-    except (ValueError, TypeError, RuntimeError, OverflowError):  # an unknown name, or torch's errors
-        raise ValueError(f"{expected}, got {reprlib.repr(values)}") from None
+    expected = f"one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
+    if isinstance(values, str) and values not in names:
+        raise ValueError(f"receiver must be {expected}, got {values!r}")
+    indices = as_tensor("receiver", names.index(values) if isinstance(values, str) else values, expected)
     if indices.dtype not in (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8):
         given = f"{tuple(indices.shape)} of {indices.dtype}" if indices.ndim else repr(values)
-        raise ValueError(f"{expected}, got {given}")
+        raise ValueError(f"receiver must be {expected}, got {given}")
     indices = indices.long()
     wrong = indices[(indices < 0) | (indices >= len(names))]
     if len(wrong):
-        raise ValueError(f"{expected}, got {wrong[0]}")
+        raise ValueError(f"receiver must be {expected}, got {wrong[0]}")
     return indices
 
 
@@ -102,7 +122,7 @@ def as_subcarriers(values: object) -> Float[Tensor, " s"]:
     """Subcarriers that a user asks for [Hz], one or several, in float64; raises a ``ValueError`` for anything else."""
     expected = "different subcarriers (s,) in Hz"
     as_numbers("frequencies", values, expected)
-    exact = values.detach().cpu() if isinstance(values, Tensor) else torch.from_numpy(np.array(values, dtype=float))
+    exact = as_tensor("frequencies", values, expected).detach().cpu()
     subcarriers = exact.double().reshape(-1) if exact.ndim < 2 else exact
     if subcarriers.ndim != 1 or not len(subcarriers) or len(subcarriers.unique()) < len(subcarriers):
         raise ValueError(f"frequencies must be {expected}, got shape {tuple(exact.shape)}: {reprlib.repr(values)}")

@@ -105,7 +105,8 @@ def radio_map(
         frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
 
     Warns:
-        ExtrapolationWarning: The frequency is outside the training links' band.
+        ExtrapolationWarning: The frequency is outside the training links' band, or height or margin go farther from the
+            training transmitters' box than the diagonal of this box and the receivers.
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``.
@@ -137,10 +138,16 @@ def radio_map(
     corners = np.stack((lower, upper, *(receiver.pose.position.numpy() for receiver in scene.receivers)))[:, :2]
     lower, upper = corners.min(0) - margin, corners.max(0) + margin
     longest = float((upper - lower).max())
+    away = max(scene.lower[2].item() - height, height - scene.upper[2].item())
+    for name, size, most in (("height", away, scene.extent), ("margin", margin, 20 * scene.extent)):
+        if size > most:
+            message = f"{name} puts transmitters {size:.4g} m outside the box of the training transmitters, which with "
+            message += f"the receivers is {scene.extent:.3g} m across; is it in m?"
+            warnings.warn(message, ExtrapolationWarning, stacklevel=2)
     if pitch is not None and not (0 < pitch <= longest and math.prod(((upper - lower) / pitch).tolist()) <= 1e8):
         raise ValueError(
             f"pitch must be above 0, at most {longest:.3g} m, the longer side of the map, and give at most 1e+08 "
-            f"points, got {pitch} m"
+            f"points, got {pitch} m; is it in m?"
         )
     # All receivers of a point in one batch, so that a transmitter's excitation is computed once.
     heard = np.array([known.index(name) for name in names])

@@ -30,6 +30,9 @@ def ask(positions=PLACE, receiver=0, frequency=None, known=NONE):
         ([[1.0, 2, 3], [1.0, 2]], r"in real numbers, got \[\[1.0, 2, 3\], \[1.0, 2\]\]"),
         ("west", "in real numbers, got 'west'"),
         (np.ones((1, 3), dtype=bool), "in real numbers"),
+        (np.array([[1.0, 2, None]]), "in real numbers"),
+        (torch.eye(3).to_sparse(), "got a sparse_coo tensor; give a dense tensor with values"),
+        (torch.zeros(1, 3, device="meta"), "got a meta tensor; give a dense tensor"),
         (np.ma.array([[1.0, 2, 3]], mask=[[True, False, False]]), "in real numbers, got masked_array"),
         (replace(QUERY, transmitters=torch.full((2, 3), math.nan)), "transmitters must be finite"),
         (replace(QUERY, receivers=torch.full((2,), 9)), "receiver must be one of 0 = west"),
@@ -139,12 +142,27 @@ def test_rays_of_unlike_lengths_are_refused():
         as_directions(rays, OWN, "spectrum")
 
 
-@pytest.mark.parametrize("view", [lambda x: x[::-1], lambda x: x.astype(">f8"), lambda x: np.asfortranarray(x)])
+@pytest.mark.parametrize(
+    "view",
+    [
+        lambda x: x[::-1],
+        lambda x: x.astype(">f8"),
+        np.asfortranarray,
+        lambda x: x.astype(object),
+        lambda x: [torch.from_numpy(row) for row in x],
+        lambda x: [*np.broadcast_to(x, x.shape)],  # read-only
+    ],
+)
 def test_arrays_of_any_layout_are_positions(view):
-    points = np.arange(12.0).reshape(4, 3)
-    query, shape = Query.from_positions(view(points), 0, None, ["west"], torch.zeros(0))
-    assert torch.equal(query.transmitters, torch.from_numpy(np.ascontiguousarray(view(points), np.float32)))
+    points = view(np.arange(12.0).reshape(4, 3))
+    query, shape = Query.from_positions(points, 0, None, ["west"], torch.zeros(0))
+    assert query.transmitters.tolist() == [[float(number) for number in row] for row in points]
     assert shape == (4,)
+
+
+def test_no_positions_are_an_empty_query():
+    query, shape = Query.from_positions([], 0, None, ["west"], torch.zeros(0))
+    assert (query.transmitters.shape, query.receivers.shape, shape) == ((0, 3), (0,), (0,))
 
 
 def test_directions_become_float32():

@@ -164,6 +164,13 @@ def test_a_band_is_left_with_one_warning(pitch):
     assert re.search(r"at 6e\+10 Hz, outside the training links' band of 5e\+09 to 1\.2e\+10 Hz", str(only.message))
 
 
+@pytest.mark.parametrize("options", [{"height": 1200.0}, {"margin": 500.0}])
+def test_sizes_in_millimetres_warn(options):
+    ((name, value),) = options.items()
+    with pytest.warns(ExtrapolationWarning, match=rf"^{name} puts transmitters .* is 5\.\d+ m across; is it in m\?$"):
+        radio_map(Slope(scene()), 50.0 if name == "margin" else 2.0, **{name: value})
+
+
 def test_file_holds_the_map_and_its_axes(tmp_path):
     drawn = radio_map(Slope(scene()), pitch=0.5)
     drawn.save(tmp_path / "floor")

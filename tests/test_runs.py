@@ -4,6 +4,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 import signal
 from dataclasses import replace
@@ -564,3 +565,23 @@ def test_tensorboard_logs_beside_the_csv(tmp_path):
     runs.run(configure("tensorboard=true", "trainer.max_steps=2"), tmp_path)
     assert list(tmp_path.glob("tensorboard/*/events*"))
     assert list(tmp_path.glob("log/*/metrics.csv"))
+
+
+@pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
+def test_the_first_page_names_every_key_of_the_metrics(tmp_path, monkeypatch, task):
+    monkeypatch.setattr(runs, "has_radio_map", lambda _: False)  # which takes long
+    words = [
+        f"+experiment={'mirrored' if task == 'spectrum' else f'mirrored_{task}'}", "data.transmitters=16",
+        "trainer.max_steps=1", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "placement.order=1",
+        "placement.planes=6", "placement.obstacles=2", "placement.fixed=true", "baselines=[mean]",
+        "data.order=0", "split.validation=0.3",
+    ]  # fmt: skip
+    metrics = runs.run(gaigs.compose(*words), tmp_path)
+    rows = [*metrics["models"].values(), *metrics["validation"].values(), metrics["kriging"]]
+    rows += [*metrics["planes"], *metrics["paths"]]
+    page = (Path(__file__).parents[1] / "docs/start.md").read_text()
+    section = page[page.index("`metrics.json`:") : page.index("## Stop and continue")]
+    rows_and_paths = (line for line in section.splitlines() if line.startswith(("|", "`paths`")))
+    table = {*re.findall(r"`(\w+)`", "".join(rows_and_paths))}
+    keys = {*metrics, *(key for row in rows for key in row)}
+    assert not keys - table

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gaigs.antenna import Receiver
+from gaigs.data.doubts import doubts
 from gaigs.geometry import Frame
 from gaigs.io.images import GreyImages
 from gaigs.phases import unknown_phase
@@ -155,10 +156,10 @@ def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
 
 
 def divide(links: Links, split: Mapping) -> Links:
-    """Links with their split, by its configuration; a remark says where the phase of channels is unknown.
+    """Links with their split, by its configuration; remarks say what is doubtful, such as the phase of channels.
 
     Raises:
-        ValueError: An option of the split has a defect.
+        ValueError: An option of the split has a defect, or all spectra are constant.
     """
     parts = registry("split").build(split, links=links)
     if links.held_out is not None:
@@ -166,20 +167,27 @@ def divide(links: Links, split: Mapping) -> Links:
         bands = [task.frequencies / 1e9 for task in tasks]
         at = [f"at {band.min():.7g} .. {band.max():.7g} GHz" for band in bands]
         parts = replace(parts, name=f"{parts.name}, trained {at[0]}, tested {at[1]}")
-    links = replace(links, split=parts)
-    task = links.task
-    if not isinstance(task, Csi):
-        return links
+    links, remarks = replace(links, split=parts), [links.remarks]
+    for doubt in doubts(links.task, links.labels, links.query.transmitters, links.receivers, links.edges):
+        log.warning(doubt)
+        remarks.append(doubt)
+    if isinstance(links.task, Csi):
+        remarks.append(_phase_remark(links, links.task))
+    return replace(links, remarks="; ".join(filter(None, remarks)))
+
+
+def _phase_remark(links: Links, task: Csi) -> str:
+    """A sentence if the phase of channels is unknown, declared or found; else empty."""
+    if task.phase != "known":
+        unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[task.phase]
+        return f"{unknown} of each link unknown, and removed in every score"
     train = links.split.train[:: max(1, len(links.split.train) // 256)]
-    remark = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}.get(task.phase, "")
-    remark += " of each link unknown, and removed in every score"
-    if task.phase == "known":
-        query = links.query[train]
-        everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
-        waves = direct_waves(everywhere, query, task.frequencies)
-        phase = unknown_phase(links.labels[train], waves, query.receivers, task.frequencies)
-        if phase is None:
-            return links
-        remark = f"channels have no phase in common, as if each packet had its own; set data.phase={phase}"
-        log.warning(remark)
-    return replace(links, remarks="; ".join(filter(None, (links.remarks, remark))))
+    query = links.query[train]
+    everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
+    waves = direct_waves(everywhere, query, task.frequencies)
+    phase = unknown_phase(links.labels[train], waves, query.receivers, task.frequencies)
+    if phase is None:
+        return ""
+    remark = f"channels have no phase in common, as if each packet had its own; set data.phase={phase}"
+    log.warning(remark)
+    return remark

@@ -134,7 +134,7 @@ def _load(file: Path, given: Mapping[str, str | list]) -> tuple[dict[str, np.nda
     opened, expected = _npz, "an .npz file as numpy.savez writes it"
     if HDF5 in (head[:8], head[512:520]):
         opened, expected = _hdf5, "an HDF5 file"
-    elif file.suffix == ".mat":
+    elif file.suffix.lower() == ".mat":
         opened, expected = _mat, "a .mat file as MATLAB writes it"
     try:
         with opened(file) as (members, get):

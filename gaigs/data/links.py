@@ -11,7 +11,7 @@ from gaigs.antenna import Receiver
 from gaigs.data import Links, divide, load
 from gaigs.data.readings import gateway
 from gaigs.io.tables import number_places
-from gaigs.query import Query, as_numbers, as_positions, check_carrier
+from gaigs.query import Query, as_numbers, as_positions, as_tensor, check_carrier
 from gaigs.registry import registry
 from gaigs.task import Task
 
@@ -88,16 +88,15 @@ def from_arrays(
         receivers = [gateway(f"rx{k}", place) for k, place in enumerate(stands)]
     if np.ma.is_masked(labels):
         raise ValueError("labels must be plain numbers, got a masked array; fill it with nan where nothing was heard")
-    if not task.dtype.is_complex:
-        labels = as_numbers("labels", labels, f"labels of task {task.name!r}")
-    labels = torch.as_tensor(labels).detach().to(task.dtype)
+    convert = as_tensor if task.dtype.is_complex else as_numbers
+    labels = convert("labels", labels, f"those of task {task.name!r}").detach().to(task.dtype)
     count, most, shape = len(places), len(receivers), tuple(task.shape)
     rows = torch.arange(count)
     if tuple(labels.shape) == (count, most, *shape) and index is None:
         rows, index = rows.repeat_interleave(most), torch.arange(most).repeat(count)
         labels = labels.flatten(0, 1)
     elif tuple(labels.shape) == (count, *shape) and (index is not None or most == 1):
-        index = torch.zeros(count, dtype=torch.long) if index is None else torch.as_tensor(index)
+        index = as_tensor("index", [0] * count if index is None else index, "numbers of receivers")
     else:
         raise ValueError(
             f"labels of task {task.name!r} must be {(count, *shape)} with the receiver of each link in index, or "

@@ -166,16 +166,18 @@ def _read_frequencies(file: Path, count: int) -> Float[Tensor, " n"]:
 def _find_images(root: Path, count: int) -> list[Path]:
     """The image of each position; a ``ValueError`` for a missing image or one without a position."""
     folder = root / "spectrum"
-    files = [folder / f"{k:05d}.png" for k in range(1, count + 1)]
-    found = {file.name for file in folder.glob("*.png")}
-    missing = [file.name for file in files if file.name not in found]
-    surplus = sorted(name for name in found - {file.name for file in files} if name.removesuffix(".png").isdecimal())
+    names, found = [f"{k:05d}.png" for k in range(1, count + 1)], dict[str, list[Path]]()
+    for file in (file for file in folder.glob("*") if file.suffix.lower() == ".png"):
+        found.setdefault(file.with_suffix(".png").name, []).append(file)
+    missing = [name for name in names if name not in found]
+    unknown = (name for name in found.keys() - {*names} if name.removesuffix(".png").isdecimal())
+    surplus = sorted([*unknown, *(name for name in names if len(found.get(name, [])) > 1)])
     if missing or surplus:
         raise ValueError(
             f"{folder}: expected an image of each of the {count} rows of tx_pos.csv, got {len(missing)} too few and "
             f"{len(surplus)} too many, the first {(missing or surplus)[0]}"
         )
-    return files
+    return [found[name][0] for name in names]
 
 
 def _read_official(root: Path, count: int) -> Parts:

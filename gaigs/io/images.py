@@ -1,4 +1,4 @@
-"""Grey PNG images of data sets."""
+"""PNG images of grey values."""
 
 import warnings
 from collections.abc import Iterator, Sequence
@@ -7,29 +7,34 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt
 from PIL import Image
 from torch import Tensor
 
+MODES = {"1", "L", "LA", "P", "RGB", "RGBA", "I", "I;16", "I;16B"}
+"""Pillow's modes that may hold grey values."""
+
 
 class GreyImages:
-    """8-bit grey PNGs (rows, columns), decoded when first requested and then kept at one byte a pixel.
+    """PNGs of grey values (rows, columns), decoded when first requested and then kept at one or two bytes a pixel.
+
+    8-bit values count in 255, 16-bit ones in 65535. Colour images have equal channels, and no pixel is transparent.
 
     Raises:
-        ValueError: A file has no PNG header, or another mode or shape; when requested: its pixels are damaged.
+        ValueError: A file has no PNG header, or another shape; when requested: its pixels are damaged or coloured.
     """
 
     def __init__(self, files: Sequence[Path], shape: tuple[int, int]):
+        modes = set()
         for file in files:
             with _opened(file) as image:  # reads the header only
                 mode, (width, height) = image.mode, image.size
-            if (mode, height, width) != ("L", *shape):
-                raise ValueError(
-                    f"{file}: expected 8-bit grey (Pillow's mode L) of {shape[0]} x {shape[1]} pixels, got mode {mode} "
-                    f"of {height} x {width}"
-                )
+            if mode not in MODES or (height, width) != shape:
+                expected = f"grey values of {shape[0]} x {shape[1]} pixels"
+                raise ValueError(f"{file}: expected {expected}, got mode {mode} of {height} x {width}")
+            modes.add(mode)
         self.files = files
-        self._pixels = torch.empty(len(files), *shape, dtype=torch.uint8)
+        self._pixels = np.empty((len(files), *shape), np.uint16 if any("I" in mode for mode in modes) else np.uint8)
         self._decoded = torch.zeros(len(files), dtype=torch.bool)
 
     def __len__(self) -> int:
@@ -41,9 +46,27 @@ class GreyImages:
             with _opened(self.files[k]) as image:
                 image.verify()  # compares the checksums, which decoding does not
             with _opened(self.files[k]) as image:
-                self._pixels[k] = torch.from_numpy(np.array(image))
+                grey = _grey(self.files[k], image)
+            wide = 257 if self._pixels.dtype == np.uint16 and grey.dtype == np.uint8 else 1  # 255 becomes 65535
+            self._pixels[k] = grey.astype(self._pixels.dtype) * self._pixels.dtype.type(wide)
             self._decoded[k] = True
-        return self._pixels[indices].float() / 255
+        most = np.iinfo(self._pixels.dtype).max
+        return torch.from_numpy(self._pixels[indices.numpy()].astype(np.float32) / np.float32(most))
+
+
+def _grey(file: Path, image: Image.Image) -> UInt[np.ndarray, "rows columns"]:
+    """The grey values of an image; a ``ValueError`` for colours and transparent pixels."""
+    if image.mode.startswith("I"):
+        return np.array(image).astype(np.uint16)
+    if image.mode in ("1", "L"):
+        return np.array(image.convert("L"))
+    channels = np.array(image.convert("RGBA"))
+    for row, column in np.argwhere(np.ptp(channels[..., :3], -1) > 0)[:1]:
+        got = channels[row, column, :3].tolist()
+        raise ValueError(f"{file}: expected grey values, got the colour {got} in row {row}, column {column}")
+    for row, column in np.argwhere(channels[..., 3] < 255)[:1]:
+        raise ValueError(f"{file}: expected no transparent pixel, got one in row {row}, column {column}")
+    return channels[..., 0]
 
 
 @contextmanager

@@ -31,7 +31,12 @@ def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3
     vertices: list[list[float]] = []
     groups: Groups = {}
     name, material = NO_NAME
-    for number, line in enumerate(lines, 1):
+    begun = ""
+    for number, part in enumerate(lines, 1):
+        line, begun = begun + part, ""
+        if line.rstrip().endswith("\\") and "#" not in line:  # goes on in the next one; a comment may end in a path
+            begun = line.rstrip()[:-1] + " "
+            continue
         word, *rest = line.split("#")[0].split() or [""]
         try:
             match word:
@@ -51,6 +56,8 @@ def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3
         except ValueError as error:
             shown = line.strip() if len(line) < 80 else f"{line.strip()[:80]} ..."
             raise ValueError(f"{source}, line {number}: expected {error}, got {shown!r}") from error
+    if begun:
+        raise ValueError(f"{source}, line {number}: expected another line after the \\ at its end, got none")
     return np.array(vertices, dtype=float).reshape(-1, 3), groups
 
 

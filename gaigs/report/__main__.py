@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from gaigs.report.formats import figure_formats
 from gaigs.report.multirun import report
 
 
@@ -13,8 +14,11 @@ def main() -> None:
     parser = ArgumentParser(prog="python -m gaigs.report", description=__doc__)
     about = "folder that Hydra made for python -m gaigs --multirun ..., or one above several"
     parser.add_argument("folder", type=Path, help=about)
+    parser.add_argument("--format", default="png", help="of the figure files: png, pdf or svg, or several: png,pdf")
+    given = parser.parse_args()
     try:
-        tables = report(parser.parse_args().folder)
+        with figure_formats(given.format.split(",")):
+            tables = report(given.folder)
     except (FileNotFoundError, ValueError) as error:
         parser.error(str(error))
     Console().print(tables)

@@ -16,7 +16,7 @@ from numpy import ndarray
 from gaigs.data import Links
 from gaigs.report.curves import LABEL, cdf
 from gaigs.report.figures import Examples, TaskFigures, own_scores, read_examples, scores_of_systems
-from gaigs.report.style import COLUMN, MARKERS, PAGE, SKY, STYLE
+from gaigs.report.style import COLUMN, MARKERS, PAGE, SKY, STYLE, looks
 from gaigs.task.csi import Csi
 
 LOOKS = {
@@ -169,7 +169,7 @@ def error_against_power(powers: Float[ndarray, " k"], errors: Mapping[str, Float
         for order, (name, look) in enumerate(zip([own, *baselines[:1]], MARKERS, strict=False)):
             error = np.maximum(errors[name], 1e-14 * powers)  # of an SNR of 140 dB, the highest reported
             nmse = 10 * np.log10(error.sum() / powers.sum())
-            look = look | {"linestyle": "", "markersize": 3, "zorder": 3 - order}
+            look = look | {"linestyle": "", "markersize": 3, "zorder": 3 - order, "color": looks(errors)[name][0]}
             ax.plot(x, 10 * np.log10(error), **look, label=f"{name}, NMSE {nmse:.1f} dB")
         lower, upper = x.min() - 5, x.max() + 5  # of a few links, too, the line of 0 dB has a slope
         label = textwrap.fill(f"power of the channel [dB], split {split}", LABEL)

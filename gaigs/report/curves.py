@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy import ndarray
 
-from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE
+from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE, looks
 from gaigs.task import Metric
 
 LABEL = 48
@@ -39,13 +39,20 @@ def cdf(
         limits: Ends of the axis of values; None for those of the data.
     """
     with rc_context(STYLE):
-        ncols = 3 if max(map(len, values)) <= 12 else 2  # letters that fit a third of a column
+        longest = max(map(len, values))
+        ncols = 3 if longest <= 12 else 2 if longest <= 20 else 1  # letters that fit a part of a column
         figure = Figure(figsize=(COLUMN, 2.45 + 0.15 * math.ceil(len(values) / ncols)), layout="constrained")
         ax = figure.subplots()
         ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
-        for (name, sample), (colour, dash) in zip(values.items(), cycle(LINES), strict=False):
+        for (name, sample), (colour, dash) in zip(values.items(), looks(values).values(), strict=True):
             median = float(np.median(sample))
-            ax.ecdf(sample, color=colour, linestyle=dash, label=f"{name} {median:#.3g}")
+            ax.ecdf(
+                sample,
+                color=colour,
+                linestyle=dash,
+                zorder=2.5 if name == next(iter(values)) else 2,
+                label=f"{name} {median:#.3g}",
+            )
             ax.plot(median, 0.5, "o", color=colour, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
         label = textwrap.fill(f"{quantity}, split {split}", LABEL)
         ax.set(xlabel=label, ylabel=f"share of test {samples}", ylim=(0, 1.01))
@@ -96,22 +103,25 @@ def read_validations(folder: Path, score: str) -> list[tuple[int, float, float]]
 
 
 def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:
-    """Training loss with its terms (``train/...``) and validation scores (``validation/...``) against steps."""
+    """Training loss with its terms (``train/...``), penalties and validation scores against steps, a panel each."""
+    titles = {"train": "loss and its terms", "penalty": "penalties, unweighted", "validation": "validation score"}
     panels = {
         group: {name.removeprefix(f"{group}/"): curve for name, curve in curves.items() if name.startswith(f"{group}/")}
-        for group in ("train", "validation")
+        for group in titles
     }
+    panels = {group: dict(sorted(names.items(), key=lambda name: name[0] != "loss")) for group, names in panels.items()}
     panels = {group: names for group, names in panels.items() if names}
     with rc_context(STYLE):
-        figure = Figure(figsize=(COLUMN * len(panels), 2.6), layout="constrained")
+        figure = Figure(figsize=(min(COLUMN * len(panels), PAGE), 2.6), layout="constrained")
         for ax, (group, names) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
             for (name, curve), (colour, dash) in zip(names.items(), cycle(LINES), strict=False):
                 _draw_smoothed(ax, *curve, color=colour, linestyle=dash, label=name)
-            ax.set(xlabel="step", title="Training loss and its terms" if group == "train" else "Validation")
+            ax.set(xlabel="step", title=titles[group])
             ax.grid()
             ax.legend()
-            if group == "train" and any((values > 0).any() for _, values in names.values()):
+            if group != "validation" and any((values > 0).any() for _, values in names.values()):
                 ax.set_yscale("log")
+                _round_ticks(ax, (1, 2, 5))
     return figure
 
 
@@ -121,11 +131,14 @@ def speed_against_error(
     times: Mapping[str, Float[ndarray, " runs"]],
     score_label: str,
     baselines: Mapping[str, float],
+    models: Sequence[str] = (),
 ) -> Figure:
     """Score of each run against each kind of time, one panel a kind; NaN if a time is unknown.
 
-    The baselines' scores are horizontal lines.
+    The baselines' scores are horizontal lines, named by their model first. Runs of several models, one a run, have the
+    models' colours.
     """
+    systems = looks(dict.fromkeys([*models, *(name.partition(" ")[0] for name in baselines)]))
     with rc_context(STYLE):
         key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page
         key_rows = (len(names) + len(baselines) + 1) // key_columns
@@ -133,8 +146,11 @@ def speed_against_error(
         axes = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]
         for ax, (label, values) in zip(axes, times.items(), strict=True):
             for run, (name, look) in enumerate(zip(names, cycle(MARKERS), strict=False)):
+                if len({*models}) > 1:
+                    look = look | {"color": systems[models[run]][0], "marker": "os^DvP*X"[run % 8]}
                 ax.plot(values[run], scores[run], linestyle="", markersize=5, label=name, **look)
-            for (name, score), (colour, dash) in zip(baselines.items(), cycle(LINES[1:]), strict=False):
+            for name, score in baselines.items():
+                colour, dash = systems[name.partition(" ")[0]]
                 ax.axhline(score, color=colour, linestyle=dash, linewidth=0.9, zorder=0, label=name)
             ax.set_xlabel(label)
             ax.grid()
@@ -157,18 +173,25 @@ def learning_curves(curves: Mapping[str, Sequence], baselines: Mapping[str, floa
         key_rows = (len(curves) + len(baselines) + 3) // 4
         figure = Figure(figsize=(PAGE, 3.0 + 0.15 * key_rows), layout="constrained")
         ax = figure.subplots()
-        for (name, (times, scores)), (colour, dash) in zip(curves.items(), cycle(LINES), strict=False):
+        systems = looks([*curves, *baselines])
+        for name, (times, scores) in curves.items():
+            colour, dash = systems[name]
             ax.plot(times, scores, marker=".", markersize=4, color=colour, linestyle=dash, label=name)
-        for (name, value), shade in zip(baselines.items(), cycle(("0.2", "0.45", "0.65", "0.8")), strict=False):
-            ax.axhline(value, color=shade, linewidth=0.9, zorder=0, label=name)
+        for name, value in baselines.items():
+            colour, dash = systems[name]
+            ax.axhline(value, color=colour, linestyle=dash, linewidth=0.7, zorder=0, label=name)
         ax.set(xlabel="training [s]", ylabel=f"{score.title}, validation")
         if not score.higher_is_better and all(value > 0 for line in ax.lines for value in line.get_ydata()):
             ax.set_yscale("log")
-            ticks = LogLocator(subs=(1, 2, 3, 4, 5, 6, 8))
-            ax.yaxis.set(major_locator=ticks, major_formatter="{x:g}", minor_locator=NullLocator())
+            _round_ticks(ax, (1, 2, 3, 4, 5, 6, 8))
         ax.grid()
         figure.legend(loc="outside lower center", ncols=4)
     return figure
+
+
+def _round_ticks(ax: Axes, steps: Sequence[int]) -> None:
+    """Ticks of a logarithmic axis at these multiples of powers of ten, as plain numbers."""
+    ax.yaxis.set(major_locator=LogLocator(subs=steps), major_formatter="{x:g}", minor_locator=NullLocator())
 
 
 def _draw_smoothed(ax: Axes, steps, values, **line) -> None:
@@ -177,4 +200,6 @@ def _draw_smoothed(ax: Axes, steps, values, **line) -> None:
     if window > 1:
         ax.plot(steps, values, color=line["color"], alpha=0.2, linewidth=0.5)
     mean = np.convolve(values, np.full(window, 1 / window), "valid")
+    if len(values) <= 30:
+        line["marker"] = "."
     ax.plot(steps[(window - 1) // 2 :][: len(mean)], mean, **line)

@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from gaigs.report.figures import own_scores
-from gaigs.report.style import BLUE, LINES, PAGE, STYLE
+from gaigs.report.style import PAGE, STYLE, looks
 from gaigs.task import Task
 from gaigs.task.scalar import Scalar
 
@@ -31,7 +32,7 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
     with rc_context(STYLE):
         figure = Figure(figsize=(PAGE, 0.46 * PAGE), layout="compressed")
         left, right = figure.subplots(1, 2)
-        for (name, share), (colour, dash) in zip(shares.items(), LINES, strict=False):
+        for (name, share), (colour, dash) in zip(shares.items(), looks(shares).values(), strict=True):
             left.plot(levels, share, color=colour, linestyle=dash, label=name)
         left.axline((0, 0), slope=1, color="0.3", linewidth=0.7)
         left.set(
@@ -40,11 +41,14 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
         left.set_title(f"split {split}")
         left.legend()
         across, up = (np.array([np.sqrt((part[rows] ** 2).mean()) for rows in parts]) for part in (stated, errors))
-        right.plot(across, up, "o", color=BLUE, markersize=4)
+        right.plot(across, up, "o", color=looks(shares)[next(iter(shares))][0], markersize=4)
         furthest = 1.08 * max(across.max(), up.max()) or 1.0
         right.axline((0, 0), slope=1, color="0.3", linewidth=0.7)
         unit = f" [{task.error_unit}]" if isinstance(task, Scalar) and task.error_unit else ""
         right.set(xlim=(0, furthest), ylim=(0, furthest), aspect="equal")
+        for axis in (right.xaxis, right.yaxis):
+            axis.set_major_locator(MaxNLocator(5))
+        right.ticklabel_format(scilimits=(-3, 4))
         right.set(xlabel=f"stated standard deviation{unit}", ylabel=f"root mean square error{unit}")
         right.set_title(f"{next(iter(shares))}, {len(errors):,} test links in {len(parts)} groups")
         for ax in (left, right):

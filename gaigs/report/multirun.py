@@ -112,9 +112,11 @@ def report(folder: str | Path) -> Group:
     groups = over_seeds(runs, shared)
     caption = ", ".join(f"{key}={value}" for key, value in shared.items())
     failures = [f"{run.name}: {run.failure}" for run in runs if run.failure is not None]
+    doubts = [f"{run.name}: {doubt}" for run in runs for doubt in run.doubts]
 
     write_csv(folder / "ablation.csv", rows + groups, ("_sd", "_least"))
     page = f"{_markdown(rows, titles)}\n{caption}\n" + "".join(f"- without a result: {why}\n" for why in failures)
+    page += "".join(f"- {doubt}\n" for doubt in doubts)
     if groups:
         page += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
     write_text(folder / "ablation.md", page)
@@ -127,7 +129,7 @@ def report(folder: str | Path) -> Group:
     varied = [[value for key, value in run.overrides.items() if key not in shared] for run in runs]
     if all(varied.count(values) == 1 for values in varied):
         hidden.add("run")  # its name would repeat the varied overrides
-    caption = "\n".join([*failures, f"{caption}; all columns in ablation.md"])
+    caption = "\n".join([*failures, *doubts, f"{caption}; all columns in ablation.md"])
     tables = [_terminal(f"Runs of {folder}", rows, titles, hidden, caption)]
     if groups:
         about = f"{SEEDS}; all columns in ablation.md"
@@ -147,7 +149,8 @@ def _speed(runs: list[Run], rows: list[dict], shared: Mapping, titles: Mapping[s
     numbers = lambda key: np.array([np.nan if row.get(key) is None else row[key] for _, row in done], float)
     times = {"inference [ms a transmitter]": numbers("inference_ms"), "training [s]": numbers("train_seconds")}
     baselines = {f"{row['model']} {row.get('split', '')}".strip(): row[metric] for row in rows[len(runs) :]}
-    return speed_against_error(names, numbers(metric), times, titles[metric], baselines)
+    models = [row["model"] for _, row in done]
+    return speed_against_error(names, numbers(metric), times, titles[metric], baselines, models)
 
 
 def _text(value: float | int | str | Spread | None, between: str) -> str:

@@ -55,7 +55,7 @@ def room(links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | 
                 ellipses = _draw_gaussians(ax, means[:, view], covariances[:, view][:, :, view], strengths)
             if learnt is not None:
                 _draw_planes(ax, learnt.planes, view, along)
-            ax.add_collection(LineCollection(edges[..., view], colors="0.5", linewidths=0.8))
+            _draw_walls(ax, edges[..., view])
             ax.plot(*train[:, view].T, ".", color="0.2", markersize=2, label="transmitters, train")
             ax.plot(*test[:, view].T, ".", color=ORANGE, markersize=3, label="transmitters, test")
             _draw_receivers(ax, receivers[:, view], "receivers, axes of the array" if has_axes else "receivers")
@@ -87,7 +87,7 @@ def paths(links: Links, learnt: LearntRoom) -> Figure:
         for ax, (up, along) in zip(axes, VIEWS, strict=True):
             view = [0, up]
             _draw_planes(ax, learnt.planes, view, along)
-            ax.add_collection(LineCollection(edges[..., view], colors="0.5", linewidths=0.8))
+            _draw_walls(ax, edges[..., view])
             lines = _draw_paths(ax, learnt.paths, view)
             _draw_receivers(ax, receivers[:, view], "receivers")
             ax.plot(*points[0][0, view], "o", color=ORANGE, markeredgecolor="white", label="transmitter")
@@ -101,6 +101,11 @@ def paths(links: Links, learnt: LearntRoom) -> Figure:
 
 def _receivers(links: Links) -> Float[ndarray, "receivers 3"]:
     return np.stack([receiver.pose.position.numpy() for receiver in links.receivers])
+
+
+def _draw_walls(ax: Axes, edges: Float[ndarray, "k 2 2"]) -> None:
+    label = "walls and furniture" if len(edges) else "_nothing"
+    ax.add_collection(LineCollection(edges, colors="0.5", linewidths=0.8, label=label))
 
 
 def _draw_receivers(ax: Axes, places: Float[ndarray, "receivers 2"], label: str) -> None:

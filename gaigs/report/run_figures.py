@@ -26,7 +26,7 @@ def figures_of(task: type[Task]) -> figures.TaskFigures:
 
 
 def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
-    """Draws the room, the losses and the figures of the task from the files of a run into ``figures/*.png``.
+    """Draws the room, the losses and the figures of the task from the files of a run into ``figures``.
 
     The model's ``primitives`` and ``learnt_room`` are drawn if it has them.
     """
@@ -42,7 +42,4 @@ def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
         drawn["intervals"] = drawn_intervals
     drawn |= figures_of(type(links.task)).of_run(task, folder, links)
     (folder / "figures").mkdir(exist_ok=True)
-    files = {folder / "figures" / f"{name}.png": figure for name, figure in drawn.items()}
-    for file, figure in files.items():
-        style.save(figure, file)
-    return list(files)
+    return [file for name, figure in drawn.items() for file in style.save(figure, folder / "figures" / f"{name}.png")]

@@ -2,17 +2,24 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import QuotedString
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gaigs.configuration import differences
+from gaigs.configuration import differences, presets
 from gaigs.registry import check_type
 from gaigs.report.table import headline
+
+MISSING = object()
+"""The value of a key that a configuration lacks."""
 
 
 class Run(NamedTuple):
@@ -24,6 +31,7 @@ class Run(NamedTuple):
         metrics: Contents of ``metrics.json``; None where the job failed, was stopped or still runs.
         failure: The error of a failed job; else None.
         folder: Of the run.
+        doubts: Sentences on overrides that are not those of the run's configuration.
     """
 
     name: str
@@ -31,6 +39,7 @@ class Run(NamedTuple):
     metrics: dict | None
     failure: str | None
     folder: Path
+    doubts: tuple[str, ...] = ()
 
 
 def as_baseline(name: str) -> str:
@@ -90,7 +99,7 @@ def read_runs(folder: Path) -> list[Run]:
         FileNotFoundError: The folder holds no run.
         ValueError: One was started anew with another configuration, or a file is damaged.
     """
-    runs = []
+    runs, configs = list[Run](), list[dict]()
     for path in folder.glob("**/.hydra/overrides.yaml"):
         own, started = path.parents[1], path.parent / "config.yaml"
         stored, file = own / "config.yaml", own / "metrics.json"
@@ -101,16 +110,79 @@ def read_runs(folder: Path) -> list[Run]:
             )
         typed = (override.partition("=") for override in _read_yaml(path, list))
         overrides = {key.lstrip("+"): re.sub(r"\\(.)", r"\1", value) for key, _, value in typed}  # without escapes
+        config: dict = next((_read_yaml(path, dict) for path in (stored, started) if path.is_file()), {})
         metrics, failure = (read_metrics(file), None) if file.is_file() else (None, _failure(own))
-        runs.append(Run(own.relative_to(folder).as_posix(), overrides, metrics, failure, own))
+        doubts = _correct(overrides, config)
+        runs.append(Run(own.relative_to(folder).as_posix(), overrides, metrics, failure, own, doubts))
+        configs.append(config)
     if not runs:
         raise FileNotFoundError(
             f"{folder} must hold runs, each with its .hydra/overrides.yaml\n"
             "pass the folder that Hydra made for 'python -m gaigs --multirun ...'"
         )
+    runs = _tell_apart(runs, configs)
     # Text and numbers alternate, so that equal types are compared.
     parts = lambda name: [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
     runs.sort(key=lambda run: parts(run.name))
+    return runs
+
+
+def _correct(overrides: dict[str, str], config: dict) -> tuple[str, ...]:
+    """Replaces overrides that differ from the run's configuration by its values; returns a sentence for each.
+
+    Presets without a name of their own, such as experiments, are not in the configuration. A tokenizer that no part
+    reads becomes ``none``.
+    """
+    doubts = []
+    for key, value in overrides.items():
+        there: Any = config
+        for part in key.split("."):
+            there = there.get(part, MISSING) if isinstance(there, dict) else MISSING
+        if isinstance(there, dict):
+            there = there.get("name", MISSING)
+            known = [value, *(part.get("name") for part in presets(key, value))]
+        else:
+            known = [there if "${" in value or isinstance(there, list) else _parsed(value)]
+        if there is not MISSING and there not in known:
+            overrides[key] = str(there)
+            doubts.append(f".hydra/overrides.yaml has {key}={value}, and config.yaml {there}, which counts")
+    if "tokenizer" in overrides and _is_unread("tokenizer", config):
+        overrides["tokenizer"] = "none"
+    return tuple(doubts)
+
+
+def _parsed(value: str) -> Any:
+    try:
+        parsed = OverridesParser.create().parse_override(f"key={value}").value()
+    except HydraException:
+        return value
+    return str(parsed) if isinstance(parsed, QuotedString | list | dict) else parsed
+
+
+def _is_unread(key: str, config: Mapping) -> bool:
+    """True for the tokenizer of a model whose deformation takes no tokens."""
+    return key == "tokenizer" and (config.get("deformation") or {}).get("name") == "none"
+
+
+def _tell_apart(runs: list[Run], configs: list[dict]) -> list[Run]:
+    """Runs with the same overrides, though they differ in more than the seed, with values of their configurations."""
+    own = {}
+    for run, config in zip(runs, configs, strict=True):
+        parts = {key: value for key, value in config.items() if not _is_unread(key, config)}
+        # A model's configuration repeats those of its parts.
+        alone = {key: value for key, value in (config.get("model") or {}).items() if key not in config}
+        own[run.folder] = parts | {"model": alone}
+    for group in by_seed(runs):
+        first, *others = (own[run.folder] for run in group)
+        keys = dict.fromkeys(key for other in others for key in differences(first, other))
+        for key in (key for key in keys if key.rpartition(".")[2] != "seed"):
+            values = {run.folder: str(OmegaConf.select(OmegaConf.create(own[run.folder]), key)) for run in group}
+            usual = Counter(values.values()).most_common(1)[0][0]
+            for run in group:
+                run.overrides[key.removesuffix(".name")] = value = values[run.folder]
+                if value != usual:
+                    doubt = f".hydra/overrides.yaml has no {key.removesuffix('.name')}, and config.yaml {value}"
+                    runs[runs.index(run)] = run._replace(doubts=(*run.doubts, doubt))
     return runs
 
 

@@ -20,11 +20,14 @@ from gaigs.data import Links
 from gaigs.radio_maps import RadioMap
 from gaigs.report.curves import cdf
 from gaigs.report.figures import TaskFigures, own_scores, scores_of_systems
-from gaigs.report.style import GREY, ORANGE, PAGE, STYLE, round_step
+from gaigs.report.style import BLUE, GREY, ORANGE, PAGE, STYLE, round_step
 from gaigs.task.scalar import Scalar, with_unit
 
 PANELS = 6
 """Largest number of panels of a figure, a panel a receiver."""
+
+FEW = 400
+"""Largest number of dots of a panel that can be told apart."""
 
 
 class ScalarFigures(TaskFigures):
@@ -71,10 +74,11 @@ def predicted_against_measured(
     names: Sequence[str],
     task: Scalar,
 ) -> list[Figure]:
-    """Histogram of test readings over label and prediction [task.unit], one panel a receiver, all on the same axes.
+    """Test readings over label and prediction [task.unit], one panel a receiver, all on the same axes.
 
-    A prediction more than 20 cells outside the labels is drawn there. A receiver without readings has no panel.
-    ``receiver`` is an index into the names of each reading.
+    They are dots; if a receiver has more than ``FEW``, they are counted in cells. A prediction more than 20 cells
+    outside the labels is drawn there. A receiver without readings has no panel. ``receiver`` is an index into the names
+    of each reading.
     """
     errors, unit = np.abs(predictions - labels), task.error_unit
     # Equal labels have no range: the cell's width then suits their size, or is 1.
@@ -88,6 +92,7 @@ def predicted_against_measured(
     upper = np.floor(max(across.max(), up.max())) + 1  # past a value on an edge
     edges = np.arange(lower, upper + 1)
     counts = [np.histogram2d(across[receiver == r], up[receiver == r], (edges, edges))[0].T for r in heard]
+    has_few = max(count.sum() for count in counts) <= FEW
     colours = LogNorm(1, max(2, max(count.max() for count in counts)))
     ticks = np.outer(10.0 ** np.arange(7), (1, 2, 5)).ravel()
     cells, limits = cell * edges, (cell * lower, cell * upper)
@@ -98,8 +103,12 @@ def predicted_against_measured(
             page = range(first, min(first + PANELS, len(heard)))
             figure, axes = _panels(len(page), 1, 1, f"measured {axis}", f"predicted {axis}")
             for ax, panel in zip(axes, page, strict=True):
-                count = np.ma.masked_equal(counts[panel], 0)
-                image = ax.pcolormesh(cells, cells, count, cmap="viridis_r", norm=colours, rasterized=True)
+                if has_few:
+                    own = receiver == heard[panel]
+                    ax.plot(labels[own], predictions[own], "o", color=BLUE, markersize=3, alpha=0.5, markeredgewidth=0)
+                else:
+                    count = np.ma.masked_equal(counts[panel], 0)
+                    image = ax.pcolormesh(cells, cells, count, cmap="viridis_r", norm=colours, rasterized=True)
                 ax.axline((limits[0], limits[0]), slope=1, color="0.3", linewidth=0.7)
                 ax.set(xlim=limits, ylim=limits, aspect="equal")
                 error = errors[receiver == heard[panel]].mean()
@@ -107,11 +116,12 @@ def predicted_against_measured(
                 ax.set_title(f"{names[heard[panel]]}, MAE {error}")
                 ax.grid()
                 ax.set_axisbelow(True)
-            size = f"{cell:g} {unit}".strip()
-            label = f"test readings in {size} × {size}"
-            bar = figure.colorbar(image, ax=axes, label=label, format="{x:g}", aspect=30, shrink=0.7)
-            bar.set_ticks(ticks[ticks <= colours.vmax])
-            bar.minorticks_off()
+            if not has_few:
+                size = f"{cell:g} {unit}".strip()
+                label = f"test readings in {size} × {size}"
+                bar = figure.colorbar(image, ax=axes, label=label, format="{x:g}", aspect=30, shrink=0.7)
+                bar.set_ticks(ticks[ticks <= colours.vmax])
+                bar.minorticks_off()
             figures.append(figure)
     return figures
 
@@ -164,9 +174,11 @@ def radio_maps(
             figure.colorbar(image, ax=axes, label=label, aspect=30, shrink=0.7, extend="both")
             dot = Line2D([], [], linestyle="", marker="o", markersize=4, color=GREY)
             key = {"receiver": gateway}
+            if len(walls):
+                key["walls and furniture"] = Line2D([], [], color="black", linewidth=0.9)
             if any(len(rows) for rows in dots.values()):
                 key["test readings, in the map's colours"] = dot
-            figure.legend(key.values(), key, loc="outside lower center", ncols=2)
+            figure.legend(key.values(), key, loc="outside lower center", ncols=3)
             figures.append(figure)
     return figures
 

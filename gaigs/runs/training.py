@@ -125,6 +125,11 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     make_kriged = lambda trend: Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
     kriged = make_kriged(model)
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
+    if "tokenizer" in parts and getattr(model, "tokenizer", model) is None:
+        if parts["tokenizer"] != registry("model").options(name)["tokenizer"]:
+            words = "tokenizer=%s is not read, as deformation=%s takes no tokens"
+            log.warning(words, parts["tokenizer"], parts["deformation"])
+        parts["tokenizer"] = "none"
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
     model.fit(links)
     start = count_gaussians(model)

@@ -138,6 +138,13 @@ def time_share(trainer) -> float | None:
     return next((budget.share for budget in budgets if budget.max_time is not None), None)
 
 
+def is_time_up(trainer) -> bool:
+    """True if the time of a training is up, by the clock of the first process."""
+    budgets = (callback for callback in trainer.callbacks if isinstance(callback, Budget))
+    limited = [budget for budget in budgets if budget.max_time is not None]
+    return any(trainer.strategy.broadcast(budget.seconds) >= budget.max_time for budget in limited)
+
+
 def share_done(trainer) -> Callable[[int], float]:
     """The share of a training done after a number of steps: of its steps or of its time, whichever is more."""
 

@@ -122,10 +122,10 @@ class Descent(lightning.LightningModule):
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             # Lightning would log after the step's callbacks, and a checkpoint written there would lack the row.
             shared = {name: links * term for name, term in terms.items()}
-            shared |= {name: places * penalty for name, penalty in penalties.items()}
-            values = torch.stack([total, *shared.values()]).detach()
-            values = self.trainer.strategy.reduce(values, reduce_op="mean").tolist()
-            values = dict(zip((f"train/{name}" for name in ("loss", *shared)), values, strict=True))
+            names = ["train/loss", *(f"train/{name}" for name in shared), *(f"penalty/{name}" for name in penalties)]
+            values = torch.stack([total, *shared.values(), *(places * penalty for penalty in penalties.values())])
+            values = self.trainer.strategy.reduce(values.detach(), reduce_op="mean").tolist()
+            values = dict(zip(names, values, strict=True))
             for logger in self.loggers:
                 logger.log_metrics(values, step=self.global_step)
         return total

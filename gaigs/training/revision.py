@@ -1,16 +1,18 @@
 """Revisions: changes that a model makes to itself between two steps."""
 
+import contextlib
 import logging
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Int
 from lightning.pytorch.callbacks import Callback
-from torch import Tensor
+from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.query import Batch
 from gaigs.training import seeded
-from gaigs.training.budget import time_share
+from gaigs.training.budget import is_time_up, time_share
 
 log = logging.getLogger(__name__)
 
@@ -18,11 +20,32 @@ LINKS = 48
 """Most training links, and validation links, of a revision: a search evaluates them hundreds of times."""
 
 
+class _TimeUp(Exception):
+    """The time of a training is up."""
+
+
+@contextlib.contextmanager
+def _ending(trainer, model: nn.Module) -> Iterator[None]:
+    """Looks at the clock whenever a part of the model is called, and raises ``_TimeUp`` when the time is up."""
+
+    def look(*_) -> None:
+        if is_time_up(trainer):
+            raise _TimeUp
+
+    hooks = [part.register_forward_pre_hook(look) for part in model.modules()]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
+
+
 class Revision(Callback):
     """Calls ``Model.revise`` after the shares of the training in ``Model.revisions``.
 
-    Shares are of the training's steps or of its time, whichever comes first. All processes choose the same links by the
-    seed, so that they decide alike.
+    Shares are of the training's steps or of its time, whichever comes first. A revision that is not done when the time
+    of the training is up leaves the model as it was. All processes choose the same links by the seed, so that they
+    decide alike.
     """
 
     def __init__(self, links: Links, seed: int):
@@ -49,14 +72,22 @@ class Revision(Callback):
             by_steps = trainer.max_steps > 0 and trainer.global_step == round(share * trainer.max_steps)
             if number in self.made or not (by_steps or (time is not None and time >= share)):
                 continue
+            if is_time_up(trainer):
+                return
             self.made.append(number)
             convert, split = trainer.precision_plugin.convert_input, self.links.split
             parts = (self._batch(module, part, number) for part in (split.train, split.validation))
             train, validation = (None if part is None else convert(part) for part in parts)
             module.eval()  # as for every prediction outside of a training step
-            done = module.model.revise(
-                number, train, validation, lambda batch: module.loss(module.model(batch).value, batch)[0].item()
-            )
+            before = {name: value.clone() for name, value in module.model.state_dict().items()}
+            try:
+                with _ending(trainer, module.model):
+                    done = module.model.revise(
+                        number, train, validation, lambda batch: module.loss(module.model(batch).value, batch)[0].item()
+                    )
+            except _TimeUp:
+                module.model.load_state_dict(before)
+                done = "the time is up within a revision, which is not made"
             module.train()
             log.info("step %d: %s", trainer.global_step, done)
 

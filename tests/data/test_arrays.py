@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.task.csi import Csi
 
 PLACES = np.random.default_rng(0).uniform(0, 4, (12, 3))
 GATEWAYS = [[0.0, 0.0, 2.0], [4.0, 4.0, 2.0]]
@@ -56,3 +57,16 @@ def test_arrays_that_do_not_fit_are_refused(changes, message):
     arrays = {"task": "rssi", "transmitters": PLACES, "receivers": GATEWAYS, "labels": np.zeros((12, 2)) - 50}
     with pytest.raises(ValueError, match=message):
         gaigs.links(**(arrays | changes))
+
+
+def test_channels_of_any_layout_are_labels():
+    task = Csi(1, torch.tensor([2.40e9, 2.41e9]))
+    rng = np.random.default_rng(0)
+    channels = rng.normal(size=(12, 1, 2)) + 1j
+    read_only = np.broadcast_to(channels, channels.shape)
+    arrays = {"task": task, "transmitters": PLACES, "receivers": GATEWAYS[0]}
+    for given in (channels[::-1][::-1], channels.astype(">c16"), channels.astype(object), read_only, [*read_only]):
+        labels = gaigs.links(**arrays, labels=given).labels
+        assert torch.equal(labels, torch.from_numpy(channels).to(torch.complex64))
+    with pytest.raises(ValueError, match="labels must be those of task 'csi', got a sparse_coo tensor; give a dense"):
+        gaigs.links(**arrays, labels=torch.from_numpy(channels).to_sparse())

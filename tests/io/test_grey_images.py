@@ -48,10 +48,6 @@ def cut(size):
     ("damage", "message"),
     [
         (save(np.zeros((90, 361), np.uint8)), "of 90 x 360 pixels, got mode L of 90 x 361"),
-        (
-            save(np.zeros((90, 360, 3), np.uint8)),
-            "expected 8-bit grey (Pillow's mode L) of 90 x 360 pixels, got mode RGB",
-        ),
         (lambda file: Image.new("L", (360, 90)).save(file, format="jpeg"), "no whole PNG image (cannot identify image"),
         *((cut(size), "no whole PNG image (") for size in (0, 20, 40)),
     ],
@@ -60,6 +56,47 @@ def test_a_header_with_a_defect_is_refused_at_once(files, damage, message):
     damage(files[1])
     with pytest.raises(ValueError, match=rf"1\.png: .*{re.escape(message)}"):
         GreyImages(files, SHAPE)
+
+
+GREY = np.random.default_rng(1).integers(0, 256, SHAPE, dtype=np.uint8)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        Image.fromarray(np.stack((GREY,) * 3, -1)),
+        Image.fromarray(np.stack((GREY, np.full_like(GREY, 255)), -1)),
+        Image.fromarray(np.stack((GREY,) * 3, -1)).convert("RGBA"),
+        Image.fromarray(GREY).convert("P"),
+        Image.fromarray(GREY.astype(np.uint16) * 257),
+    ],
+    ids=lambda image: image.mode,
+)
+def test_grey_values_are_read_from_every_kind_of_png(files, image):
+    plain = GreyImages(files, SHAPE)[torch.tensor([1])]
+    image.save(files[1])
+    assert torch.equal(GreyImages(files, SHAPE)[torch.tensor([1, 0])][:1], plain)
+
+
+def test_sixteen_bits_are_kept(files):
+    fine = np.arange(90 * 360, dtype=np.uint16).reshape(SHAPE)
+    Image.fromarray(fine).save(files[1])
+    np.testing.assert_allclose(GreyImages(files, SHAPE)[torch.tensor([1])][0], fine / 65535, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("channel", "value", "message"),
+    [
+        (1, GREY[3, 5] ^ 1, "expected grey values, got the colour [{0}, {1}, {0}] in row 3, column 5"),
+        (3, 254, "expected no transparent pixel, got one in row 3, column 5"),
+    ],
+)
+def test_colours_and_transparent_pixels_are_no_grey_values(files, channel, value, message):
+    pixels = np.stack((GREY, GREY, GREY, np.full_like(GREY, 255)), -1)
+    pixels[3, 5, channel] = value
+    Image.fromarray(pixels).save(files[1])
+    with pytest.raises(ValueError, match=rf"1\.png: {re.escape(message.format(GREY[3, 5], value))}"):
+        GreyImages(files, SHAPE)[torch.tensor([1])]
 
 
 @pytest.mark.parametrize("place", [45, 100, 6000, 20000, -60, -5000])

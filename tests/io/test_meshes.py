@@ -23,6 +23,17 @@ def test_an_obj_has_vertices_and_faces_by_object_and_material(tmp_path):
     assert groups == {("floor", "glass"): [(0, 1, 2, 3)], ("roof", "glass"): [(0, 1, 2)]}
 
 
+def test_a_line_of_an_obj_goes_on_after_a_backslash(tmp_path):
+    (tmp_path / "room.OBJ").write_text(OBJ.replace("f 1/1 2/2", "f 1/1 \\\n 2/2\\").replace("0 2 1", "0 \\\n2 1"))
+    with (tmp_path / "room.OBJ").open("a") as file:
+        file.write("# from C:\\rooms\\\n#\n")
+    assert repr(read_obj(tmp_path / "room.OBJ")) == repr(parse_obj(OBJ.splitlines(), ""))
+    with pytest.raises(ValueError, match="line 12: expected numbers x y z, got 'v 0  0'"):
+        parse_obj([*OBJ.splitlines(), "v 0 \\", "0"], "room.obj")
+    with pytest.raises(ValueError, match=r"line 11: expected another line after the \\ at its end"):
+        parse_obj([*OBJ.splitlines(), "v 0 0 \\"], "room.obj")
+
+
 @pytest.mark.parametrize("text", [True, False])
 def test_a_ply_has_vertices_and_faces(tmp_path, text):
     ply(text).write(str(tmp_path / "room.ply"))

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import ecdf
 
-from gaigs.report.curves import cdf, loss_curves, read_curves, speed_against_error
+from gaigs.registry import registry
+from gaigs.report.curves import cdf, learning_curves, loss_curves, read_curves, speed_against_error
+from gaigs.report.style import looks
+from gaigs.task import Metric
 
 
 @pytest.fixture
@@ -76,6 +79,42 @@ def test_curves_leave_out_the_gaps_of_the_log(tmp_path):
     assert set(lines(train)) == {"loss", "l1"}
     np.testing.assert_allclose(lines(train)["loss"].get_xydata(), [(k, 1 / (k + 1)) for k in range(30)])
     np.testing.assert_allclose(lines(validation)["ssim"].get_xdata(), [9, 19, 29])
+
+
+def test_penalties_have_an_axis_of_their_own():
+    steps = np.arange(9.0)
+    figure = loss_curves({"train/l1": (steps, steps), "train/loss": (steps, steps), "penalty/opacity": (steps, steps)})
+    assert [[*lines(ax)] for ax in figure.axes] == [["loss", "l1"], ["opacity"]]
+
+
+def test_a_system_has_one_look_in_all_figures(rng):
+    known = registry("model").names()
+    found = looks(known)
+    assert len({*found.values()}) == len(known)
+    assert found["gaigs"][1] == found["mirrored"][1] == "-"
+    assert looks(["GAI-GS", "knn (baseline)", "gaigs_trend"]) == {
+        "GAI-GS": found["gaigs"], "knn (baseline)": found["knn"], "gaigs_trend": (found["gaigs"][0], ":")
+    }  # fmt: skip
+    variants = looks(["GAI-GS split=a", "GAI-GS split=b"])
+    assert variants["GAI-GS split=a"] == found["gaigs"] != variants["GAI-GS split=b"]
+    names = [f"a system of mine {k}" for k in range(20)]
+    assert len({*looks([*known[:10], *names]).values()}) == 30
+    assert looks(["gaigs", "knn", names[0]])[names[0]] == looks(names[:1])[names[0]]
+    scores = {name: rng.random(9) for name in ("mirrored", "knn", "mean")}
+    drawn = cdf(scores, "SSIM", "spectra", "random", (None, 1)).axes[0]
+    steps = [line.get_color() for line in drawn.lines if line.get_drawstyle().startswith("steps")]
+    assert steps == [found[name][0] for name in scores]
+    two = [((1.0, 2.0), (0.5, 0.6))] * 2
+    curves = learning_curves(
+        dict(zip(("mirrored Gaussians", "GAI-GS"), two, strict=True)), {"knn": 0.7}, Metric("SSIM", True)
+    )
+    assert [line.get_color() for line in curves.axes[0].lines] == [
+        found[name][0] for name in ("mirrored", "gaigs", "knn")
+    ]
+    times = {"inference": np.array([1.0, 2.0, 3.0])}
+    models = ["mirrored", "gaigs", "mirrored"]
+    (ax,) = speed_against_error(["a", "b", "c"], np.ones(3), times, "SSIM", {"knn official": 0.8}, models).axes
+    assert [line.get_color() for line in ax.lines] == [found[name][0] for name in (*models, "knn")]
 
 
 def test_many_steps_are_smoothed_in_place():

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 from folders import FACTS, read, terminal, write_run
 
 from gaigs.report.__main__ import main
@@ -200,6 +201,52 @@ def test_overrides_of_a_refused_start_are_not_shown_as_the_runs(tmp_path):
         report(tmp_path)
     (run / ".hydra" / "config.yaml").write_text("seed: 1\nsave_every: 5\n")  # which changes no result
     assert len(read_runs(tmp_path)) == 1
+
+
+def write_configured(folder, overrides, config, own):
+    write_run(folder, overrides, scores(own), seed=config["seed"])
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+
+
+def configured(seed, tokenizer="ga", deformation="two_branch", **others):
+    parts = {"tokenizer": {"name": tokenizer}, "deformation": {"name": deformation}}
+    return {"seed": seed, "model": {"name": "gaigs", **parts}, **parts, "split": {"name": "official"}} | others
+
+
+def test_the_configuration_counts_where_overrides_were_changed(tmp_path):
+    words = ["tokenizer=ga", "split=official_runs", "+experiment=spectrum", "rate=1e-3", "name='a b'", "list=[1,2]"]
+    others = {"rate": 0.001, "name": "a b", "list": [1, 2]}
+    write_configured(tmp_path / "0", [*words, "seed=0"], configured(0, **others), 0.9)
+    write_configured(tmp_path / "1", [*words, "seed=0"], configured(1, "euclidean", **others), 0.7)
+    first, second = read_runs(tmp_path)
+    assert first.doubts == ()
+    assert (second.overrides["tokenizer"], second.overrides["seed"]) == ("euclidean", "1")
+    named = ".hydra/overrides.yaml has tokenizer=ga, and config.yaml euclidean, which counts"
+    assert second.doubts[0] == named
+    report(tmp_path)
+    assert f"- 1: {named}\n" in (tmp_path / "ablation.md").read_text()
+    assert not [row for row in read(tmp_path / "ablation.csv") if row["status"] == "seeds"]
+
+
+def test_runs_whose_overrides_were_cut_are_told_apart(tmp_path):
+    for seed, tokenizer, words in ((0, "ga", ["seed=0"]), (1, "ga", ["seed=1"]), (2, "euclidean", ["seed=2"])):
+        write_configured(tmp_path / str(seed), words, configured(seed, tokenizer), 0.9)
+    assert [run.overrides["tokenizer"] for run in read_runs(tmp_path)] == ["ga", "ga", "euclidean"]
+    assert [run.doubts for run in read_runs(tmp_path)][:2] == [(), ()]
+    report(tmp_path)
+    assert (
+        "2: .hydra/overrides.yaml has no tokenizer, and config.yaml euclidean" in (tmp_path / "ablation.md").read_text()
+    )
+    (group,) = [row for row in read(tmp_path / "ablation.csv") if row["status"] == "seeds"]
+    assert (group["tokenizer"], group["runs"]) == ("ga", "2")
+
+
+def test_a_tokenizer_that_is_not_read_is_none_in_tables(tmp_path):
+    for seed, tokenizer in enumerate(("ga", "euclidean")):
+        words = [f"tokenizer={tokenizer}", "deformation=none", f"seed={seed}"]
+        write_configured(tmp_path / str(seed), words, configured(seed, tokenizer, "none"), 0.9)
+    runs = read_runs(tmp_path)
+    assert [(run.overrides["tokenizer"], run.doubts) for run in runs] == [("none", ())] * 2
 
 
 def test_command_line(tmp_path, monkeypatch, capsys):

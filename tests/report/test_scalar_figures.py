@@ -6,6 +6,7 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.contour import QuadContourSet
 
 from gaigs.radio_maps import RadioMap
+from gaigs.report import scalar
 from gaigs.report.scalar import PANELS, predicted_against_measured, radio_maps
 from gaigs.report.style import round_step
 from gaigs.task.rssi import Rssi
@@ -29,7 +30,24 @@ def counts(ax):
     return mesh.get_coordinates()[0, :, 0], mesh.get_array().filled(0)
 
 
-def test_readings_are_counted_where_they_were_measured_and_predicted():
+@pytest.fixture
+def counted(monkeypatch):
+    """Readings are counted, however few they are."""
+    monkeypatch.setattr(scalar, "FEW", 0)
+
+
+def test_few_readings_are_dots_and_many_are_counted():
+    labels = np.linspace(-80, -50, 2 * scalar.FEW + 1)
+    draw = lambda count: predicted_against_measured(
+        labels[:count], labels[:count] + 1, np.arange(count) % 2, ["west", "east"], Rssi()
+    )
+    (few,), (many,) = draw(2 * scalar.FEW), draw(2 * scalar.FEW + 1)
+    assert len(few.axes) == 2, "no bar of colours"
+    np.testing.assert_array_equal(few.axes[1].lines[0].get_xydata(), np.stack((labels, labels + 1), 1)[1:-1:2])
+    assert counts(many.axes[0])[1].sum() == scalar.FEW + 1
+
+
+def test_readings_are_counted_where_they_were_measured_and_predicted(counted):
     labels, predictions = np.array([-61.0, -61, -70, -50, -43]), np.array([-55.0, -55.5, -70, -50.5, -44])
     receiver = np.array([1, 1, 1, 2, 2])
     (figure,) = predicted_against_measured(labels, predictions, receiver, ["silent", "hall", "[attic]"], Rssi())
@@ -54,7 +72,7 @@ def test_many_receivers_take_several_figures():
 
 
 @pytest.mark.parametrize("scale", [1e-9, 0.03, 1.0, 4e6])
-def test_cells_and_margins_follow_from_the_data_in_other_units(scale):
+def test_cells_and_margins_follow_from_the_data_in_other_units(counted, scale):
     rng = np.random.default_rng(6)
     labels = scale * rng.gamma(2, 30, 3000)
     predictions = labels + scale * rng.normal(0, 10, 3000)
@@ -77,7 +95,7 @@ def test_cells_and_margins_follow_from_the_data_in_other_units(scale):
 
 @pytest.mark.parametrize("task", [NANOSECONDS, Rssi()])
 @pytest.mark.parametrize("labels", [np.full(4, 7.0), np.zeros(4), np.arange(11) / 10, -60 - 2.0 * np.arange(4)])
-def test_every_reading_is_inside(labels, task):
+def test_every_reading_is_inside(counted, labels, task):
     (figure,) = predicted_against_measured(labels, labels, np.zeros(len(labels), int), ["a"], task)
     (ax,) = panels(figure)
     assert counts(ax)[1].sum() == len(labels)

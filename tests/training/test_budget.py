@@ -131,6 +131,33 @@ def test_revisions_come_after_their_shares_of_the_time(train, links, caplog):
     assert module.model.turns == [0, 1, 2, 3], "steps and time bring each once"
 
 
+class Searched(Turned):
+    """A plane whose second revision takes a second a step of a search of ten."""
+
+    clock = None
+
+    def revise(self, number, train, validation, loss):
+        self.before = self.slope.clone()
+        super().revise(number, train, validation, loss)
+        for _ in range(10 if number == 1 else 0):
+            self.clock.now += 1.0
+            self.network(train.query.transmitters)
+        return "turned"
+
+
+def test_a_revision_ends_with_the_time_and_leaves_the_model_as_it_was(train, links, caplog):
+    caplog.set_level("INFO")
+    clock, module = Clock(), make_module(links, Searched(links.scene))
+    module.model.clock = clock
+    trainer = train(clock, module)
+    assert trainer.global_step == 4, "one step more, which is validated"
+    assert clock.now <= 12
+    assert clock.validated[-1] == 4
+    lines = [record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"]
+    assert lines == ["step 0: turned", "step 3: the time is up within a revision, which is not made"]
+    assert (module.model.slope - module.model.before).abs().max() < 0.02, "of one step, not of 0.1"
+
+
 @pytest.mark.parametrize("at", [3, 4])
 def test_a_training_that_goes_on_has_the_time_that_was_spent(train, links, tmp_path, at):
     """Stopped between validations and at one, it sees what an uninterrupted one sees, whatever the clock shows now."""

@@ -58,7 +58,7 @@ def test_a_training_is_the_papers_at_rates_of_its_own(links, tmp_path):
     curves = read_curves(list(tmp_path.glob("a/log/*/metrics.csv")))
     assert curves["train/loss"][0].tolist() == list(range(1, 30, 2)), "every second step, counted from 0"
     assert curves["train/loss"][1].tolist() == pytest.approx(referee.losses[1::2])
-    terms = {name: curves[f"train/{name}"][1] for name in ("l1", "ssim", "gain")}
+    terms = {name.partition("/")[2]: curves[name][1] for name in ("train/l1", "train/ssim", "penalty/gain")}
     blend = 0.75 * terms["l1"] + 0.25 * terms["ssim"] + 0.5 * terms["gain"]
     assert blend.tolist() == pytest.approx(referee.losses[1::2])
     assert curves["validation/ssim"][0].tolist() == [4, 9, 14, 19, 24, 29]
@@ -103,7 +103,7 @@ def test_shares_weigh_the_loss_by_links_and_the_penalties_by_places(module, link
     for loss, gain in seen:
         assert loss == pytest.approx(1.75 * 3 + 0.5 * 0.5 * gain)
     curves = read_curves(list(tmp_path.glob("log/*/metrics.csv")))
-    logged = [curves[f"train/{name}"][1].item() for name in ("loss", "three", "gain")]
+    logged = [curves[name][1].item() for name in ("train/loss", "train/three", "penalty/gain")]
     assert logged == pytest.approx([seen[1][0], 1.75 * 3, 0.5 * seen[1][1]])
 
 

@@ -1,14 +1,19 @@
 """Known walls: planes from a floor plan or a mesh."""
 
 import itertools
+import logging
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.io.meshes import read_obj
+from gaigs.data.doubts import walls_doubt
+from gaigs.io.meshes import Face, read_obj, triangles
 from gaigs.io.tables import read_walls
+
+log = logging.getLogger(__name__)
 
 SHORTEST = 1e-3
 """Least length of a wall and of the edges of a face [m]."""
@@ -24,8 +29,9 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
     """
     if not file.is_file():
         raise FileNotFoundError(f"no walls at {file}; set placement.walls to a .csv or .obj, or to null")
-    if file.suffix == ".csv":
+    if file.suffix.lower() == ".csv":
         ends = read_walls(file)
+        points = ends.flatten(0, 1)
         along = ends[:, 1] - ends[:, 0]
         lengths = along.norm(dim=1)
         normals = torch.stack((along[:, 1], -along[:, 0], 0 * lengths), 1)
@@ -33,23 +39,24 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
         walls = _merged(normals[lengths > SHORTEST], ends[lengths > SHORTEST, 0], lengths[lengths > SHORTEST])
         # A room has floor and ceiling before a fifth wall.
         planes = torch.cat((walls[:4], level, walls[4:])) if len(walls) else walls
-    elif file.suffix == ".obj":
-        planes = _merged(*_faces(file))
+    elif file.suffix.lower() == ".obj":
+        vertices, groups = read_obj(file)
+        points = torch.from_numpy(vertices).float()
+        planes = _merged(*_faces(points, itertools.chain(*groups.values())))
     else:
         raise ValueError(f"placement.walls must be a .csv or .obj, got {file.name}")
     if not len(planes):
         raise ValueError(f"{file} must have a wall longer than {SHORTEST} m")
+    if doubt := walls_doubt(points, torch.stack((lower, upper))):
+        log.warning("placement.walls: %s", doubt)
     return planes
 
 
-def _faces(file: Path) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, " f"]]:
+def _faces(
+    vertices: Float[Tensor, "v 3"], faces: Iterable[Face]
+) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, " f"]]:
     """Normals, a point and area of each triangle of a mesh."""
-    vertices, groups = read_obj(file)
-    faces = itertools.chain(*groups.values())
-    triangles = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
-    if not triangles:
-        return torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0)
-    corners = torch.from_numpy(vertices).float()[torch.tensor(triangles)]
+    corners = vertices[torch.tensor(triangles(faces), dtype=torch.long).reshape(-1, 3)]
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = normals.norm(dim=1) / 2
     large = areas > SHORTEST**2

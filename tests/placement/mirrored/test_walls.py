@@ -1,6 +1,7 @@
 """Planes of known walls against the floor plans and cuboids of the files."""
 
 import math
+import re
 
 import pytest
 import torch
@@ -146,3 +147,11 @@ def test_training_moves_walls_unless_they_are_fixed(tmp_path, links, fixed):
     assert torch.equal(placement.normals, before[0]) == fixed
     assert torch.equal(placement.offsets, before[1]) == fixed
     assert not torch.equal(placement.plane_gains, before[2])
+
+
+def test_walls_in_millimetres_are_doubted(tmp_path, caplog):
+    read_planes(write(tmp_path, "plan.CSV", PLAN), LOWER, UPPER)
+    assert not caplog.messages
+    millimetres = PLAN.replace("4", "4000").replace("3", "3000")
+    read_planes(write(tmp_path, "plan.csv", millimetres), LOWER, UPPER)
+    assert re.search(r"placement.walls: the walls are \d.+ m across, transmitters and receivers .* m", caplog.text)
