@@ -253,9 +253,8 @@ def _read_points(table: Wide, axes: Axes, height: float, storey: float) -> Float
     """Coordinates of all rows; NaN where they are empty."""
     columns = [axes.x, axes.y, *([axes.z] if axes.z >= 0 else [])]
     own = table.numbers[:, columns]
-    bad = {
-        row + 2: table.cell(row, columns[int(np.isinf(own[row]).argmax())]) for row in np.isinf(own).any(1).nonzero()[0]
-    }
+    wrong = np.isinf(own)
+    bad = {row + 2: table.cell(row, columns[int(wrong[row].argmax())]) for row in wrong.any(1).nonzero()[0].tolist()}
     tables.refuse(table.file, bad, "a finite number")
     own = own * [_plain(table.names[column])[1] for column in columns]
     if axes.z < 0:

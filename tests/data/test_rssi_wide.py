@@ -60,7 +60,7 @@ def heard(links):
         table(("x_pos", "y_pos"), mark="-110", separator=";", point=","),
         table(before=("Stra\xdfe",), mark="100", separator=";").encode("latin-1"),
         table(("x [cm]", "y [cm]"), columns=100 * PLACES),
-        table(("easting", "northing"), columns=PLACES + [691000, 5334000]),
+        table(("easting", "northing"), columns=PLACES + np.array([691000, 5334000])),
     ],
 )
 def test_surveys_of_any_form_are_the_same_links(survey, text):
@@ -82,7 +82,7 @@ def test_degrees_become_metres_of_utm(survey):
     span = links.query.transmitters.amax(0) - links.query.transmitters.amin(0)
     torch.testing.assert_close(span[:2], torch.tensor([7.0, 4.0]), atol=0.3, rtol=0)
     with pytest.raises(ValueError, match="expected latitudes within 90 degrees in column lat"):
-        survey(table(("lon", "lat"), columns=columns + [0, 100]))
+        survey(table(("lon", "lat"), columns=columns + np.array([0, 100])))
 
 
 def test_uji_indoor_loc_is_read_as_it_is(survey):
@@ -91,9 +91,8 @@ def test_uji_indoor_loc_is_read_as_it_is(survey):
     for k, (x, y) in enumerate(PLACES):
         for shift in (0, 4):  # two phones
             own = -40 - k - shift
-            rows.append(
-                f"{own},{-90 if k % 3 else 100},100,{-7541.26 + x},{4864921.1 + y},{k % 2},1,106,2,{k},3,{1371713733 + k}"
-            )
+            place = f"{-7541.26 + x},{4864921.1 + y},{k % 2},1,106,2,{k},3,{1371713733 + k}"
+            rows.append(f"{own},{-60 - k if k % 3 else 100},100,{place}")
     links = survey("\n".join(rows))
     assert [receiver.name for receiver in links.receivers] == ["WAP001", "WAP002"]
     assert links.query.transmitters[:, 2].unique().tolist() == [1, 4]
