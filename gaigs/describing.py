@@ -225,8 +225,9 @@ def figure(links: Links) -> Figure:
         left.plot(*stands[:, :2].T.numpy(), "^", color=style.ORANGE, markeredgecolor="white", markersize=6, label=words)
         left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         drawn.legend(loc="outside lower left")
-        step = math.ceil((values.max() - values.min()).item() / 40) if links.task.is_noisy else 0
-        edges = np.arange(values.min().floor() - 0.5, values.max() + step, step) if step else 40  # levels are whole
+        low, high = math.floor(values.min().item()), values.max().item()
+        step = math.ceil((high - low) / 40) if links.task.is_noisy else 0
+        edges = np.arange(low - 0.5, high + step, step) if step else 40  # levels are whole numbers
         right.hist(values.numpy(), edges, color=style.BLUE)
         right.set(xlabel=with_unit(quantity, unit), ylabel="links")
         right.grid(axis="y")

@@ -131,12 +131,13 @@ def read(
     if not is_placed.any():
         raise ValueError(f"{table.file}: expected rows with coordinates, got none")
     everything = np.array([*points[is_placed], *placed.values()])
-    everything, frame, moved = _to_world(table, axes, everything, epsg)
+    everything, frame, moved = _to_world(table, axes, everything, int(is_placed.sum()), epsg, gateways)
     stands = dict(zip(placed, everything[is_placed.sum() :].tolist(), strict=True))
 
     levels = table.numbers[is_placed][:, columns.gateways]
     heard = ~(np.isnan(levels) | np.isin(levels, columns.marks))
-    places, which = tables.number_places(everything[: len(levels)].tolist())
+    places, numbers = tables.number_places(everything[: len(levels)].tolist())
+    which = numbers.numpy()
     counts, sums = np.zeros((2, len(places), len(columns.gateways)))
     np.add.at(counts, which, heard)
     np.add.at(sums, which, np.where(heard, levels, 0))
@@ -196,6 +197,8 @@ def _read_wide(file: Path, content: str) -> Wide:
     delimiter = next((mark for mark, found in counts.items() if len(found) == 1 and found != {1}), ",")
     names = tables.split_cells(lines[0], delimiter)
     for name in names:
+        if not name.isprintable():
+            raise ValueError(f"{file}, line 1: expected names of columns, got {tables.quote(name)}")
         if name and names.count(name) > 1:
             raise ValueError(
                 f"{file}, line 1: expected each column once, got {tables.quote(name)} {names.count(name)} times"
@@ -339,13 +342,13 @@ def _find_gateways(
 
 
 def _to_world(
-    table: Wide, axes: Axes, points: Float[ndarray, "n 3"], epsg: int | None
+    table: Wide, axes: Axes, points: Float[ndarray, "n 3"], count: int, epsg: int | None, gateways: str | Path | None
 ) -> tuple[Float[ndarray, "n 3"], Frame | None, str]:
-    """Points in the world frame [m], the place of this frame, and a remark."""
-    largest = np.abs(points).max(0)
+    """Places (the first ``count``) and gateways in the world frame [m], the place of this frame, and a remark."""
+    largest = np.abs(points[:count]).max(0)
     if epsg is None and axes.is_global and largest[0] <= 180:
         if largest[1] > 90:
-            row = int(np.abs(points[:, 1]).argmax())
+            row = int(np.abs(points[:count, 1]).argmax())
             raise ValueError(
                 f"{table.file}: expected latitudes within 90 degrees in column {table.names[axes.y]}, got "
                 f"{points[row, 1]:g}; if longitudes are there, set data.coordinates"
@@ -355,10 +358,13 @@ def _to_world(
     if epsg is not None:
         points[:, :2], utm = to_utm(points[:, :2], epsg)
     if epsg is not None or largest[:2].max() >= FAR:
-        origin = np.floor(points[:, :2].min(0))
+        origin = np.floor(points[:count, :2].min(0))
         points[:, :2] -= origin
         system = f"EPSG:{utm}" if utm else "the table's coordinates; data.epsg gives their system"
         remark = f"the world's origin is ({origin[0]:.0f}, {origin[1]:.0f}) in {system}"
-    if np.abs(points).max() >= FAR:
-        raise ValueError(f"{table.file}: expected places within 100 km, got {np.ptp(points, 0).max() / 1e3:.3g} km")
+    far = np.abs(points).max(1) >= FAR
+    if far.any():
+        file = table.file if far[:count].any() else gateways
+        found = ", ".join(f"{x:g}" for x in points[far][0])
+        raise ValueError(f"{file}: expected places within 100 km of each other, got one at ({found}) m")
     return points, Frame(utm, *origin.tolist()) if utm else None, remark
