@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from gaigs.configuration import compose
     from gaigs.data import Links
     from gaigs.data.links import links
+    from gaigs.describing import Description, describe
     from gaigs.geometry import Grid, Pose, Rays
     from gaigs.kriging.intervals import Estimate
     from gaigs.locating import Fingerprints, Location, fingerprints, locate
@@ -48,13 +49,14 @@ PLACES = {
     "Rays": "geometry", "Receiver": "antenna", "Array": "antenna", "Pose": "geometry", "Scene": "scene",
     "Metric": "task", "survey": "surveying", "SurveyPlan": "surveying", "Estimate": "kriging.intervals",
     "locate": "locating", "Location": "locating", "fingerprints": "locating", "Fingerprints": "locating",
+    "describe": "describing", "Description": "describing",
 }  # fmt: skip
 """The module of each public name, which is imported when the name is first used: torch is slow to import."""
 
 __all__ = [
-    "Array", "Estimate", "Fingerprints", "Grid", "Links", "Location", "Metric", "Model", "Pose", "Query", "Rays",
-    "Receiver", "Scene", "SurveyPlan", "__version__", "compose", "evaluate", "fingerprints", "links", "load", "locate",
-    "radio_map", "rasterize", "register", "registries", "run", "survey", "train",
+    "Array", "Description", "Estimate", "Fingerprints", "Grid", "Links", "Location", "Metric", "Model", "Pose", "Query",
+    "Rays", "Receiver", "Scene", "SurveyPlan", "__version__", "compose", "describe", "evaluate", "fingerprints",
+    "links", "load", "locate", "radio_map", "rasterize", "register", "registries", "run", "survey", "train",
 ]  # fmt: skip
 
 
@@ -135,12 +137,14 @@ def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | Non
                 with processes.only_run(folder):
                     benchmark.run(folder, overrides, **limits)
             log.info("results: %s", folder)
-        case "agreement" | "survey" | "locate" as command:
-            from gaigs import agreement, locating, surveying
+        case "agreement" | "describe" | "survey" | "locate" as command:
+            from gaigs import agreement, describing, locating, surveying
 
-            module = {"agreement": agreement, "survey": surveying, "locate": locating}[command]
+            modules = {"agreement": agreement, "describe": describing, "survey": surveying, "locate": locating}
+            module = modules[command]
             with processes.limited_threads(config["threads"]):
                 module.run(config, folder)
         case unknown:
-            raise ValueError(f"command must be train, benchmark, agreement, survey, locate or devices, got {unknown!r}")
+            known = "train, benchmark, agreement, describe, survey, locate or devices"
+            raise ValueError(f"command must be {known}, got {unknown!r}")
     return None

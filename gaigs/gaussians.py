@@ -29,7 +29,7 @@ class Gaussians(nn.Module):
         scene: Its receivers are the centres of the lattices.
         zone: Lowest and highest elevation of the lattice, in the receivers' frames [rad].
         channels: Signal channels of a Gaussian.
-        count: Initial number of Gaussians for all receivers together.
+        count: Initial number of Gaussians for all receivers together; it grows to one a receiver.
         near, far: Range of the initial distances to their receiver [m].
         spread: Initial standard deviation, as a fraction of the distance to the next Gaussian of the lattice.
         opacity: Initial opacity, in (0, 1).
@@ -64,8 +64,9 @@ class Gaussians(nn.Module):
     ):
         super().__init__()
         receivers = len(scene.receivers)
-        if count < receivers:
-            raise ValueError(f"gaussians.count must be at least one a receiver ({receivers}), got {count}")
+        if count < 1:
+            raise ValueError(f"gaussians.count must be at least 1, got {count}")
+        count = max(count, receivers)
         if not 0 < near <= far < FAR:
             raise ValueError(f"gaussians.near and far must satisfy 0 < near <= far < {FAR:g} m, got {near} and {far}")
         if not (0 < spread <= 1e6 and 0 < opacity < 1 and 0 <= signal <= 1e6 and degree >= 0):

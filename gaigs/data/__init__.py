@@ -1,7 +1,7 @@
 """Measured and simulated links, each from one transmitter position to one receiver, with their labels."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,7 +13,8 @@ from torch import Tensor
 
 from gaigs.antenna import Receiver
 from gaigs.data.doubts import doubts
-from gaigs.geometry import Frame
+from gaigs.data.gateways import estimate_place
+from gaigs.geometry import Frame, Pose
 from gaigs.io.images import GreyImages
 from gaigs.phases import unknown_phase
 from gaigs.query import Batch, Query
@@ -75,6 +76,10 @@ class Links:
             unknown.
         held_out: The same links at subcarriers that are held out, with the labels of the test; None if there are none.
         frame: Place of the world frame on a map; None if unknown.
+        uncertainties: Standard deviation of each receiver's place (r,) [m]: 0 if given, infinite until ``divide``
+            estimates it from the training links. None: all are given, and receivers without training links stay.
+        noises: Standard deviation of each label by the scatter of repeated readings, less the more of them it is the
+            mean of (n,), in the label's unit; None without repetitions.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
         remarks: Counts of links read and left out, with the reason.
         origin: Configurations of ``data`` and ``split``; empty for arrays in memory.
@@ -98,6 +103,8 @@ class Links:
     bandwidth: float | None = None
     held_out: "Links | None" = None
     frame: Frame | None = None
+    uncertainties: Float[Tensor, " r"] | None = None
+    noises: Float[Tensor, " n"] | None = None
     edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
     remarks: str = ""
     origin: Mapping = field(default_factory=dict)
@@ -158,6 +165,9 @@ def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
 def divide(links: Links, split: Mapping) -> Links:
     """Links with their split, by its configuration; remarks say what is doubtful, such as the phase of channels.
 
+    Of links with ``uncertainties``, receivers without a training link are left out, and those without a place get an
+    estimate of it from the training links.
+
     Raises:
         ValueError: An option of the split has a defect, or all spectra are constant.
     """
@@ -167,7 +177,10 @@ def divide(links: Links, split: Mapping) -> Links:
         bands = [task.frequencies / 1e9 for task in tasks]
         at = [f"at {band.min():.7g} .. {band.max():.7g} GHz" for band in bands]
         parts = replace(parts, name=f"{parts.name}, trained {at[0]}, tested {at[1]}")
-    links, remarks = replace(links, split=parts), [links.remarks]
+    links = replace(links, split=parts)
+    if links.uncertainties is not None:
+        links = with_places(only_trained(links))
+    remarks = [links.remarks]
     for doubt in doubts(links.task, links.labels, links.query.transmitters, links.receivers, links.edges):
         log.warning(doubt)
         remarks.append(doubt)
@@ -191,3 +204,58 @@ def _phase_remark(links: Links, task: Csi) -> str:
     remark = f"channels have no phase in common, as if each packet had its own; set data.phase={phase}"
     log.warning(remark)
     return remark
+
+
+def only_trained(links: Links) -> Links:
+    """Links to receivers that have training links: nothing is known of others. A remark names these."""
+    trained = links.query.receivers[links.split.train].unique()
+    if len(trained) == len(links.receivers):
+        return links
+    number = torch.full((len(links.receivers),), -1).index_copy(0, trained, torch.arange(len(trained)))
+    kept = (number[links.query.receivers] >= 0).nonzero()[:, 0]
+    some = lambda values: None if values is None else values[kept]
+    parts = {name: torch.isin(kept, part).nonzero()[:, 0] for name, part in links.split.parts().items()}
+    names = [receiver.name for receiver, new in zip(links.receivers, number, strict=True) if new < 0]
+    remark = f"receivers without a training link are left out, with {len(links) - len(kept)} links: {shortened(names)}"
+    return replace(
+        links,
+        query=replace(links.query[kept], receivers=number[links.query.receivers[kept]]),
+        receivers=tuple(links.receivers[old] for old in trained.tolist()),
+        labels=links.labels[kept],
+        rows=some(links.rows),
+        official=None,
+        split=Split(links.split.name, **parts, groups=some(links.split.groups)),
+        uncertainties=links.uncertainties[trained],
+        noises=some(links.noises),
+        remarks="; ".join(filter(None, (links.remarks, remark))),
+    )
+
+
+def with_places(links: Links) -> Links:
+    """Links whose receivers without a place have an estimate from the training links; remarks say how certain it is."""
+    if links.uncertainties.isfinite().all():
+        return links
+    receivers, deviations, named = [*links.receivers], links.uncertainties.clone(), []
+    train = links.split.train
+    for number in (~deviations.isfinite()).nonzero()[:, 0].tolist():
+        own, receiver = train[links.query.receivers[train] == number], receivers[number]
+        place, deviation = estimate_place(links.query.transmitters[own], links.labels[own])
+        receivers[number] = replace(receiver, pose=Pose(place, torch.eye(3)))
+        deviations[number] = deviation
+        named.append(f"{receiver.name} {deviation:.2g}")
+    remark = (
+        f"places of {len(named)} receivers are estimated from the training links, with a median standard deviation of "
+        f"{deviations[deviations > 0].median().item():.2g} m: {shortened(named)}"
+    )
+    return replace(
+        links,
+        receivers=tuple(receivers),
+        uncertainties=deviations,
+        remarks="; ".join(filter(None, (links.remarks, remark))),
+    )
+
+
+def shortened(names: Sequence[str], most: int = 10) -> str:
+    """Names joined by commas; of many the first, and the number of the others."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

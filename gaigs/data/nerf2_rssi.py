@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gaigs.data import Links, Parts
-from gaigs.data.readings import gateway, to_dbm
+from gaigs.data.readings import gateway, loud_remark, to_dbm
 from gaigs.io import tables
 from gaigs.io.yaml import read_mapping, to_position
 from gaigs.query import Query
@@ -63,6 +63,7 @@ def read(root: str | Path) -> Links:
     silent = [name for k, name in enumerate(names) if k not in present]
     if silent:
         remarks += f", and so are the gateways that heard nothing: {', '.join(silent)}"
+    remarks += loud_remark(dbm[heard].tolist())
     return Links(
         query=Query(torch.tensor(positions)[rows], receivers),
         receivers=tuple(gateway(names[k], gateways[names[k]]) for k in present.tolist()),

@@ -1,19 +1,23 @@
 """Readings of received signal strength: their bounds and receivers."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy import ndarray
 from torch import Tensor
 
 from gaigs.antenna import Receiver
 from gaigs.geometry import Pose
 from gaigs.io.tables import Rows, to_numbers
 
-LOUDEST = 0.0
-"""Upper bound of readings [dBm]. Bluetooth sends at most 20 dBm and loses 30 dB over 0.3 m, so 0 and above are another
-unit, a lost sign or another mark of "not heard"."""
+QUIETEST, LOUDEST = -150.0, 30.0
+"""Bounds of readings [dBm]: others are another unit, a lost sign or a mark of "not heard" such as 100."""
+
+MARKS, ROUND = (100.0, 127.0, -200.0, -999.0), (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)
+"""Usual marks of "not heard", out of these bounds and within."""
 
 
 def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiver:
@@ -23,6 +27,32 @@ def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiv
 
 def to_dbm(file: Path, rows: Rows, names: Sequence[str], lowest: float, not_heard: float) -> list[list[float]]:
     """Cells of a table as readings [dBm]; a ``ValueError`` where one is neither ``not_heard`` nor in range."""
-    holds = lambda value: value == not_heard or lowest <= value < LOUDEST
-    expected = f"an RSSI from {lowest:g} to below {LOUDEST:g} dBm ({not_heard:g} where nothing was heard)"
+    holds = lambda value: value == not_heard or lowest <= value <= LOUDEST
+    expected = f"an RSSI from {lowest:g} to {LOUDEST:g} dBm ({not_heard:g} where nothing was heard)"
     return to_numbers(file, rows, names, holds, expected)
+
+
+def marks_of(levels: Float[ndarray, " n"]) -> list[float]:
+    """Values among readings [dBm] that mean "not heard".
+
+    They are repeated or usual values out of bounds; the lowest value if it is usual and 5 dB below all others, or has
+    5 % of the readings and five times those of each value within 5 dB; and 0 if it is 10 dB above all others.
+    """
+    values, counts = np.unique(levels, return_counts=True)
+    outside = (values < QUIETEST) | (values > LOUDEST)
+    marks = values[outside & ((counts > 1) | np.isin(values, MARKS))].tolist()
+    values, counts = values[~outside], counts[~outside]
+    if len(values) < 2:
+        return marks
+    often, near = max(3, 0.05 * counts.sum()), counts[1:][values[1:] < values[0] + 5]
+    if (counts[0] >= often and counts[0] > 5 * near.max(initial=0)) or (values[0] in ROUND and not len(near)):
+        marks.append(float(values[0]))
+    if values[-1] == 0 and values[-2] < -10:
+        marks.append(0.0)
+    return marks
+
+
+def loud_remark(levels: Iterable[float]) -> str:
+    """The remark that counts levels of 0 dBm or more: many tables mean "not heard" by 0."""
+    count = sum(level >= 0 for level in levels)
+    return f"; {count} readings of 0 dBm or more are taken for levels" if count else ""

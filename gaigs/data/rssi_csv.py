@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from gaigs.data import Links
-from gaigs.data.readings import LOUDEST, gateway, to_dbm
+from gaigs.data.readings import gateway, loud_remark, to_dbm
 from gaigs.io import tables
 from gaigs.io.files import write_text
 from gaigs.query import Query
@@ -38,12 +38,11 @@ def read(
             any order and in any case; the remarks name other columns.
         layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; None for no walls.
         fixed: End that stands still, ``tx`` or ``rx``; None for the end with fewer places, the receiver in a tie.
-        not_heard: Value of readings that were not heard [dBm]; all others lie in [-200, 0).
+        not_heard: Value of readings that were not heard [dBm]; all others lie in [-200, 30].
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: An option is out of range, the fixed end has more than 64 places, or a file has a defect; the
-            message names file, line and value.
+        ValueError: An option is out of range, or a file has a defect; the message names file, line and value.
     """
     if fixed not in (None, *ENDS):
         raise ValueError(f"fixed must be tx or rx, or null for the end with fewer places, got {fixed!r}")
@@ -54,17 +53,9 @@ def read(
     walls = torch.zeros(0, 2, 3) if layout is None else tables.read_walls(Path(layout).expanduser())
 
     numbered = {end: tables.number_places(points[end]) for end in ENDS}
-    tx, rx = (len(numbered[end][0]) for end in ENDS)
-    fixed = fixed or ("rx" if rx <= tx else "tx")
+    fixed = fixed or ("rx" if len(numbered["rx"][0]) <= len(numbered["tx"][0]) else "tx")
     moving = "tx" if fixed == "rx" else "rx"
     places, at = numbered[fixed]
-    most = 64  # each fixed place is a separate receiver
-    if len(places) > most:
-        advice = "keep the readings of a few places of one end" if min(tx, rx) > most else f"set fixed={moving} or null"
-        raise ValueError(
-            f"{file}: the fixed end must stand at {most} places at most, got {tx} of the transmitter and {rx} of the "
-            f"receiver; {advice}"
-        )
     heard = torch.tensor([value != not_heard for value in dbm])
     present, receivers = at[heard].unique(return_inverse=True)
     transmitters = torch.tensor(points[moving])[heard]
@@ -75,8 +66,9 @@ def read(
     silent = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
     if silent:
         remarks += f", and so are the places that nothing was heard at: {', '.join(silent)}"
-    if below := sum(value < not_heard < LOUDEST for value in dbm):
+    if below := sum(value < not_heard <= 0 for value in dbm):
         remarks += f"; {below} readings below {not_heard:g} dBm are taken for levels"
+    remarks += loud_remark(value for value in dbm if value != not_heard)
     if ignored:
         remarks += f"; columns ignored: {', '.join(ignored)}"
     return Links(

@@ -1,5 +1,6 @@
 """Text files of data sets: lines, tables of numbers, points and index files. Errors name file, line and content."""
 
+import codecs
 import csv
 import math
 import os
@@ -55,14 +56,20 @@ def check_empty(folder: Path) -> None:
 
 
 def read_lines(file: Path, content: str) -> list[str]:
-    """Lines of a UTF-8 file without the blank ones at its end; a ``ValueError`` for an empty file."""
+    """Lines of a text file without the blank ones at its end; a ``ValueError`` for an empty file.
+
+    The text is UTF-8, UTF-16 with a byte order mark, or else of western Windows, which has the letters of Latin-1.
+    """
     if not os.path.isfile(file):  # reading a pipe would block
         state = "no file, but a folder, a device or a broken link" if has_file(file) else "missing"
         raise ValueError(f"{file}: {state}; expected {content}")
+    stored = file.read_bytes()
     try:
-        lines = file.read_text(encoding="utf-8-sig").rstrip().splitlines()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"cannot parse {file}: not UTF-8 at byte {error.start}; expected {content}") from None
+        text = stored.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        is_wide = stored.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = stored.decode("utf-16" if is_wide else "cp1252", errors="replace")
+    lines = text.rstrip().splitlines()
     if not lines:
         raise ValueError(f"{file}: empty; expected {content}")
     return lines
@@ -94,19 +101,22 @@ def read_walls(file: Path) -> Float[Tensor, "k 2 3"]:
     return torch.stack((corners[:-1], corners[1:]), 1)
 
 
-def split_cells(line: str) -> list[str]:
-    """Cells of a line with commas, without the blanks around them."""
+def split_cells(line: str, delimiter: str = ",") -> list[str]:
+    """Cells of a line, without the blanks around them."""
     try:
         # csv appends blanks behind a quoted cell to it.
-        (cells,) = csv.reader([re.sub(r"(?<=\")[ \t]+(?=,|$)", "", line)], skipinitialspace=True, strict=True)
+        line = re.sub(rf"(?<=\")[ \t]+(?={re.escape(delimiter)}|$)", "", line) if '"' in line else line
+        (cells,) = csv.reader([line], delimiter=delimiter, skipinitialspace=delimiter != "\t", strict=True)
     except csv.Error:  # a quote inside a cell or without its end, or a cell of 100,000 characters
         cells = []
     return [cell.strip() for cell in cells] or [line]
 
 
-def split_rows(file: Path, lines: Sequence[str], names: Sequence[str], skip: int) -> dict[int, list[str]]:
+def split_rows(
+    file: Path, lines: Sequence[str], names: Sequence[str], skip: int, delimiter: str = ","
+) -> dict[int, list[str]]:
     """Cells of all lines but the first few; a ``ValueError`` unless each line has one for each name."""
-    rows = {number: split_cells(line) for number, line in enumerate(lines[skip:], skip + 1)}
+    rows = {number: split_cells(line, delimiter) for number, line in enumerate(lines[skip:], skip + 1)}
     wrong = {n: f"{len(cells)}: {quote(lines[n - 1])}" for n, cells in rows.items() if len(cells) != len(names)}
     refuse(file, wrong, f"{len(names)} columns {quote(','.join(names))}")
     return rows

@@ -10,6 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from gaigs.io.files import atomic_write
 from gaigs.registry import registry
@@ -140,8 +141,8 @@ def _receivers_table(receivers: Mapping, name: str, metric: Metric) -> Table:
     table = Table("receiver", title=f"{escape(metric.title)} at each receiver")
     for model in next(iter(receivers.values())):
         table.add_column(escape(model), justify="right")
-    for receiver, models in receivers.items():
-        table.add_row(escape(receiver), *_cells(models, name, metric.higher_is_better).values())
+    for receiver, models in receivers.items():  # markup would make emojis of addresses such as 00:cd:11
+        table.add_row(Text(receiver), *_cells(models, name, metric.higher_is_better).values())
     return table
 
 

@@ -12,6 +12,7 @@ CHOICES = {
     "nerf2_spectrum": ("spectrum", "official"),
     "nerf2_rssi": ("rssi", "official_runs"),
     "rssi_csv": ("rssi", "random"),
+    "rssi_wide": ("rssi", "random"),
     "csi_npz": ("csi", "random"),
     "synthetic": ("spectrum", "official"),
     "synthetic_rssi": ("rssi", "official"),

@@ -8,7 +8,8 @@ import pytest
 import torch
 from damages import BYTES, TEXTS
 
-from gaigs.data import csi_npz, nerf2_rssi, nerf2_spectrum, rssi_csv
+from gaigs.data import csi_npz, nerf2_rssi, nerf2_spectrum, rssi_csv, rssi_wide
+from gaigs.data.readings import LOUDEST
 from gaigs.geometry import FAR
 from gaigs.testing import check_data
 
@@ -50,6 +51,11 @@ def files(request, tmp_path, reader):
             (tmp_path / "room.csv").write_text("\n".join(["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm,note", *rows]))
             (tmp_path / "walls.csv").write_text("x,y\n0,0\n4,0\n4,3.5\n")
             read, root = lambda: rssi_csv.read(tmp_path / "room.csv", tmp_path / "walls.csv"), tmp_path
+        case "rssi_wide":
+            rows = [f"{k}.25;{k % 3};-{50 + k},5;{-60 - k if k % 2 else 100};note {k}" for k in range(8)]
+            (tmp_path / "room.csv").write_text("\n".join(["x;y;door;hall;note", *rows]))
+            (tmp_path / "aps.csv").write_text("name,x,y,z\ndoor,0,0,2\nhall,4,1,2\n")
+            read, root = lambda: rssi_wide.read(tmp_path / "room.csv", str(tmp_path / "aps.csv")), tmp_path
         case "csi_npz":
             (tmp_path / "room.npz").write_bytes(channels())
             read, root = lambda: csi_npz.read(tmp_path / "room.npz"), tmp_path
@@ -87,7 +93,7 @@ def check_links(links):
     assert all(within(place, -FAR, FAR) for place in places)
     labels = links.labels[torch.arange(len(links))]
     if links.task.name == "rssi":
-        assert within(labels, rssi_csv.QUIETEST, 0)
+        assert within(labels, rssi_csv.QUIETEST, LOUDEST)
     if links.task.name == "csi":
         assert within(labels.abs().flatten(1).amax(1), *csi_npz.STRENGTHS)
     return labels
@@ -106,7 +112,7 @@ def outcome(read, file):
     return message
 
 
-@pytest.mark.parametrize("reader", ["nerf2_spectrum", "nerf2_rssi", "rssi_csv", "csi_npz"])
+@pytest.mark.parametrize("reader", ["nerf2_spectrum", "nerf2_rssi", "rssi_csv", "rssi_wide", "csi_npz"])
 def test_a_damaged_file_is_read_or_named(files, reader):
     read, paths = files
     whole = check_links(read())

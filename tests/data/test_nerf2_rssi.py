@@ -109,10 +109,10 @@ TX, RSSI, YML = "tx_pos.csv", "gateway_rssi.csv", "gateway_position.yml"
 TRAIN, TEST = "train_index.txt", "test_index.txt"
 
 DEFECTS = [
-    (RSSI, "-54,-65,-100", "nan,nan,nan", ", line 4: expected an RSSI from -100 to below 0 dBm (-100 where nothing was "
+    (RSSI, "-54,-65,-100", "nan,nan,nan", ", line 4: expected an RSSI from -100 to 30 dBm (-100 where nothing was "
      "heard), got 'nan' in column west"),
-    (RSSI, "-60", "0", ", line 7: expected an RSSI from -100 to below 0 dBm"),
-    (RSSI, "-60", "-100.5", ", line 7: expected an RSSI from -100 to below 0 dBm"),
+    (RSSI, "-60", "31", ", line 7: expected an RSSI from -100 to 30 dBm"),
+    (RSSI, "-60", "-100.5", ", line 7: expected an RSSI from -100 to 30 dBm"),
     (RSSI, "-52,-100,-80", "-52,-100", ", line 3: expected 3 columns 'west,east,attic', got 2: '-52,-100'"),
     (RSSI, None, ",west,east,attic\n0,-50,-60,-70\n", ", line 1: column '' has no position in gateway_position.yml"),
     (RSSI, "attic", "east", ", line 1: expected one column 'east', got 2"),

@@ -7,7 +7,9 @@ import pytest
 import torch
 from damages import replace
 
+import gaigs
 from gaigs.data import load, rssi_csv
+from gaigs.registry import registry
 from gaigs.testing import check_data
 
 RANDOM = {"name": "random", "test": 0.4, "validation": 0}
@@ -122,19 +124,27 @@ def test_walls_come_from_a_file_where_one_is_given(file, tmp_path):
     assert edges.tolist() == [[[0, 0, 0], [5, 0, 0]], [[5, 0, 0], [5, 4, 0]]]
 
 
-def test_both_ends_may_not_move(file):
-    row = "{0},1,1,{0},0,2,-40\n"
-    file.write_text(FORTH.splitlines()[0] + "\n" + "".join(map(row.format, range(64))) + "99,1,1,1,0,2,-40\n")
-    assert len(read(file).receivers) == 64
-    file.write_text(FORTH.splitlines()[0] + "\n" + "".join(map(row.format, range(65))) + "99,1,1,1,0,2,-40\n")
-    with pytest.raises(ValueError, match="64 places at most, got 66 of the transmitter and 65 of the receiver; keep"):
-        read(file)
+def test_levels_of_0_dbm_and_more_are_taken_and_counted(file):
+    replace(file, "-41", "0")
+    replace(file, "-42", "12.5")
+    links = read(file)
+    assert links.labels.tolist() == [-40, -50.25, 0, 12.5, -43, -53]
+    assert links.remarks.endswith("; 2 readings of 0 dBm or more are taken for levels")
+
+
+def test_seventy_gateways_are_more_than_the_usual_gaussians(file):
+    row = "{1},{0},1,{0},0,2,-{0}\n"
+    rows = "".join(row.format(30 + k, x) for k in range(70) for x in (1, 2, 3, 4))
+    file.write_text(f"{FORTH.splitlines()[0]}\n{rows}")
+    links = read(file, fixed="rx")
+    model = registry("model").build(gaigs.compose("+experiment=rssi")["model"], scene=links.scene)
+    assert len(model.gaussians) == len(links.receivers) == 70
 
 
 DEFECTS = [
     ("2.5,1,1,5,0,2,-41", "2.5,-1e5,1,5,5400000,2,-41", ", line 4: expected positions within 1e5 m of the origin on "
      "each axis (subtract a common origin from all), got '-1e5' in column tx_y"),
-    (",-41", ",nan", ", line 4: expected an RSSI from -200 to below 0 dBm (-100 where nothing was heard), got 'nan'"),
+    (",-41", ",nan", ", line 4: expected an RSSI from -200 to 30 dBm (-100 where nothing was heard), got 'nan'"),
     (",-41", ",-200.5", ", line 4: expected an RSSI from -200"),
     (",-41", ",-41,9", ", line 4: expected 7 columns 'tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm', got 8: '2.5"),
     ("rss_dbm", "rssi", ", line 1: expected one column rss_dbm, got 0 in 'tx_x,tx_y,tx_z,rx_x"),

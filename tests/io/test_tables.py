@@ -45,7 +45,7 @@ def test_a_cell_without_a_plain_number_is_refused(tmp_path, cell):
         ("1,2\n" + 14 * "nan,2\n", "line 2 and 13 other lines: expected a finite number, got 'nan' in column x"),
         ("1,2\n3,1e5\n-1e5,0\n", "line 2 and 1 other line: expected positions within 1e5 m of the origin on each axis"),
         ("1,\x1b[31m\u202e\n", "got '\\x1b[31m\\u202e' in column y"),
-        ("x,y\n1,2\nZürich,3\n".encode("latin-1"), "cannot parse FILE: not UTF-8 at byte 9; expected points"),
+        ("x,y\n1,2\nZürich,3\n".encode("latin-1"), ", line 3: expected a finite number, got 'Zürich' in column x"),
     ],
 )
 def test_a_defect_is_named_with_its_line(tmp_path, text, message):
@@ -55,6 +55,11 @@ def test_a_defect_is_named_with_its_line(tmp_path, text, message):
     assert message in str(caught.value).replace(str(file), "FILE" if "FILE" in message else "points.csv")
     assert len(str(caught.value)) < 400
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("coding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+def test_usual_encodings_are_read(tmp_path, coding):
+    assert read_lines(write(tmp_path, "Höhe,x\n1,2\n".encode(coding)), "points") == ["Höhe,x", "1,2"]
 
 
 @pytest.mark.parametrize("make", [lambda file: file.symlink_to("elsewhere"), os.mkfifo, lambda file: None])

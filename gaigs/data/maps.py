@@ -1,0 +1,43 @@
+"""Coordinates of maps in metres of UTM; other systems take pyproj."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+
+def is_utm(epsg: int) -> bool:
+    """True for the codes of UTM on WGS 84."""
+    return 1 <= epsg % 100 <= 60 and epsg // 100 in (326, 327)
+
+
+def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 2"], int]:
+    """Eastings and northings [m] in the UTM zone of the points' middle, and its EPSG code.
+
+    Points of UTM stay as they are. Degrees are longitude before latitude.
+
+    Raises:
+        ImportError: pyproj is needed and not installed.
+        ValueError: There is no such system, or a point is outside of it.
+
+    Example:
+        >>> from gaigs.data.maps import to_utm
+        >>> to_utm(np.array([[9.0, 48.0]]), 4326)[1]
+        32632
+    """
+    if is_utm(epsg):
+        return points, epsg
+    try:
+        from pyproj import Transformer
+        from pyproj.exceptions import ProjError
+    except ImportError:
+        raise ImportError("coordinates of maps need pyproj: pip install 'gaigs[maps]'") from None
+    try:
+        x, y = points.mean(0).tolist()
+        lon, lat = Transformer.from_crs(epsg, 4326, always_xy=True).transform(x, y, errcheck=True)
+        utm = (32700 if lat < 0 else 32600) + int((lon + 180) % 360 // 6) + 1
+        east, north = points.T
+        moved = Transformer.from_crs(epsg, utm, always_xy=True).transform(east, north, errcheck=True)
+    except ProjError as error:
+        cause = " ".join(str(error).split())
+        raise ValueError(f"data.epsg={epsg} does not suit the coordinates: {cause}") from None
+    return np.stack(moved, 1), utm

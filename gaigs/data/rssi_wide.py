@@ -1,0 +1,370 @@
+"""Received signal strength in a wide table, one place a row and one gateway a column; docs/data.md has examples."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from gaigs.data import Links, shortened
+from gaigs.data.maps import to_utm
+from gaigs.data.readings import LOUDEST, QUIETEST, gateway, loud_remark, marks_of
+from gaigs.geometry import FAR, Frame
+from gaigs.io import tables
+from gaigs.io.yaml import read_mapping, to_vector
+from gaigs.query import Query
+from gaigs.registry import register
+from gaigs.task.rssi import Rssi
+
+FORMS = ("{}", "{}pos", "pos{}", "{}coord", "coord{}", "position{}", "tx{}", "loc{}")
+PLAIN = {axis: {form.format(axis) for form in FORMS} for axis in "xyz"}
+PAIRS = (
+    (PLAIN["x"], PLAIN["y"]),
+    ({"easting", "east", "utmx", "utme", "utmeasting"}, {"northing", "north", "utmy", "utmn", "utmnorthing"}),
+    ({"longitude", "lon", "long", "lng"}, {"latitude", "lat"}),
+)
+"""Names of the columns of x and y, of easting and northing, of longitude and latitude, in small letters and digits."""
+
+HEIGHTS, FLOORS = PLAIN["z"] | {"alt", "altitude", "elevation", "height"}, {"floor", "storey", "floorid", "level"}
+NAMES = {"name", "gateway", "ap", "id", "mac", "bssid", "ssid", "station", "anchor", "beacon"}
+
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
+
+EMPTY = {"", "nan", "na", "n/a", "null", "none", "-inf", "-"}
+"""Cells that mean "not heard" in any table."""
+
+WEAK = -20.0
+"""Upper bound of the median of a gateway's column [dBm]; columns of larger numbers are something else."""
+
+
+class Wide(NamedTuple):
+    """A table in numbers: NaN for an empty cell, infinity for another text."""
+
+    file: Path
+    lines: list[str]
+    delimiter: str
+    names: list[str]
+    numbers: Float[ndarray, "rows columns"]
+
+    def cell(self, row: int, column: int) -> str:
+        """The text of a cell with its column, for messages."""
+        text = tables.split_cells(self.lines[row + 1], self.delimiter)[column]
+        return f"{tables.quote(text)} in column {self.names[column]}"
+
+    def column(self, name: str) -> int:
+        """The number of a column; a ``ValueError`` if there is none of that name."""
+        if name not in self.names:
+            raise ValueError(
+                f"{self.file}, line 1: expected a column {tables.quote(name)}, got {shortened(self.names)}"
+            )
+        return self.names.index(name)
+
+
+class Columns(NamedTuple):
+    """Columns of gateways, marks of "not heard", and names of gateways that heard nothing and of other columns."""
+
+    gateways: list[int]
+    marks: list[float]
+    silent: list[str]
+    ignored: list[str]
+
+
+class Axes(NamedTuple):
+    """Columns of x, of y and of the height or the floor; a column of -1 is not there."""
+
+    x: int
+    y: int
+    z: int
+    is_floor: bool
+    is_global: bool
+
+
+@register("data", "rssi_wide")
+def read(
+    file: str | Path,
+    gateways: str | Path | None = None,
+    coordinates: list[str] | None = None,
+    ignore: list[str] | None = None,
+    not_heard: float | list[float] | None = None,
+    height: float = 1.0,
+    storey: float = 3.0,
+    epsg: int | None = None,
+) -> Links:
+    """A data set from a wide table: one link for each gateway that a place hears.
+
+    Columns are separated by commas, semicolons, tabs or bars, numbers have a decimal point or comma. Coordinates are
+    found by the names ``x``, ``y``, ``z``, ``easting``, ``northing``, ``longitude``, ``latitude``, ``altitude`` and the
+    like, with a unit as in ``x [cm]``. Gateways are the columns of ``gateways``, and all others that mostly hold levels
+    with a median of at most -20 dBm. Rows of one place are averaged in dB. Gateways look along the world's axes.
+
+    Args:
+        file: The table. Levels lie in [-150, 30] dBm. Empty cells and NaN were not heard.
+        gateways: Table of ``name,x,y,z``, or YAML of ``name: [x, y, z]``, in the coordinates of the places. Gateways
+            that it does not have, or all if it is None, get their place from the training links.
+        coordinates: Columns of x, y and optionally z or floor; longitude and easting come first. None: by their names.
+        ignore: Columns that are no gateways.
+        not_heard: Values that mean "not heard"; None: those that ``gaigs.data.readings.marks_of`` finds.
+        height: Height of all places without a column of it, and of floor 0 [m].
+        storey: Height of a storey [m], for a column ``floor``.
+        epsg: System of the coordinates, e.g. 32632 or 3857; None: WGS 84 for degrees, none for metres. Coordinates of
+            another system than UTM are converted to it, which takes ``gaigs[maps]``.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ImportError: Coordinates are to be converted, and pyproj is not installed.
+        ValueError: A file has a defect; the message names file, line, column and value.
+    """
+    table = _read_wide(tables.find_file(file, "a table of readings"), "a heading x,y,ap1,ap2,... and one place a line")
+    axes = _find_axes(table, coordinates)
+    points = _read_points(table, axes, height, storey)
+    placed: dict[str, list[float]] = {}
+    unused: list[str] = []
+    if gateways is not None:
+        placed, unused = _read_gateways(tables.find_file(gateways, "a table of gateways"), table, axes, height, storey)
+    columns = _find_gateways(table, axes, placed, ignore or [], not_heard)
+    is_placed = ~np.isnan(points).any(1)
+    if not is_placed.any():
+        raise ValueError(f"{table.file}: expected rows with coordinates, got none")
+    everything = np.array([*points[is_placed], *placed.values()])
+    everything, frame, moved = _to_world(table, axes, everything, int(is_placed.sum()), epsg, gateways)
+    stands = dict(zip(placed, everything[is_placed.sum() :].tolist(), strict=True))
+
+    levels = table.numbers[is_placed][:, columns.gateways]
+    heard = ~(np.isnan(levels) | np.isin(levels, columns.marks))
+    places, numbers = tables.number_places(everything[: len(levels)].tolist())
+    which = numbers.numpy()
+    counts, sums = np.zeros((2, len(places), len(columns.gateways)))
+    np.add.at(counts, which, heard)
+    np.add.at(sums, which, np.where(heard, levels, 0))
+    means = sums / counts.clip(1)
+    rows, receivers = counts.nonzero()
+    if not len(rows):
+        raise ValueError(f"{table.file}: expected a reading that was heard, got none; see data.not_heard")
+    present, receivers = np.unique(receivers, return_inverse=True)
+    names = [table.names[columns.gateways[k]] for k in present]
+    repeats, noises, scatter = int(heard.sum()) - len(rows), None, 0.0
+    if repeats:
+        scatter = math.sqrt(np.square(np.where(heard, levels - means[which], 0)).sum() / repeats)
+        noises = torch.from_numpy(scatter / np.sqrt(counts[counts > 0])).float()
+
+    silent = columns.silent + [table.names[k] for k in columns.gateways if table.names[k] not in names]
+    marks = " and ".join(f"{mark:g}" for mark in sorted(columns.marks))
+    unplaced = [name for name in names if name not in stands]
+    empty = len(places) - len(np.unique(rows))
+    remarks = [
+        f"{len(rows)} readings of {len(np.unique(rows))} places at {len(names)} gateways",
+        f"{int((~heard).sum())} cells were not heard: {marks or 'empty ones'}{marks and ', or empty'}",
+        repeats
+        and f"repeated readings of one place, of {len(levels)} rows, are averaged, and scatter by {scatter:.2g} dB",
+        empty and f"{empty} places hear nothing, and are left out",
+        silent and f"gateways that heard nothing are left out: {shortened(silent)}",
+        placed and unplaced and f"gateways without a place in {Path(gateways).name}: {shortened(unplaced)}",
+        unused and f"gateways of {Path(gateways).name} without a column: {shortened(unused)}",
+        not is_placed.all() and f"{int((~is_placed).sum())} rows without coordinates are left out",
+        axes.z < 0 and f"all places are {height:g} m high (data.height)",
+        axes.is_floor and f"heights are those of floors, {storey:g} m each (data.storey)",
+        moved,
+        columns.ignored and f"columns ignored: {shortened(columns.ignored)}",
+    ]
+    labels = torch.from_numpy(means[counts > 0]).float()
+    return Links(
+        query=Query(torch.tensor(places)[rows], torch.from_numpy(receivers)),
+        receivers=tuple(gateway(name, stands.get(name, [0.0, 0.0, 0.0])) for name in names),
+        labels=labels,
+        task=Rssi(),
+        rows=torch.from_numpy(rows),
+        frame=frame,
+        uncertainties=torch.tensor([0.0 if name in stands else math.inf for name in names]),
+        noises=noises,
+        remarks="; ".join(filter(None, remarks)) + loud_remark(labels.tolist()),
+    )
+
+
+def _plain(name: str) -> tuple[str, float]:
+    """The name of a column in small letters and digits without its unit, and the unit [m]."""
+    match = re.fullmatch(r"(.*?)[\s_]*[\[(]?\s*(mm|cm|km|m|ft|feet|deg|°)?\s*[\])]?", name.strip().lower())
+    return re.sub(r"[\W_]", "", match[1]), UNITS.get(match[2], 1.0)
+
+
+def _read_wide(file: Path, content: str) -> Wide:
+    lines = tables.read_lines(file, content)
+    counts = {mark: {len(tables.split_cells(line, mark)) for line in lines[:3]} for mark in ("\t", ";", "|", ",")}
+    delimiter = next((mark for mark, found in counts.items() if len(found) == 1 and found != {1}), ",")
+    names = tables.split_cells(lines[0], delimiter)
+    for name in names:
+        if not name.isprintable():
+            raise ValueError(f"{file}, line 1: expected names of columns, got {tables.quote(name)}")
+        if name and names.count(name) > 1:
+            raise ValueError(
+                f"{file}, line 1: expected each column once, got {tables.quote(name)} {names.count(name)} times"
+            )
+    has_commas = delimiter != ","
+    numbers: dict[str, float] = {}
+
+    def number(cell: str) -> float:
+        if cell not in numbers:
+            text = cell.replace("−", "-")
+            value = tables.to_number(text.replace(",", ".") if has_commas else text)
+            numbers[cell] = math.inf if math.isnan(value) and cell.lower() not in EMPTY else value
+        return numbers[cell]
+
+    rows, wrong = [], {}
+    for line, text in enumerate(lines[1:], 2):
+        cells = tables.split_cells(text, delimiter)
+        rows.append(np.array([number(cell) for cell in cells]))
+        if len(cells) != len(names):
+            wrong[line] = f"{len(cells)}: {tables.quote(text)}"
+    tables.refuse(file, wrong, f"{len(names)} columns {tables.quote(delimiter.join(names))}")
+    if not rows:
+        raise ValueError(f"{file}: no rows below the heading")
+    return Wide(file, lines, delimiter, names, np.stack(rows))
+
+
+def _find_axes(table: Wide, coordinates: Sequence[str] | None = None) -> Axes:
+    """The columns of coordinates, by the names given or by usual ones."""
+    plain = [_plain(name)[0] for name in table.names]
+    here = f"{table.file}, line 1"
+    if coordinates is not None:
+        if len(coordinates) not in (2, 3):
+            raise ValueError(f"data.coordinates must be the columns of x, y and optionally z, got {coordinates}")
+        x, y, z = [table.column(name) for name in coordinates] + [-1] * (3 - len(coordinates))
+        return Axes(x, y, z, plain[z] in FLOORS and z >= 0, plain[x] in PAIRS[2][0])
+    found = lambda names: [k for k, name in enumerate(plain) if name in names]
+    for pair in PAIRS:
+        x, y = map(found, pair)
+        heights = found(HEIGHTS) or found(FLOORS)
+        if not (x and y):
+            continue
+        for columns in (x, y, heights):
+            if len(columns) > 1:
+                doubled = ", ".join(table.names[k] for k in columns)
+                raise ValueError(f"{here}: several columns of one coordinate, {doubled}; choose by data.coordinates")
+        z = heights[0] if heights else -1
+        return Axes(x[0], y[0], z, z >= 0 and not found(HEIGHTS), pair is PAIRS[2])
+    raise ValueError(
+        f"{here}: expected columns x and y, easting and northing, or longitude and latitude, got "
+        f"{tables.quote(', '.join(table.names))}; name them by data.coordinates=[x,y]"
+    )
+
+
+def _read_points(table: Wide, axes: Axes, height: float, storey: float) -> Float[ndarray, "rows 3"]:
+    """Coordinates of all rows; NaN where they are empty."""
+    columns = [axes.x, axes.y, *([axes.z] if axes.z >= 0 else [])]
+    own = table.numbers[:, columns]
+    wrong = np.isinf(own)
+    bad = {row + 2: table.cell(row, columns[int(wrong[row].argmax())]) for row in wrong.any(1).nonzero()[0].tolist()}
+    tables.refuse(table.file, bad, "a finite number")
+    own = own * [_plain(table.names[column])[1] for column in columns]
+    if axes.z < 0:
+        own = np.column_stack((own, np.full(len(own), height)))
+    elif axes.is_floor:
+        own[:, 2] = height + storey * own[:, 2]
+    return own
+
+
+def _read_gateways(
+    file: Path, table: Wide, axes: Axes, height: float, storey: float
+) -> tuple[dict[str, list[float]], list[str]]:
+    """Coordinates of the gateways of a file by the names of the table's columns, and the file's other gateways."""
+    if file.suffix.lower() in (".yml", ".yaml"):
+        found = {}
+        for name, value in read_mapping(file, "each gateway's name: [x, y, z]").items():
+            count = 2 if isinstance(value, list) and len(value) == 2 else 3
+            found[name] = [*to_vector(f"{file}: {name}", value, "xyz"[:count]), height][:3]
+    else:
+        other = _read_wide(file, "a heading name,x,y,z and one gateway a line")
+        own = _find_axes(other)
+        if own.is_global != axes.is_global:
+            raise ValueError(f"{file}, line 1: expected the coordinates of {table.file.name}, got other ones")
+        plain = [_plain(name)[0] for name in other.names]
+        column = next((k for k, name in enumerate(plain) if name in NAMES), None)
+        if column is None:
+            raise ValueError(f"{file}, line 1: expected a column name, got {tables.quote(', '.join(other.names))}")
+        points = _read_points(other, own, height, storey)
+        missing = {row + 2: "none" for row in np.isnan(points).any(1).nonzero()[0].tolist()}
+        tables.refuse(file, missing, "coordinates of each gateway")
+        names = [tables.split_cells(line, other.delimiter)[column] for line in other.lines[1:]]
+        repeated = {row + 2: tables.quote(name) for row, name in enumerate(names) if name in names[:row]}
+        tables.refuse(file, repeated, "each gateway once")
+        found = dict(zip(names, points.tolist(), strict=True))
+    known = {name.casefold(): name for name in table.names} | {name: name for name in table.names}
+    matched = {name: known.get(name) or known.get(name.casefold()) for name in found}
+    if not any(matched.values()):
+        raise ValueError(f"{file}: none of its gateways is a column of {table.file.name}: {shortened([*found])}")
+    return {own: found[name] for name, own in matched.items() if own}, [
+        name for name, own in matched.items() if not own
+    ]
+
+
+def _find_gateways(
+    table: Wide, axes: Axes, placed: Mapping, ignore: Sequence[str], not_heard: float | list[float] | None
+) -> Columns:
+    """The columns of gateways, and the marks of "not heard" in them."""
+    reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
+    coordinate = HEIGHTS.union(*PAIRS[0], *PAIRS[1], *PAIRS[2])
+    free = [k for k in range(len(table.names)) if k not in reserved]
+    distinct = [np.unique(own[np.isfinite(own)]) for own in table.numbers.T]
+    weak = [((own >= QUIETEST) & (own <= WEAK)).sum() >= max(1, len(own) / 2) for own in distinct]
+    likely = [k for k in free if weak[k] or table.names[k] in placed]
+    likely = [k for k in likely if table.names[k] in placed or _plain(table.names[k])[0] not in coordinate]
+    pooled = table.numbers[:, likely]
+    if not_heard is None:
+        marks = marks_of(pooled[np.isfinite(pooled)])
+    else:
+        marks = [float(mark) for mark in (not_heard if isinstance(not_heard, list) else [not_heard])]
+    gateways, silent, ignored = [], [], []
+    for k in free:
+        own = table.numbers[:, k]
+        own = own[~(np.isnan(own) | np.isin(own, marks))]
+        within = (own >= QUIETEST) & (own <= LOUDEST)
+        if not len(own):
+            silent.append(table.names[k])
+        elif table.names[k] in placed or (k in likely and within.mean() >= 0.5 and np.median(own[within]) <= WEAK):
+            gateways.append(k)
+        else:
+            ignored.append(table.names[k])
+    if not gateways:
+        raise ValueError(
+            f"{table.file}: expected columns of levels [dBm], a gateway each, got none in "
+            f"{tables.quote(', '.join(table.names))}; write levels with their sign, or name gateways by data.gateways"
+        )
+    own = table.numbers[:, gateways]
+    wrong = ~(np.isnan(own) | np.isin(own, marks) | ((own >= QUIETEST) & (own <= LOUDEST)))
+    bad = {row + 2: table.cell(row, gateways[int(wrong[row].argmax())]) for row in wrong.any(1).nonzero()[0].tolist()}
+    marked = ", ".join(f"{mark:g}" for mark in marks) or "an empty cell"
+    tables.refuse(table.file, bad, f"a level from {QUIETEST:g} to {LOUDEST:g} dBm ({marked} where nothing was heard)")
+    return Columns(gateways, marks, silent, [name for name in ignored if name])
+
+
+def _to_world(
+    table: Wide, axes: Axes, points: Float[ndarray, "n 3"], count: int, epsg: int | None, gateways: str | Path | None
+) -> tuple[Float[ndarray, "n 3"], Frame | None, str]:
+    """Places (the first ``count``) and gateways in the world frame [m], the place of this frame, and a remark."""
+    largest = np.abs(points[:count]).max(0)
+    if epsg is None and axes.is_global and largest[0] <= 180:
+        if largest[1] > 90:
+            row = int(np.abs(points[:count, 1]).argmax())
+            raise ValueError(
+                f"{table.file}: expected latitudes within 90 degrees in column {table.names[axes.y]}, got "
+                f"{points[row, 1]:g}; if longitudes are there, set data.coordinates"
+            )
+        epsg = 4326
+    utm, remark = None, ""
+    if epsg is not None:
+        points[:, :2], utm = to_utm(points[:, :2], epsg)
+    if epsg is not None or largest[:2].max() >= FAR:
+        origin = np.floor(points[:count, :2].min(0))
+        points[:, :2] -= origin
+        system = f"EPSG:{utm}" if utm else "the table's coordinates; data.epsg gives their system"
+        remark = f"the world's origin is ({origin[0]:.0f}, {origin[1]:.0f}) in {system}"
+    far = np.abs(points).max(1) >= FAR
+    if far.any():
+        file = table.file if far[:count].any() else gateways
+        found = ", ".join(f"{x:g}" for x in points[far][0])
+        raise ValueError(f"{file}: expected places within 100 km of each other, got one at ({found}) m")
+    return points, Frame(utm, *origin.tolist()) if utm else None, remark
