@@ -39,15 +39,18 @@ def main() -> None:
             raise ValueError("--deepmimo writes the built-in room; DeepMIMO has a converter of its own for Sionna RT")
         if is_built_in:
             geometry = synthetic.wavefront_obj(synthetic.ROOM)
-        else:
+        elif options.get("scene") is None:
             geometry = wavefront_obj(sionna.ROOMS[options.get("room", "furnished")].meshes())
+        else:  # the user has the surfaces
+            geometry = None
         folder.mkdir(parents=True, exist_ok=True)
         writers = {"spectrum": nerf2_spectrum.write, "rssi": rssi_csv.write, "csi": csi_npz.write}
         if arguments.deepmimo:
             write_paths(folder, links, options.get("order", 2))
         else:
             writers[links.task.name](folder, links)
-        write_text(folder / "geometry.obj", geometry)
+        if geometry is not None:
+            write_text(folder / "geometry.obj", geometry)
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, OmegaConfBaseException) as error:
         parser.error(str(error))
     print(f"{folder}: {len(links.split.train)} training and {len(links.split.test)} test labels")

@@ -26,7 +26,6 @@ from gaigs.query import Query, check_carrier
 from gaigs.registry import register
 from gaigs.task import Task
 from gaigs.task.csi import Csi
-from gaigs.version import __version__
 
 UPRIGHT = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """Rotation of the stations' arrays: rows run upwards, columns along y, and the normal along x, as DeepMIMO's panels."""
@@ -107,7 +106,7 @@ def read(
     if subcarriers < 1:
         raise ValueError(f"subcarriers must be at least 1, got {subcarriers}")
     frequency, stations, remarks = read_stations(root, with_angles=math.prod(elements) > 1)
-    array = Array.planar(*elements, speed_of_light / frequency / 2)
+    array = Array.planar(elements[0], elements[1], speed_of_light / frequency / 2)
     edge = bandwidth / 2 if subcarriers > 1 else 0.0
     offsets = np.linspace(-edge, edge, subcarriers)
     task = Csi(len(array), torch.from_numpy(frequency + offsets), phase)
@@ -201,33 +200,40 @@ def read_stations(root: str | Path, with_angles: bool) -> tuple[float, list[Stat
         stations.append(station)
         direct.append((station.fields[is_direct], station.delays[is_direct]))
     if not any(station.fields.any() for station in stations):
-        raise ValueError(f"{root}: expected a path to a user, got none")
+        names = ", ".join(_find(root, f"power_{code}").name for code, _ in pairs)
+        raise ValueError(f"{root}: expected a path to a user in {names}, got none")
     remarks = []
     fields, delays = (np.concatenate(part) for part in zip(*direct, strict=True))
     if _lacks_carrier(fields, delays, frequency, tracer):
         turn = lambda station: np.exp(-2j * np.pi * frequency * station.delays)
         stations = [replace(station, fields=station.fields * turn(station)) for station in stations]
-        remarks.append("phases are without that of the delay, as Sionna RT's are, and got it")
+        remarks.append("phases lack the carrier's over the delay, as those of Sionna RT; it is added")
     return frequency, stations, remarks
 
 
 def _read_station(root: Path, code: str, name: str, with_angles: bool) -> tuple[StationPaths, np.ndarray]:
     """The paths of one base station and set of users, and True for those in line of sight (n, p)."""
     angles = ("aod_az", "aod_el") if with_angles else ()
-    arrays = {key: _load(root, key, code) for key in ("rx_pos", "tx_pos", "power", "phase", "delay", *angles, "inter")}
+    names = ("power", "rx_pos", "tx_pos", "phase", "delay", *angles, "inter")
+    files = {key: _find(root, f"{key}_{code}") for key in names}
+    arrays = {key: _load(file, key) for key, file in files.items()}
     shape = arrays["power"].shape
-    shapes = dict.fromkeys(arrays, shape) | {"rx_pos": (*shape[:1], 3), "tx_pos": (1, 3)}
-    arrays["tx_pos"] = arrays["tx_pos"].reshape(-1, 3) if arrays["tx_pos"].size == 3 else arrays["tx_pos"]
+    if len(shape) != 2:
+        raise ValueError(f"{files['power']}: expected the shape (users, paths), got {shape}")
     exists = ~np.isnan(arrays["power"]) & (arrays["power"] != -np.inf)
     for key, array in arrays.items():
-        if array.shape != shapes[key] or len(shapes[key]) != 2:
-            raise ValueError(f"{root / key}_{code}: expected the shape {shapes[key]} or (n, p), got {array.shape}")
+        is_position = key.endswith("_pos")
+        expected = ({"tx_pos": 1}.get(key, shape[0]), 3) if is_position else shape
+        if array.shape != expected:
+            raise ValueError(
+                f"{files[key]}: expected the shape {expected} to {files['power'].name} of {shape}, got {array.shape}"
+            )
         low, high, expected = RANGES[key]
-        wrong = np.argwhere(~((low <= array) & (array <= high)) & (exists if array.shape == shape else True))
+        wrong = np.argwhere(~((low <= array) & (array <= high)) & (is_position or exists))
         if len(wrong):
-            at = f"{root / key}_{code}, {key}{wrong[0].tolist()}"
-            raise ValueError(f"{at}: expected {expected}, got {array[tuple(wrong[0])]:.7g} ({len(wrong)} such values)")
-        arrays[key] = np.where(exists, array, 0) if array.shape == shape else array
+            at, got = f"{files[key]}: {key}{wrong[0].tolist()}", f"{array[tuple(wrong[0])]:.7g}"
+            raise ValueError(f"{at}: expected {expected}, got {got} ({len(wrong)} of {array.size})")
+        arrays[key] = array if is_position else np.where(exists, array, 0)
     departures = None
     if with_angles:
         azimuths, zeniths = np.deg2rad(arrays["aod_az"]), np.deg2rad(arrays["aod_el"])
@@ -238,12 +244,17 @@ def _read_station(root: Path, code: str, name: str, with_angles: bool) -> tuple[
     return station, exists & (arrays["inter"] == 0)
 
 
-def _load(root: Path, name: str, code: str) -> np.ndarray:
-    """A matrix as float64, from the first file that there is in DeepMIMO's own order."""
-    files = [root / f"{name}_{code}{suffix}" for suffix in (".mat", ".npz", ".npy")]
-    file = next(filter(has_file, files), None)
-    if file is None:
+def _find(root: Path, stem: str) -> Path:
+    """The file of a matrix, the first one in DeepMIMO's own order of formats."""
+    files = [root / f"{stem}{suffix}" for suffix in (".mat", ".npz", ".npy")]
+    found = next(filter(has_file, files), None)
+    if found is None:
         raise ValueError(f"{root}: expected {files[1].name}, got no such file")
+    return found
+
+
+def _load(file: Path, name: str) -> np.ndarray:
+    """A matrix as float64."""
     try:
         with file.open("rb") as stream, warnings.catch_warnings(action="ignore"):
             if file.suffix == ".mat":
@@ -253,7 +264,7 @@ def _load(root: Path, name: str, code: str) -> np.ndarray:
                 array = content if file.suffix == ".npy" else content[name]
             if array.dtype.kind not in "iuf":
                 raise ValueError(f"{array.dtype} for real numbers")
-            return array.astype(float)
+            return array.astype(float).reshape((1, 3) if name == "tx_pos" and array.size == 3 else array.shape)
     except Exception as error:  # damaged files make numpy and scipy raise exceptions of many types
         cause = " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(f"cannot parse {file}: {cause}; expected an array {name!r} of real numbers") from error
@@ -316,7 +327,7 @@ def write(
         "version": "4.0.5",
         "rt_params": {
             "raytracer_name": "gaigs",
-            "raytracer_version": __version__,
+            "raytracer_version": "",
             "frequency": float(frequency),
             "max_path_depth": depth,
             "max_reflections": depth,

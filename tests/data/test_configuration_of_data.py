@@ -13,6 +13,8 @@ CHOICES = {
     "nerf2_rssi": ("rssi", "official_runs"),
     "rssi_csv": ("rssi", "random"),
     "csi_npz": ("csi", "random"),
+    "deepmimo": ("csi", "random"),
+    "deepmimo_rssi": ("rssi", "random"),
     "synthetic": ("spectrum", "official"),
     "synthetic_rssi": ("rssi", "official"),
     "synthetic_csi": ("csi", "official"),
