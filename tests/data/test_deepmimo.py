@@ -104,7 +104,7 @@ def write_scenario(folder, seed=0):
     station = np.array([0.0, 0.0, 2.5])
     images = np.stack((users, users * (1, 1, -1)), 1)
     lengths = np.linalg.norm(images - station, axis=-1)
-    gains = [1, -0.5] * speed_of_light / (4 * np.pi * CARRIER * lengths)
+    gains = np.array([1, -0.5]) * speed_of_light / (4 * np.pi * CARRIER * lengths)
     share = station[2] / (station[2] + users[:, 2:])
     points = np.full((12, 2, 1, 3), NAN)
     points[:, 1, 0] = station + share * (images[:, 1] - station)

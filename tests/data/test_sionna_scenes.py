@@ -34,16 +34,15 @@ def scene(tracer, tmp_path):
 
 
 def test_transmitters_stand_in_the_free_space_alone(scene):
-    links = sionna_rssi.traced_room_rssi(
-        scene=scene, receivers=[[0.3, 0.3, 2.5], [4.7, 3.7, 1.0]], transmitters=40, heights=[0.5, 1.5]
-    )
-    places = links.query.transmitters
+    receivers = [[0.3, 0.3, 2.5], [4.7, 3.7, 1.0]]
+    room = sionna.find_room("", scene, "receivers", receivers, None, [0.5, 1.5])
+    places = room.place(40, 0)
     low, high = places.new_tensor([0.1, 0.1, 0.5]), places.new_tensor([4.9, 3.9, 1.5])
     assert ((places >= low) & (places <= high)).all()
     near = (places > places.new_tensor([0.9, 0.9, 0])) & (places < places.new_tensor([2.6, 2.7, 1.9]))
     assert not near.all(1).any()
-    assert len(links.receivers) == 2
-    assert len(links.edges) == 24
+    assert [receiver.pose.position.tolist() for receiver in room.gateways] == torch.tensor(receivers).tolist()
+    assert len(room.edges) == 24
 
 
 def test_paths_are_those_over_a_plate_of_metal(tracer, tmp_path):
