@@ -230,7 +230,7 @@ def test_the_page_on_data_describes_each_component(kind):
 
 
 def test_the_documented_file_of_channels_is_read(tmp_path):
-    (code,) = [block for block in blocks(ROOT / "docs/data.md", "python") if "np.savez" in block]
+    (code,) = [block for block in blocks(ROOT / "docs/data.md", "python") if 'np.savez("room.npz"' in block]
     check = """
 from gaigs.data import load
 links = load({"name": "csi_npz", "file": "room.npz"}, {"name": "random"})

@@ -13,6 +13,7 @@ import torch
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links
 from gaigs.data.bands import hold_out_band
+from gaigs.data.impulse_responses import from_sionna
 from gaigs.geometry import FAR, WITHIN, Pose
 from gaigs.io.files import atomic_write
 from gaigs.io.tables import find_file, number_places
@@ -29,6 +30,17 @@ ARRAYS = {
     "elements": ("real", ("e", 3)),
 }
 """Numbers and shape of each array: n links, k receivers, s subcarriers, e elements. ``elements`` may be missing."""
+
+RESPONSES = {
+    "tx": ("real", ("n", 3)),
+    "rx": ("real", ("k", 3)),
+    "frequencies": ("real", ("s",)),
+    "carrier": ("real", (1,)),
+    "a": ("complex", ("k", "e", "n", "m", "p", 1)),
+    "tau": ("real", ("k", "n", "p")),
+    "elements": ("real", ("e", 3)),
+}
+"""The same of files with impulse responses ``a`` and ``tau`` in place of ``h``."""
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 """Signature of HDF5 files, at the start or, from MATLAB, after 512 bytes."""
@@ -57,7 +69,8 @@ def read(
             subcarriers [Hz]; ``h`` (n, e, s), complex channels, linear amplitude, or real and imaginary part along a
             first or last axis of 2; optionally ``elements`` (e, 3), offsets of an array's elements from its receiver's
             position along the world's axes [m], by default 0. With (k, e, 3) each receiver has its own, and NaN for
-            those that it lacks, where ``h`` is 0. The remarks name other arrays.
+            those that it lacks, where ``h`` is 0. The remarks name other arrays. In place of ``h`` and ``rx_index`` the
+            file may have impulse responses, see ``gaigs.data.impulse_responses.from_sionna``.
         arrays: Names of these arrays in the file where they differ, such as ``{"h": "CSI"}``; two names are those of
             real and imaginary part.
         phase: Of ``gaigs.task.csi.Csi``.
@@ -70,9 +83,15 @@ def read(
     """
     file = find_file(file, "a file of channels")
     arrays = arrays or {}
-    if unknown := [suggest(name, ARRAYS) for name in arrays if name not in ARRAYS]:
-        raise ValueError(f"data.arrays has no array {listed(unknown)}; it has: {listed(ARRAYS)}")
+    known = ARRAYS | RESPONSES
+    if unknown := [suggest(name, known) for name in arrays if name not in known]:
+        raise ValueError(f"data.arrays has no array {listed(unknown)}; it has: {listed(known)}")
     loaded, ignored = _load(file, arrays)
+    if "a" in loaded:
+        try:
+            loaded = from_sionna(loaded, needs_delays=phase != "per_link_and_delay")
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from None
     _check_shapes(file, loaded)
     _check_values(file, loaded)
     _move_missing_elements_last(file, loaded)
@@ -138,7 +157,8 @@ def _load(file: Path, given: Mapping[str, str | list]) -> tuple[dict[str, np.nda
         opened, expected = _mat, "a .mat file as MATLAB writes it"
     try:
         with opened(file) as (members, get):
-            for name, (kind, sizes) in ARRAYS.items():
+            has = {*members, *given}
+            for name, (kind, sizes) in (RESPONSES if {"a", "tau"} <= has and "h" not in has else ARRAYS).items():
                 place, names = f"{name}: ", given.get(name, name)
                 names = [names] if isinstance(names, str) else [*names]
                 if name not in given and name not in members:
@@ -147,7 +167,7 @@ def _load(file: Path, given: Mapping[str, str | list]) -> tuple[dict[str, np.nda
                     if name == "rx_index" and arrays["rx"].shape[:1] == (1,):
                         arrays[name] = np.zeros(arrays["tx"].shape[:1], np.int64)
                         continue
-                if len(names) > 1 and (name, len(names)) != ("h", 2):
+                if len(names) > 1 and not (name in ("h", "a") and len(names) == 2):
                     raise ValueError(f"data.arrays has {len(names)} names")
                 if missing := [own for own in names if members.count(own) != 1]:
                     shape = str(sizes).replace("'", "")
@@ -156,8 +176,8 @@ def _load(file: Path, given: Mapping[str, str | list]) -> tuple[dict[str, np.nda
                         f"{missing[0]!r} among {reprlib.repr(members)}; data.arrays takes other names"
                     )
                 parts, used = [get(own) for own in names], used + names
-                array = _join(parts, arrays["tx"].shape[0]) if name == "h" else parts[0]
-                if opened is not _npz:
+                array = _join(parts, arrays["tx"].shape[0]) if kind == "complex" else parts[0]
+                if opened is not _npz and name != "a":
                     array = _from_matlab(array, kind, len(sizes))
                 arrays[name] = array
     except ImportError:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -69,7 +69,7 @@ def simulate_spectra(
     grid = Grid.degrees()
     labels = [to_spectra(room.respond(places, receiver, f, offsets), grid, receiver.array, f) for f in carriers]
     rows = torch.arange(transmitters).repeat_interleave(len(carriers))
-    return Links(
+    links = Links(
         query=Query(places[rows], torch.zeros_like(rows), torch.tensor(carriers).float().repeat(transmitters)),
         receivers=(receiver,),
         labels=torch.stack(labels, 1).flatten(0, 1),
@@ -79,6 +79,7 @@ def simulate_spectra(
         bandwidth=bandwidth if spectrum == "band" else 0.0,
         edges=room.edges,
     )
+    return without_silent(links, transmitters, ~links.labels.isnan().flatten(1).any(1))
 
 
 def simulate_channels(
@@ -113,7 +114,7 @@ def simulate_channels(
         if phase == "per_link_and_delay":
             angles, labels = angles + 4 * math.pi / bandwidth * delays * offsets, 10 ** (0.3 * gains) * labels
         labels = labels * torch.polar(torch.ones_like(angles), angles)
-    return Links(
+    links = Links(
         query=Query(places, torch.zeros_like(rows), torch.full((transmitters,), float(frequency))),
         receivers=(receiver,),
         labels=labels.to(torch.complex64),
@@ -121,6 +122,24 @@ def simulate_channels(
         rows=rows,
         official=partial(last_fifth, transmitters, rows),
         edges=room.edges,
+    )
+    return without_silent(links, transmitters, links.labels.flatten(1).any(1))
+
+
+def without_silent(links: Links, transmitters: int, heard: Bool[Tensor, " n"]) -> Links:
+    """Links from places that a path leads to; the remarks count the others. A ``ValueError`` if there are too few."""
+    if heard.all():
+        return links
+    rows = links.rows[heard]
+    if len(rows.unique()) < 2:
+        raise ValueError(f"paths must lead to two of {transmitters} transmitters or more; move the receiver or heights")
+    return replace(
+        links,
+        query=links.query[heard],
+        labels=links.labels[heard],
+        rows=rows,
+        official=partial(last_fifth, transmitters, rows),
+        remarks=f"{int((~heard).sum())} links without a path are left out",
     )
 
 
@@ -190,10 +209,12 @@ def draw_places(
     if count < 2:
         raise ValueError(f"transmitters must be at least 2, one to train and one to test on, got {count}")
     generator = torch.Generator().manual_seed(seed)
-    places = torch.zeros(0, 3)
+    places, rounds = torch.zeros(0, 3), 0
     while len(places) < count:
         tries = lower + (upper - lower) * torch.rand(count, 3, generator=generator)
-        places = torch.cat((places, tries[is_free(tries)]))
+        places, rounds = torch.cat((places, tries[is_free(tries)])), rounds + 1
+        if rounds == 1000 and not len(places):
+            raise ValueError(f"transmitters must have free space to stand in, got none at {1000 * count} places tried")
     return places[:count]
 
 

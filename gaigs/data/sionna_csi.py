@@ -20,10 +20,16 @@ def traced_room_csi(
     phase: str = "known",
     band_train: Sequence[float] | None = None,
     band_test: Sequence[float] | None = None,
+    scene: str | None = None,
+    receiver: Sequence[float] | None = None,
+    facing: Sequence[float] | None = None,
+    heights: Sequence[float] | None = None,
 ) -> Links:
     """Channels of transmitters at random places in a room, at each element of its 4 x 4 array.
 
-    Rooms, places, array and errors are those of ``sionna``, channels and other options those of ``synthetic_csi``.
+    Rooms, scenes, places, array and errors are those of ``sionna``, channels and other options those of
+    ``synthetic_csi``.
     """
-    links = simulate_channels(find_room(room), transmitters, frequency, bandwidth, subcarriers, seed, phase)
+    simulated = find_room(room, scene, "receiver", None if receiver is None else [receiver], facing, heights)
+    links = simulate_channels(simulated, transmitters, frequency, bandwidth, subcarriers, seed, phase)
     return hold_out_band(links, band_train, band_test)

@@ -14,6 +14,8 @@ CHOICES = {
     "rssi_csv": ("rssi", "random"),
     "rssi_wide": ("rssi", "random"),
     "csi_npz": ("csi", "random"),
+    "deepmimo": ("csi", "random"),
+    "deepmimo_rssi": ("rssi", "random"),
     "synthetic": ("spectrum", "official"),
     "synthetic_rssi": ("rssi", "official"),
     "synthetic_csi": ("csi", "official"),

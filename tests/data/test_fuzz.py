@@ -8,7 +8,7 @@ import pytest
 import torch
 from damages import BYTES, TEXTS
 
-from gaigs.data import csi_npz, nerf2_rssi, nerf2_spectrum, rssi_csv, rssi_wide
+from gaigs.data import csi_npz, deepmimo, nerf2_rssi, nerf2_spectrum, rssi_csv, rssi_wide
 from gaigs.data.readings import LOUDEST
 from gaigs.geometry import FAR
 from gaigs.testing import check_data
@@ -17,7 +17,13 @@ COUNT = 100
 """Damages of each reader's files."""
 
 
-def channels(**changes):
+def saved(arrays):
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def channels():
     """Ten links of an array of three elements at four subcarriers."""
     draw = np.random.default_rng(0)
     arrays = {
@@ -28,9 +34,7 @@ def channels(**changes):
         "h": draw.normal(size=(10, 3, 4)) + 1j * draw.normal(size=(10, 3, 4)),
         "elements": np.array([[-0.06, 0, 0], [0, 0, 0], [0.06, 0, 0.01]]),
     }
-    stream = io.BytesIO()
-    np.savez(stream, **{name: array for name, array in (arrays | changes).items() if array is not None})
-    return stream.getvalue()
+    return saved(arrays)
 
 
 @pytest.fixture
@@ -59,14 +63,21 @@ def files(request, tmp_path, reader):
         case "csi_npz":
             (tmp_path / "room.npz").write_bytes(channels())
             read, root = lambda: csi_npz.read(tmp_path / "room.npz"), tmp_path
+        case "deepmimo":
+            draw, root = np.random.default_rng(0), tmp_path
+            points, gains = draw.uniform(1, 3, (10, 4, 1, 3)), draw.normal(size=(10, 4)) * 1e-3j
+            deepmimo.write(root, 3.5e9, draw.uniform(-3, 3, (10, 3)), [(np.array([0.0, 0.0, 2.5]), gains, points)])
+            for unread in (*root.glob("aoa*"), *root.glob("inter_pos*"), root / "objects.json", root / "vertices.npz"):
+                unread.unlink()
+            read = lambda: deepmimo.read(root, subcarriers=4)
     return read, sorted(file for file in root.rglob("*") if file.is_file())
 
 
 def change_array(content, draw):
     """Another value in one array, another type, another shape, or no such array."""
     with np.load(io.BytesIO(content)) as stored:
-        name = draw.choice(stored.files)
-        array = stored[name]
+        name, arrays = draw.choice(stored.files), dict(stored)
+    array = arrays.pop(name)
     value = draw.choice([np.nan, np.inf, -1, 0, 1e300, -1e300, 1e38, 1e-45, 1e20, 99999.9999, 2**63 - 1])
     dtype = draw.choice(["f2", "f4", "f8", "g", "c8", "G", "i1", "u8", "i8", "?", "U3", "S2", "M8[s]", "V8", "O"])
     match draw.randrange(4):
@@ -78,8 +89,8 @@ def change_array(content, draw):
                 array = (array.real if dtype[0] not in "cG" else array).astype("f8" if dtype[0] in "MV" else dtype)
             array = array[draw.randrange(2) :] if kind == 1 else array.reshape(-1)
         case 3:
-            return channels(**{name: None})
-    return channels(**{name: array})
+            return saved(arrays)
+    return saved(arrays | {name: array})
 
 
 def within(values, low, high):
@@ -112,7 +123,7 @@ def outcome(read, file):
     return message
 
 
-@pytest.mark.parametrize("reader", ["nerf2_spectrum", "nerf2_rssi", "rssi_csv", "rssi_wide", "csi_npz"])
+@pytest.mark.parametrize("reader", ["nerf2_spectrum", "nerf2_rssi", "rssi_csv", "rssi_wide", "csi_npz", "deepmimo"])
 def test_a_damaged_file_is_read_or_named(files, reader):
     read, paths = files
     whole = check_links(read())

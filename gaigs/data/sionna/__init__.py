@@ -1,7 +1,9 @@
 """Rooms of any shape, simulated by the independent ray tracer Sionna RT."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,9 +13,10 @@ from gaigs.data import Links
 from gaigs.data.readings import gateway
 from gaigs.data.simulation import PART, SimulatedRoom, draw_places, simulate_spectra
 from gaigs.data.sionna.cache import find_paths
-from gaigs.data.sionna.meshes import MeshRoom, edges
+from gaigs.data.sionna.meshes import MeshRoom, edges, facing
 from gaigs.data.sionna.rooms import ROOMS
-from gaigs.data.sionna.tracing import frequency_offsets, respond
+from gaigs.data.sionna.scenes import SceneFile, check_points
+from gaigs.data.sionna.tracing import frequency_offsets, respond, sample_paths
 from gaigs.registry import register
 
 HEIGHTS = 0.3, 2.0
@@ -28,6 +31,10 @@ def traced_room(
     frequency: float | Sequence[float] = 6.4896e9,
     bandwidth: float = 499.2e6,
     seed: int = 0,
+    scene: str | None = None,
+    receiver: Sequence[float] | None = None,
+    facing: Sequence[float] | None = None,
+    heights: Sequence[float] | None = None,
 ) -> Links:
     """Spectra of transmitters at random places in a room; the official split tests on the last fifth of them.
 
@@ -35,17 +42,38 @@ def traced_room(
 
     Args:
         room: ``l_shape``, ``slanted`` or ``furnished``.
+        scene: File of one's own surfaces, as ``sionna.rt.load_scene`` loads it (Mitsuba XML); None for the room.
+        receiver: Position of the array in the scene [m].
+        facing: Point in the scene that the array faces [m]; None for the middle of all surfaces.
+        heights: Lowest and highest z of transmitters in the scene [m]; None for 0.3 to 2 m above the lowest surface.
 
     Raises:
+        FileNotFoundError: There is no such scene.
         ImportError: Sionna RT is not installed.
         RuntimeError: There is no libLLVM that it can use.
-        ValueError: An option is out of range.
+        ValueError: An option is out of range, or the scene cannot be loaded.
     """
-    return simulate_spectra(find_room(room), spectrum, transmitters, frequency, bandwidth, seed)
+    simulated = find_room(room, scene, "receiver", None if receiver is None else [receiver], facing, heights)
+    return simulate_spectra(simulated, spectrum, transmitters, frequency, bandwidth, seed)
 
 
-def find_room(name: str) -> SimulatedRoom:
-    """The traced room of a name; a ``ValueError`` for an unknown one."""
+def find_room(
+    name: str,
+    scene: str | None = None,
+    option: str = "receivers",
+    receivers: Sequence[Sequence[float]] | None = None,
+    facing: Sequence[float] | None = None,
+    heights: Sequence[float] | None = None,
+) -> SimulatedRoom:
+    """The traced room of a name or scene file, and receivers in the scene by the option of a name.
+
+    Raises:
+        ValueError: The name is unknown, or the scene or an option of it has a defect.
+    """
+    if scene is not None:
+        return find_scene(scene, option, receivers, facing, heights)
+    if given := [key for key, value in ((option, receivers), ("facing", facing), ("heights", heights)) if value]:
+        raise ValueError(f"data.{given[0]} is an option of data.scene; rooms have their own")
     if name not in ROOMS:
         raise ValueError(f"room must be one of {', '.join(ROOMS)}, got {name!r}")
     room = ROOMS[name]
@@ -60,6 +88,35 @@ def find_room(name: str) -> SimulatedRoom:
         edges=edges(room.meshes()),
         place=lambda count, seed: place(room, count, seed),
         frequency_offsets=lambda bandwidth: frequency_offsets(room.meshes(), bandwidth),
+        respond=trace,
+    )
+
+
+def find_scene(
+    file: str,
+    option: str,
+    receivers: Sequence[Sequence[float]] | None,
+    target: Sequence[float] | None,
+    heights: Sequence[float] | None,
+) -> SimulatedRoom:
+    """The room of a scene file; options are those of ``find_room``."""
+    positions = check_points(f"data.{option}", receivers)
+    if heights is not None and not (len(heights) == 2 and heights[0] < heights[1]):
+        raise ValueError(f"data.heights must be the lowest and the highest z [m], got {[*heights]}")
+    room = SceneFile(Path(file).expanduser(), positions, None if heights is None else (heights[0], heights[1]))
+    space = room.space
+    middle = (space.lower + space.upper) / 2 if target is None else check_points("data.facing", [target])[0].tolist()
+
+    def trace(places: Tensor, receiver: Receiver, frequency: float, offsets: Tensor) -> Sequence[Tensor]:
+        paths = find_paths(room, receiver.pose.position, places, frequency)
+        return respond(paths, receiver, frequency, offsets).split(PART)
+
+    return SimulatedRoom(
+        pose=facing(positions[0].tolist(), [*middle]),
+        gateways=tuple(gateway(f"rx{k}", position) for k, position in enumerate(positions)),
+        edges=room.edges(),
+        place=room.place,
+        frequency_offsets=lambda bandwidth: sample_paths(bandwidth, float(np.linalg.norm(space.upper - space.lower))),
         respond=trace,
     )
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gaigs.data.sionna import tracing
 from gaigs.data.sionna.meshes import MeshRoom
+from gaigs.data.sionna.scenes import SceneFile
 from gaigs.data.synthetic.image_source import Paths
 
 log = logging.getLogger(__name__)
@@ -26,12 +27,19 @@ VERSION = 1
 
 
 def find_paths(
-    room: MeshRoom, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
+    room: MeshRoom | SceneFile, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
 ) -> Paths:
     """The paths in a room, traced by ``tracing.trace`` the first time and read by ``keep`` afterwards."""
+    surfaces: dict[str, object] = (
+        {"scene": room.digest}
+        if isinstance(room, SceneFile)
+        else {
+            "meshes": [(mesh.material, mesh.vertices, mesh.faces) for mesh in room.meshes()],
+            "thickness": tracing.THICKNESS,
+        }
+    )
     key = {
-        "meshes": [(mesh.material, mesh.vertices, mesh.faces) for mesh in room.meshes()],
-        "thickness": tracing.THICKNESS,
+        **surfaces,
         "receiver": receiver.tolist(),
         "transmitters": transmitters.tolist(),
         "frequency": float(frequency),
@@ -39,7 +47,10 @@ def find_paths(
     }
 
     def trace() -> dict[str, np.ndarray]:
-        paths = tracing.trace(room.meshes(), receiver, transmitters, frequency)
+        if isinstance(room, SceneFile):
+            paths = tracing.trace_scene(room.load(frequency), receiver, transmitters, frequency)
+        else:
+            paths = tracing.trace(room.meshes(), receiver, transmitters, frequency)
         return {"images": paths.images.numpy().astype(np.float32), "gains": paths.gains.numpy().astype(np.complex64)}
 
     arrays = keep(key, trace, f"tracing the paths of {len(transmitters)} transmitters")

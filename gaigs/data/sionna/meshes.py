@@ -128,11 +128,7 @@ class MeshRoom:
 
     def pose(self) -> Pose:
         """Pose of the receiver with the array: its normal points at the point that it faces."""
-        position, target, turn = self.antenna
-        normal = torch.tensor(target, dtype=torch.float64) - torch.tensor(position, dtype=torch.float64)
-        azimuth, depression = torch.atan2(normal[1], normal[0]), torch.atan2(-normal[2], normal[:2].norm())
-        angles = [azimuth.item(), math.pi / 2 + depression.item(), math.radians(turn)]
-        return Pose.from_xyzw(position, Rotation.from_euler("ZYZ", angles).as_quat())
+        return facing(*self.antenna)
 
     def is_free(self, points: Float[Tensor, "k 3"]) -> Bool[Tensor, " k"]:
         """True for points [m] inside, with the margins from walls and furniture."""
@@ -150,6 +146,14 @@ class MeshRoom:
         for cuboid in self.furniture:
             free &= ~cuboid.contains(points, FURNITURE_MARGIN)
         return free
+
+
+def facing(position: Sequence[float], target: Sequence[float], turn: float = 0.0) -> Pose:
+    """Pose at a position [m] whose normal points at a target [m], rotated about the normal [deg]."""
+    normal = torch.tensor(target, dtype=torch.float64) - torch.tensor(position, dtype=torch.float64)
+    azimuth, depression = torch.atan2(normal[1], normal[0]), torch.atan2(-normal[2], normal[:2].norm())
+    angles = [azimuth.item(), math.pi / 2 + depression.item(), math.radians(turn)]
+    return Pose.from_xyzw(position, Rotation.from_euler("ZYZ", angles).as_quat())
 
 
 def _compact(mesh: Mesh) -> Mesh:

@@ -89,7 +89,16 @@ def trace(
 
     Source: Sionna RT technical report, arXiv:2504.21719; materials as in ITU-R P.2040-3, table 3.
     """
-    scene = make_scene(meshes, frequency)
+    paths = trace_scene(make_scene(meshes, frequency), receiver, transmitters, frequency)
+    if deaf := [k for k, gains in enumerate(paths.gains) if not gains.any()]:
+        raise ValueError(f"a path must lead to each transmitter, got none to {transmitters[deaf[0]].tolist()}; move it")
+    return paths
+
+
+def trace_scene(
+    scene: Any, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
+) -> Paths:
+    """The same in a scene that is set up for a carrier [Hz]; without a path all gains are 0."""
     from sionna import rt
 
     scene.add(rt.Transmitter("receiver", receiver.tolist()))
@@ -102,8 +111,6 @@ def trace(
         paths = solver(scene, max_depth=DEPTH, samples_per_src=RAYS, max_num_paths_per_src=CANDIDATES, diffraction=True)
         found += _strongest(paths, receiver.double().numpy(), speed_of_light / frequency)
         scene.remove(names)
-    if deaf := [k for k, (_, gains) in enumerate(found) if not len(gains)]:
-        raise ValueError(f"a path must lead to each transmitter, got none to {transmitters[deaf[0]].tolist()}; move it")
     images = pad_sequence([torch.from_numpy(places) for places, _ in found], batch_first=True, padding_value=1e3)
     return Paths(images, pad_sequence([torch.from_numpy(gains) for _, gains in found], batch_first=True))
 
@@ -129,8 +136,7 @@ def make_scene(meshes: Sequence[Mesh], frequency: float) -> Any:
     import mitsuba
 
     scene = rt.load_scene()
-    scene.frequency = frequency
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    set_up(scene, frequency)
     objects, materials = [], {}
     for name in sorted({mesh.material for mesh in meshes}):
         permittivity, c, d = MATERIALS[name]  # Sionna's own table refuses frequencies below 1 GHz
@@ -148,6 +154,14 @@ def make_scene(meshes: Sequence[Mesh], frequency: float) -> Any:
         objects.append(rt.SceneObject(mi_mesh=shape, name=f"mesh {number}", radio_material=materials[mesh.material]))
     scene.edit(add=objects)
     return scene
+
+
+def set_up(scene: Any, frequency: float) -> None:
+    """Sets the carrier of a scene [Hz], and isotropic, vertically polarised antennas at both ends."""
+    from sionna import rt
+
+    scene.frequency = frequency
+    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
 
 
 def _strongest(paths: Any, receiver: np.ndarray, wavelength: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -196,4 +210,9 @@ def respond(
 def frequency_offsets(meshes: Sequence[Mesh], bandwidth: float) -> Float[Tensor, " f"]:
     """Frequencies that sample a band, as by ``sample_band``, for the longest path among meshes."""
     corners = torch.tensor([corner for mesh in meshes for corner in mesh.vertices], dtype=torch.float64)
-    return sample_band(bandwidth, (DEPTH + 1) * (corners.amax(0) - corners.amin(0)).norm().item())
+    return sample_paths(bandwidth, (corners.amax(0) - corners.amin(0)).norm().item())
+
+
+def sample_paths(bandwidth: float, diagonal: float) -> Float[Tensor, " f"]:
+    """The same for the longest path among surfaces within a box of a diagonal [m]."""
+    return sample_band(bandwidth, (DEPTH + 1) * diagonal)

@@ -159,6 +159,22 @@ def trace(
     return Paths(images, gains)
 
 
+def bounces(
+    room: Room, images: Float[Tensor, "b p 3"], receiver: Float[Tensor, "3"], order: int
+) -> Float[Tensor, "b p order 3"]:
+    """Points at which paths are reflected, from the receiver on, world frame [m]; NaN after the last one.
+
+    A straight line to an image crosses a plane of the lattice at each reflection; folded back, all are in the room.
+    """
+    start, size = receiver.to(images), images.new_tensor(room.size)
+    ray = images - start
+    planes = torch.arange(1 - order, order + 1).to(images)[:, None] * size
+    shares = ((planes - start) / ray[:, :, None]).flatten(2)
+    shares = torch.where((shares > 0) & (shares < 1), shares, torch.nan).sort(-1).values[..., :order]
+    points = (start + shares[..., None] * ray[:, :, None]) / size
+    return (points - 2 * (points / 2).round()).abs() * size
+
+
 def is_free(room: Room, points: Float[Tensor, "*batch 3"]) -> Tensor:
     """True for points inside the room and outside its furniture."""
     free = ((points > 0) & (points < points.new_tensor(room.size))).all(-1)

@@ -1,0 +1,102 @@
+"""Channels from impulse responses: the gains and delays of paths."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from gaigs.query import check_carrier
+
+PART = 256
+"""Links summed at a time, since the waves of all paths take many times the memory of their sums."""
+
+
+def to_channels(
+    gains: Complex[np.ndarray, "n e p"], delays: Float[np.ndarray, "n d p"], offsets: Float[np.ndarray, " s"]
+) -> Complex[np.ndarray, "n e s"]:
+    """Channels sum_p g_p exp(-j 2 pi f t_p), complex64, from gains at the carrier that include its phase.
+
+    Args:
+        gains: Baseband-equivalent gain of each path at each element; 0 for no path.
+        delays: Of each path, for all elements or for each [s].
+        offsets: Subcarriers relative to the carrier [Hz].
+
+    Example:
+        >>> from gaigs.data.impulse_responses import to_channels
+        >>> gains, delays = np.array([[[1.0, 0.5j]]]), np.array([[[0.0, 1e-7]]])  # a second path 30 m longer
+        >>> to_channels(gains, delays, np.array([0.0, 2.5e6])).round(3)
+        array([[[1. +0.5j, 1.5+0.j ]]], dtype=complex64)
+    """
+    found = np.zeros((*gains.shape[:2], len(offsets)), np.complex64)
+    for first in range(0, len(gains), PART):
+        part = slice(first, first + PART)
+        waves = np.exp(-2j * np.pi * delays[part, ..., None].astype(float) * offsets)
+        found[part] = (gains[part, :, None] @ waves)[:, :, 0]
+    return found
+
+
+def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> dict[str, np.ndarray]:
+    """Arrays of ``gaigs.data.csi_npz`` from impulse responses as ``sionna.rt.Paths.cir`` gives them.
+
+    The end with fewer places, the receivers in a tie, becomes the fixed one; a channel is the same both ways.
+
+    Args:
+        arrays: ``a`` (k, e, n, m, p, 1) and ``tau`` (k, n, p) or (k, e, n, m, p), of k receivers ``rx`` with e antennas
+            and n transmitters ``tx`` with m; ``carrier`` [Hz]; ``frequencies``, absolute or relative to it [Hz].
+        needs_delays: True if delays must count from the transmission.
+
+    Raises:
+        ValueError: Shapes do not fit, or a delay is none.
+    """
+    for name, array in arrays.items():
+        if name != "a" and array.dtype.kind not in "iuf":
+            raise ValueError(f"{name}: expected real numbers, got {array.dtype}")
+    if arrays["carrier"].size != 1:
+        raise ValueError(f"carrier: expected one number [Hz], got an array of {arrays['carrier'].shape}")
+    a, tau, tx, rx, subcarriers = (arrays[name] for name in ("a", "tau", "tx", "rx", "frequencies"))
+    carrier = float(arrays["carrier"].item())
+    check_carrier("carrier", carrier)
+    if a.dtype.kind == "f" and a.ndim == 7 and len(a) == 2:
+        a = a[0] + 1j * a[1]
+    if a.dtype.kind != "c" or a.ndim != 6 or a.shape[5] != 1:
+        raise ValueError(
+            f"a: expected complex numbers of (rx, rx_ant, tx, tx_ant, paths, 1), got {a.dtype} of {a.shape}; save a, "
+            "tau = paths.cir(normalize_delays=False, out_type='numpy')"
+        )
+    a = a[..., 0]
+    tau = tau[:, None, :, None] if tau.ndim == 3 else tau
+    if tx.shape != (a.shape[2], 3) or rx.shape != (a.shape[0], 3) or tau.shape not in (a.shape, _shared(a.shape)):
+        expected = f"tx {(a.shape[2], 3)}, rx {(a.shape[0], 3)} and tau {a.shape} or without antennas"
+        raise ValueError(f"a of {a.shape}: expected {expected}, got {tx.shape}, {rx.shape} and {arrays['tau'].shape}")
+    exists = a != 0
+    delays = np.where(exists, tau, 0)
+    if not ((delays >= 0) & (delays < 1e-3)).all():
+        raise ValueError("tau: expected a delay of 0 to 1 ms in seconds where a is not 0")
+    if needs_delays and exists.any() and not np.where(exists, tau, np.inf).min(-1)[exists.any(-1)].any():
+        raise ValueError(
+            "tau: expected delays from the transmission on, got 0 for the first path of every link; save those of "
+            "paths.cir(normalize_delays=False), or set data.phase=per_link_and_delay"
+        )
+    if len(tx) < len(rx):
+        a, delays, tx, rx = a.transpose(2, 3, 0, 1, 4), delays.transpose(2, 3, 0, 1, 4), rx, tx
+    if a.shape[3] != 1:
+        raise ValueError(f"a: expected one antenna at each place of the moving end, got {a.shape[3]}")
+    # Links run over the transmitters, and over the receivers of each.
+    gains, delays = (
+        part[:, :, :, 0].transpose(2, 0, 1, 3).reshape(-1, *part[0, :, 0, 0].shape) for part in (a, delays)
+    )
+    is_relative = (np.abs(subcarriers) < carrier / 2).all()
+    frequencies = subcarriers + (carrier if is_relative else 0.0)
+    return {
+        "tx": tx.repeat(len(rx), 0),
+        "rx": rx,
+        "rx_index": np.tile(np.arange(len(rx)), len(tx)),
+        "frequencies": frequencies,
+        "h": to_channels(gains.astype(complex), delays, frequencies - carrier),
+        **{name: arrays[name] for name in ("elements",) if name in arrays},
+    }
+
+
+def _shared(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The shape of the delays of a synthetic array, which all antennas share."""
+    return (shape[0], 1, shape[2], 1, shape[4])
