@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from gaigs.configuration import compose
     from gaigs.data import Links
     from gaigs.data.links import links
+    from gaigs.exporting import export
     from gaigs.geometry import Grid, Pose, Rays
     from gaigs.kriging.intervals import Estimate
     from gaigs.locating import Fingerprints, Location, fingerprints, locate
@@ -48,13 +49,14 @@ PLACES = {
     "Rays": "geometry", "Receiver": "antenna", "Array": "antenna", "Pose": "geometry", "Scene": "scene",
     "Metric": "task", "survey": "surveying", "SurveyPlan": "surveying", "Estimate": "kriging.intervals",
     "locate": "locating", "Location": "locating", "fingerprints": "locating", "Fingerprints": "locating",
+    "export": "exporting",
 }  # fmt: skip
 """The module of each public name, which is imported when the name is first used: torch is slow to import."""
 
 __all__ = [
     "Array", "Estimate", "Fingerprints", "Grid", "Links", "Location", "Metric", "Model", "Pose", "Query", "Rays",
-    "Receiver", "Scene", "SurveyPlan", "__version__", "compose", "evaluate", "fingerprints", "links", "load", "locate",
-    "radio_map", "rasterize", "register", "registries", "run", "survey", "train",
+    "Receiver", "Scene", "SurveyPlan", "__version__", "compose", "evaluate", "export", "fingerprints", "links", "load",
+    "locate", "radio_map", "rasterize", "register", "registries", "run", "survey", "train",
 ]  # fmt: skip
 
 
@@ -126,12 +128,13 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
                 with processes.only_run(folder):
                     benchmark.run(folder, overrides, **limits)
             log.info("results: %s", folder)
-        case "agreement" | "survey" | "locate" as command:
-            from gaigs import agreement, locating, surveying
+        case "agreement" | "survey" | "locate" | "export" as command:
+            from gaigs import agreement, exporting, locating, surveying
 
-            module = {"agreement": agreement, "survey": surveying, "locate": locating}[command]
+            module = {"agreement": agreement, "survey": surveying, "locate": locating, "export": exporting}[command]
             with processes.limited_threads(config["threads"]):
                 module.run(config, folder)
         case unknown:
-            raise ValueError(f"command must be train, benchmark, agreement, survey, locate or devices, got {unknown!r}")
+            known = "train, benchmark, agreement, survey, locate, export or devices"
+            raise ValueError(f"command must be {known}, got {unknown!r}")
     return None
