@@ -29,8 +29,8 @@ from gaigs.registry.holders import plugin_packages
 log = logging.getLogger(__name__)
 
 HARMLESS = (
-    "command", "folder", "survey", "locate", "export", "save_every", "tensorboard", "threads", "trainer.enable_progress_bar",
-    "trainer.enable_model_summary",
+    "command", "folder", "survey", "locate", "export", "save_every", "tensorboard", "threads",
+    "trainer.enable_progress_bar", "trainer.enable_model_summary",
 )  # fmt: skip
 """Keys that change no result: a run may be resumed with other values."""
 
