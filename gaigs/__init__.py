@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gaigs.data import Links
     from gaigs.data.links import links
     from gaigs.describing import Description, describe
+    from gaigs.exporting import export
     from gaigs.geometry import Grid, Pose, Rays
     from gaigs.kriging.intervals import Estimate
     from gaigs.locating import Fingerprints, Location, fingerprints, locate
@@ -50,13 +51,15 @@ PLACES = {
     "Metric": "task", "survey": "surveying", "SurveyPlan": "surveying", "Estimate": "kriging.intervals",
     "locate": "locating", "Location": "locating", "fingerprints": "locating", "Fingerprints": "locating",
     "describe": "describing", "Description": "describing",
+    "export": "exporting",
 }  # fmt: skip
 """The module of each public name, which is imported when the name is first used: torch is slow to import."""
 
 __all__ = [
     "Array", "Description", "Estimate", "Fingerprints", "Grid", "Links", "Location", "Metric", "Model", "Pose", "Query",
-    "Rays", "Receiver", "Scene", "SurveyPlan", "__version__", "compose", "describe", "evaluate", "fingerprints",
-    "links", "load", "locate", "radio_map", "rasterize", "register", "registries", "run", "survey", "train",
+    "Rays", "Receiver", "Scene", "SurveyPlan", "__version__", "compose", "describe", "evaluate", "export",
+    "fingerprints", "links", "load", "locate", "radio_map", "rasterize", "register", "registries", "run", "survey",
+    "train",
 ]  # fmt: skip
 
 
@@ -137,14 +140,16 @@ def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | Non
                 with processes.only_run(folder):
                     benchmark.run(folder, overrides, **limits)
             log.info("results: %s", folder)
-        case "agreement" | "describe" | "survey" | "locate" as command:
-            from gaigs import agreement, describing, locating, surveying
+        case "agreement" | "describe" | "survey" | "locate" | "export" as command:
+            from gaigs import agreement, describing, exporting, locating, surveying
 
-            modules = {"agreement": agreement, "describe": describing, "survey": surveying, "locate": locating}
-            module = modules[command]
+            modules = {
+                "agreement": agreement, "describe": describing, "survey": surveying, "locate": locating,
+                "export": exporting,
+            }  # fmt: skip
             with processes.limited_threads(config["threads"]):
-                module.run(config, folder)
+                modules[command].run(config, folder)
         case unknown:
-            known = "train, benchmark, agreement, describe, survey, locate or devices"
+            known = "train, benchmark, agreement, describe, survey, locate, export or devices"
             raise ValueError(f"command must be {known}, got {unknown!r}")
     return None

@@ -220,8 +220,12 @@ class MirroredSplatting(GaussianSplatting):
         training transmitters' box.
         """
         super().export(folder)
-        places = export.all_over(self.scene) if self.places is None else self.places
-        export.export(self.placement, places, folder)
+        export.export(self.placement, self.surveyed, folder)
+
+    @property
+    def surveyed(self) -> Query:
+        """Links whose paths show where planes end."""
+        return export.all_over(self.scene) if self.places is None else self.places
 
     def learnt_room(self, links: Links) -> LearntRoom:
         """Planes, obstacles and paths for figures."""

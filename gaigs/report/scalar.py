@@ -43,22 +43,13 @@ class ScalarFigures(TaskFigures):
         readings = np.column_stack((transmitters[:, :2], labels))
         measured = {name: readings[receiver == index] for index, name in enumerate(gateways)}
         radio_map, edges = RadioMap.load(folder / "radio_map.npz"), links.edges.numpy()
-        paged = {
-            "predicted_against_measured": predicted_against_measured(labels, predictions, receiver, [*gateways], task),
-            "radio_map": radio_maps(radio_map, gateways, measured, edges, task),
-        }
-        if radio_map.deviations is not None:
-            unit = {"quantity": "standard deviation", "unit": task.error_unit}
-            deviations = replace(radio_map, values=radio_map.deviations, **unit)
-            none = {name: rows[:0] for name, rows in measured.items()}
-            paged["deviation_map"] = radio_maps(deviations, gateways, none, edges, task)
+        maps = map_pages(radio_map, gateways, measured, edges, task)
+        pages = predicted_against_measured(labels, predictions, receiver, [*gateways], task)
         # The last hundredth would squeeze all others.
         furthest = float(max(np.quantile(error, 0.99) for error in errors.values())) or None
         title = with_unit("|error|", task.error_unit)
         figures = {"error_cdf": cdf(errors, title, "readings", links.split.name, (0, furthest))}
-        for name, pages in paged.items():
-            figures |= {f"{name}_{page}" if page > 1 else name: figure for page, figure in enumerate(pages, 1)}
-        return figures
+        return figures | _numbered("predicted_against_measured", pages) | maps
 
     def of_systems(self, task: type[Scalar], files: Mapping[str, Path], split: str) -> dict[str, Figure]:
         errors = {name: abs(values) for name, values in scores_of_systems(files, "error").items()}
@@ -124,6 +115,27 @@ def predicted_against_measured(
                 bar.minorticks_off()
             figures.append(figure)
     return figures
+
+
+def _numbered(name: str, pages: Sequence[Figure]) -> dict[str, Figure]:
+    return {f"{name}_{page}" if page > 1 else name: figure for page, figure in enumerate(pages, 1)}
+
+
+def map_pages(
+    radio_map: RadioMap,
+    gateways: Mapping[str, Float[ndarray, "3"]],
+    readings: Mapping[str, Float[ndarray, "k 3"]],
+    edges: Float[ndarray, "s 2 3"],
+    task: Scalar,
+) -> dict[str, Figure]:
+    """Pages of ``radio_map`` and, if there are deviations, of ``deviation_map``, by name; see ``radio_maps``."""
+    pages = _numbered("radio_map", radio_maps(radio_map, gateways, readings, edges, task))
+    if radio_map.deviations is not None:
+        unit = {"quantity": "standard deviation", "unit": task.error_unit}
+        deviations = replace(radio_map, values=radio_map.deviations, **unit)
+        none = {name: rows[:0] for name, rows in readings.items()}
+        pages |= _numbered("deviation_map", radio_maps(deviations, gateways, none, edges, task))
+    return pages
 
 
 def radio_maps(

@@ -48,7 +48,7 @@ def find_paths(
 
     def trace() -> dict[str, np.ndarray]:
         if isinstance(room, SceneFile):
-            paths = tracing.trace_scene(room.load(frequency), receiver, transmitters, frequency)
+            paths = tracing.trace_scene(room.load(frequency), receiver, transmitters)
         else:
             paths = tracing.trace(room.meshes(), receiver, transmitters, frequency)
         return {"images": paths.images.numpy().astype(np.float32), "gains": paths.gains.numpy().astype(np.complex64)}

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from glob import glob
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from torch.nn.utils.rnn import pad_sequence
 from gaigs.antenna import Receiver
 from gaigs.data.simulation import sample_band
 from gaigs.data.sionna.meshes import THICKNESS, Mesh
-from gaigs.data.synthetic.image_source import MATERIALS, Paths
+from gaigs.data.synthetic.image_source import MATERIALS, Paths, conductivity
 from gaigs.propagation import free_space
 
 DEPTH = 3
@@ -89,16 +90,16 @@ def trace(
 
     Source: Sionna RT technical report, arXiv:2504.21719; materials as in ITU-R P.2040-3, table 3.
     """
-    paths = trace_scene(make_scene(meshes, frequency), receiver, transmitters, frequency)
+    paths = trace_scene(make_scene(meshes, frequency), receiver, transmitters)
     if deaf := [k for k, gains in enumerate(paths.gains) if not gains.any()]:
         raise ValueError(f"a path must lead to each transmitter, got none to {transmitters[deaf[0]].tolist()}; move it")
     return paths
 
 
 def trace_scene(
-    scene: Any, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
+    scene: Any, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], depth: int = DEPTH
 ) -> Paths:
-    """The same in a scene that is set up for a carrier [Hz]; without a path all gains are 0."""
+    """As ``trace``, in a scene that is ``set_up``; without a path all gains are 0."""
     from sionna import rt
 
     scene.add(rt.Transmitter("receiver", receiver.tolist()))
@@ -108,9 +109,10 @@ def trace_scene(
         names = [f"transmitter {k}" for k in range(len(chunk))]
         for name, position in zip(names, chunk.tolist(), strict=True):
             scene.add(rt.Receiver(name, position))
-        paths = solver(scene, max_depth=DEPTH, samples_per_src=RAYS, max_num_paths_per_src=CANDIDATES, diffraction=True)
-        found += _strongest(paths, receiver.double().numpy(), speed_of_light / frequency)
+        paths = solver(scene, max_depth=depth, samples_per_src=RAYS, max_num_paths_per_src=CANDIDATES, diffraction=True)
+        found += _strongest(paths, receiver.double().numpy(), float(scene.wavelength[0]))
         scene.remove(names)
+    scene.remove("receiver")
     images = pad_sequence([torch.from_numpy(places) for places, _ in found], batch_first=True, padding_value=1e3)
     return Paths(images, pad_sequence([torch.from_numpy(gains) for _, gains in found], batch_first=True))
 
@@ -127,20 +129,26 @@ def find_sionna() -> Any:
     return rt
 
 
-def make_scene(meshes: Sequence[Mesh], frequency: float) -> Any:
-    """A scene of Sionna RT at a carrier [Hz], with isotropic, vertically polarised antennas; mesh k is ``mesh <k>``."""
+def open_scene(frequency: float, file: Path | None = None) -> Any:
+    """The scene of a Mitsuba file, or an empty one, ``set_up`` at a carrier [Hz]."""
     low, high = 0.3e9, 40e9  # below, furniture is no larger than the wavelength; above, materials are not tabulated
     if not low <= frequency <= high:
         raise ValueError(f"frequency must lie in {low:g}..{high:g} Hz, got {frequency:.6g}")
-    rt = find_sionna()
-    import mitsuba
-
-    scene = rt.load_scene()
+    scene = find_sionna().load_scene(file and str(file))
     set_up(scene, frequency)
+    return scene
+
+
+def make_scene(meshes: Sequence[Mesh], frequency: float) -> Any:
+    """The scene of some meshes, as by ``open_scene``; mesh k is ``mesh <k>``."""
+    scene = open_scene(frequency)
+    import mitsuba
+    from sionna import rt
+
     objects, materials = [], {}
     for name in sorted({mesh.material for mesh in meshes}):
-        permittivity, c, d = MATERIALS[name]  # Sionna's own table refuses frequencies below 1 GHz
-        materials[name] = rt.RadioMaterial(name, THICKNESS[name], permittivity, c * (frequency / 1e9) ** d)
+        # Sionna's own table refuses frequencies below 1 GHz.
+        materials[name] = rt.RadioMaterial(name, THICKNESS[name], MATERIALS[name][0], conductivity(name, frequency))
     for number, mesh in enumerate(meshes):
         triangles = mesh.triangles()
         properties = mitsuba.Properties()

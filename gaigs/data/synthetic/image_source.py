@@ -20,6 +20,9 @@ MATERIALS = {
     "wood": (1.99, 0.0047, 1.0718),
     "glass": (6.31, 0.0036, 1.3394),
     "ceiling_board": (1.48, 0.0011, 1.0750),
+    "chipboard": (2.58, 0.0217, 0.7800),
+    "plywood": (2.71, 0.33, 0.0),
+    "marble": (7.074, 0.0055, 0.9262),
     "metal": (1.0, 1e7, 0.0),
 }
 """Relative permittivity, and c and d of the conductivity c (f / GHz)^d [S/m]; ITU-R P.2040-3, table 3, 1 to 40 GHz."""
@@ -66,8 +69,13 @@ def permittivity(material: str, frequency: float) -> complex:
         raise ValueError(f"unknown material {material!r}; there are: {', '.join(MATERIALS)}")
     if not 1e9 <= frequency <= 40e9:
         raise ValueError(f"frequency must lie in 1e9..40e9 Hz, where materials are tabulated, got {frequency:.6g}")
-    real, c, d = MATERIALS[material]
-    return complex(real, -c * (frequency / 1e9) ** d / (2 * math.pi * epsilon_0 * frequency))
+    return complex(MATERIALS[material][0], -conductivity(material, frequency) / (2 * math.pi * epsilon_0 * frequency))
+
+
+def conductivity(material: str, frequency: float) -> float:
+    """Conductivity of a material [S/m] at a frequency [Hz]; extrapolated outside the tables."""
+    _, c, d = MATERIALS[material]
+    return c * (frequency / 1e9) ** d
 
 
 def cells(order: int) -> Int[Tensor, "p 3"]:

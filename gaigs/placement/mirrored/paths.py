@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -294,6 +294,13 @@ class Mirrored(Placement):
         """Field of each kept path over free space, after reflections and obstacles; 0 for no path."""
         left = self.path_gains[self.kept] + self.receiver_gains[query.receivers, None]
         left = torch.complex(left.exp() * folded.exists, torch.zeros_like(left))
+        left = folded.reflected(left, self.responses(query))
+        if blocked and self.obstacles is not None and not self.is_bare:
+            left = left * (-self._depths(self.obstacles, folded, left)).exp()
+        return left
+
+    def responses(self, query: Query) -> Callable[[Bounces], Complex[Tensor, "b w"]]:
+        """The reflection coefficients of a query's bounces, with the gains of their planes."""
         normals = self.normals
         permittivities = torch.complex(1 + self.log_permittivities.exp(), -self.log_conductivities.exp())
 
@@ -307,10 +314,7 @@ class Mirrored(Placement):
             aside = (points - self.middles[planes]) * (-self.log_extents[planes]).exp()
             return polarised(normals[planes], te, tm) * (self.plane_gains[planes] - aside.square().sum(-1) / 2).exp()
 
-        left = folded.reflected(left, response)
-        if blocked and self.obstacles is not None and not self.is_bare:
-            left = left * (-self._depths(self.obstacles, folded, left)).exp()
-        return left
+        return response
 
     def _depths(self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]) -> Float[Tensor, "b n"]:
         """Optical depth of each path through the obstacles [Np]; 0 for no path and, of levels, for a ``FAINT`` one."""

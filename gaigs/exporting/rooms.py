@@ -1,0 +1,161 @@
+"""Learnt rooms for 3-D programs, as glTF and Wavefront OBJ, and for ray tracers, as scenes of Mitsuba."""
+
+import base64
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from gaigs.data.sionna.meshes import Mesh
+from gaigs.data.synthetic.image_source import MATERIALS, conductivity
+from gaigs.io.files import atomic_write, write_text
+from gaigs.model import Model
+from gaigs.model.ensemble import Ensemble
+from gaigs.model.kriging import Kriging
+from gaigs.model.mirrored import MirroredSplatting
+from gaigs.placement.learnt_room import LearntPlane
+from gaigs.placement.mirrored import export
+from gaigs.placement.mirrored.materials import Material, materials
+from gaigs.query import check_carrier
+
+COLOUR = 0.0, 0.45, 0.70, 0.35
+"""Red, green, blue and opacity of planes: the figures' blue, through which the room shows."""
+
+TABULATED = 1e9, 40e9
+"""Lowest and highest carrier [Hz] at which all of ``MATERIALS`` are tabulated."""
+
+
+def write_room(model: Model, file: Path, frequency: float | None = None) -> list[Path]:
+    """Writes the planes that a model has learnt, of an ensemble those of its first member; gives the files.
+
+    Args:
+        file: ``.gltf``, ``.glb``, ``.obj``, or a scene ``.xml`` of Mitsuba, whose meshes get a folder beside it.
+        frequency: Carrier of a scene's materials [Hz]; None: that of the training links, of several the middle one.
+
+    Raises:
+        ValueError: The model has no planes, or a scene's carrier is unknown or impossible.
+    """
+    own: Any = model.members[0] if isinstance(model, Ensemble) else model
+    own = own.trend if isinstance(own, Kriging) else own
+    if not isinstance(own, MirroredSplatting):
+        raise ValueError(f"a learnt room takes a model 'mirrored', got {type(own).__name__}; train it on the same data")
+    suffix, found = file.suffix.lower(), export.survey(own.placement, own.surveyed)
+    if suffix == ".obj":
+        write_text(file, export.wavefront_obj(own.placement, found))
+        return [file]
+    planes = export.outlines(own.placement, found)
+    if suffix != ".xml":
+        write_gltf(file, [*map(mesh_of, planes)], [{"share": plane.share} for plane in planes])
+        return [file]
+    known = own.scene.frequencies
+    if frequency is None and not len(known):
+        raise ValueError("materials depend on the carrier, which the data do not know; set frequency=... [Hz]")
+    frequency = float(known[len(known) // 2] if frequency is None else frequency)
+    check_carrier("frequency", frequency)
+    chosen = materials(own.placement, own.surveyed, frequency)
+    return write_scene(file, [*map(mesh_of, planes)], [chosen[plane.number] for plane in planes], frequency)
+
+
+def mesh_of(plane: LearntPlane) -> Mesh:
+    """A plane as a mesh of one face."""
+    corners = tuple(map(tuple, plane.corners.tolist()))
+    return Mesh(f"plane_{plane.number}", "", corners, (tuple(range(len(corners))),))
+
+
+def write_scene(file: Path, meshes: Sequence[Mesh], materials: Sequence[Material], frequency: float) -> list[Path]:
+    """Writes a scene of Mitsuba for Sionna RT, and a mesh ``.ply`` of each surface beside it; gives the files.
+
+    Materials are those of ITU-R P.2040 by name, which follow the carrier that is set in Sionna RT. For a carrier [Hz]
+    outside their tables they are the extrapolated numbers of this carrier.
+    """
+    scene = ElementTree.Element("scene", version="2.1.0")
+    scene.append(ElementTree.Comment(f" Learnt by gaigs; metres, z up; materials for {frequency:.7g} Hz. "))
+    names = {material: f"{material.name}-{1e3 * material.thickness:.4g}mm" for material in materials}
+    for material, name in names.items():
+        is_tabulated = TABULATED[0] <= frequency <= TABULATED[1]
+        surface = ElementTree.SubElement(scene, "bsdf", id=name)
+        surface.set("type", "itu-radio-material" if is_tabulated else "radio-material")
+        numbers = {"thickness": material.thickness}
+        if is_tabulated:
+            ElementTree.SubElement(surface, "string", name="type", value=material.name)
+        else:
+            numbers["relative_permittivity"] = MATERIALS[material.name][0]
+            numbers["conductivity"] = conductivity(material.name, frequency)
+        for key, number in numbers.items():
+            ElementTree.SubElement(surface, "float", name=key, value=f"{number:.6g}")
+    folder = file.with_name(f"{file.stem}_meshes")
+    folder.mkdir(exist_ok=True)
+    files = []
+    for mesh, material in zip(meshes, materials, strict=True):
+        files.append(folder / f"{mesh.name}.ply")
+        vertices = np.array([*mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"])
+        faces = np.array([(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))])
+        elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+        with atomic_write(files[-1]) as part:
+            PlyData(elements, byte_order="<").write(str(part))
+        shape = ElementTree.SubElement(scene, "shape", type="ply", id=f"mesh-{mesh.name}")
+        ElementTree.SubElement(shape, "string", name="filename", value=f"{folder.name}/{files[-1].name}")
+        ElementTree.SubElement(shape, "boolean", name="face_normals", value="true")
+        ElementTree.SubElement(shape, "ref", id=names[material], name="bsdf")
+    ElementTree.indent(scene)
+    write_text(file, ElementTree.tostring(scene, encoding="unicode") + "\n")
+    return [file, *files]
+
+
+def write_gltf(file: Path, meshes: Sequence[Mesh], extras: Sequence[Mapping[str, float]]) -> None:
+    """Writes meshes as glTF 2.0, ``.glb`` or, with its buffer within, ``.gltf``; a node each, with its extras.
+
+    The root's rotation turns z up into glTF's y up.
+    """
+    buffer, views, accessors = b"", [], []
+
+    def add(array: np.ndarray, kind: str, target: int) -> int:
+        nonlocal buffer
+        views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": array.nbytes, "target": target})
+        component = 5126 if array.dtype == np.float32 else 5125  # float and unsigned int, of OpenGL as the targets
+        accessors.append(
+            {"bufferView": len(views) - 1, "componentType": component, "count": len(array), "type": kind}
+            | ({"min": array.min(0).tolist(), "max": array.max(0).tolist()} if kind == "VEC3" else {})
+        )
+        buffer += array.tobytes()  # both types have 4 bytes, so that all parts stay aligned
+        return len(views) - 1
+
+    shapes = []
+    for mesh in meshes:
+        corners = add(np.array(mesh.vertices, np.float32), "VEC3", 34962)
+        faces = add(np.array(mesh.triangles(), np.uint32).ravel(), "SCALAR", 34963)
+        primitive = {"attributes": {"POSITION": corners}, "indices": faces, "material": 0}
+        shapes.append({"name": mesh.name, "primitives": [primitive]})
+    turned = {"name": "room", "children": [*range(1, len(meshes) + 1)], "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]}
+    nodes = [{"name": mesh.name, "mesh": k, "extras": extras[k]} for k, mesh in enumerate(meshes)]
+    look = {"baseColorFactor": COLOUR, "metallicFactor": 0}
+    content = {
+        "asset": {"version": "2.0", "generator": "gaigs"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [turned, *nodes],
+        "meshes": shapes,
+        "materials": [{"pbrMetallicRoughness": look, "alphaMode": "BLEND", "doubleSided": True}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(buffer)}],
+    }
+    if file.suffix.lower() == ".gltf":
+        content["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(buffer).decode()
+        write_text(file, json.dumps(content) + "\n")
+        return
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    with atomic_write(file) as part:
+        part.write_bytes(
+            struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(buffer))
+            + struct.pack("<I4s", len(text), b"JSON")
+            + text
+            + struct.pack("<I4s", len(buffer), b"BIN\0")
+            + buffer
+        )

@@ -1,0 +1,44 @@
+"""NetCDF files, classic format with 64-bit offsets, by SciPy."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy import ndarray
+from scipy.io import netcdf_file
+
+from gaigs.io.files import atomic_write
+
+
+class Variable(NamedTuple):
+    """Real numbers or texts with a name for each dimension, and the attributes of the CF conventions."""
+
+    dimensions: tuple[str, ...]
+    values: ndarray
+    attributes: Mapping[str, Any] = {}
+
+
+def write_netcdf(file: Path, variables: Mapping[str, Variable], attributes: Mapping[str, Any]) -> None:
+    """Writes variables by name. A variable with the name of its only dimension is a coordinate.
+
+    Texts become characters with a dimension of their own, which xarray joins.
+    """
+    with atomic_write(file) as part, netcdf_file(part, "w", version=2) as content:
+        _describe(content, {"Conventions": "CF-1.11", **attributes})
+        for name, (dimensions, values, own) in variables.items():
+            if values.dtype.kind == "U":
+                rows = [text.encode() for text in values.tolist()]
+                values = np.array(rows, f"S{max(map(len, rows), default=0) or 1}")[:, None].view("S1")
+                dimensions, own = (*dimensions, f"{name}_length"), {"_Encoding": "utf-8", **own}
+            for dimension, size in zip(dimensions, values.shape, strict=True):
+                if dimension not in content.dimensions:
+                    content.createDimension(dimension, size)
+            variable = content.createVariable(name, values.dtype, dimensions)
+            variable[...] = values
+            _describe(variable, own)
+
+
+def _describe(part: Any, attributes: Mapping[str, Any]) -> None:
+    for key, value in attributes.items():
+        setattr(part, key, value.encode() if isinstance(value, str) else value)
