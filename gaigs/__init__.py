@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from gaigs.scene import Scene
     from gaigs.surveying import SurveyPlan, survey
     from gaigs.task import Metric
+    from gaigs.viewing import View, view
 
 log = logging.getLogger(__name__)
 
@@ -48,13 +49,14 @@ PLACES = {
     "Rays": "geometry", "Receiver": "antenna", "Array": "antenna", "Pose": "geometry", "Scene": "scene",
     "Metric": "task", "survey": "surveying", "SurveyPlan": "surveying", "Estimate": "kriging.intervals",
     "locate": "locating", "Location": "locating", "fingerprints": "locating", "Fingerprints": "locating",
+    "view": "viewing", "View": "viewing",
 }  # fmt: skip
 """The module of each public name, which is imported when the name is first used: torch is slow to import."""
 
 __all__ = [
     "Array", "Estimate", "Fingerprints", "Grid", "Links", "Location", "Metric", "Model", "Pose", "Query", "Rays",
-    "Receiver", "Scene", "SurveyPlan", "__version__", "compose", "evaluate", "fingerprints", "links", "load", "locate",
-    "radio_map", "rasterize", "register", "registries", "run", "survey", "train",
+    "Receiver", "Scene", "SurveyPlan", "View", "__version__", "compose", "evaluate", "fingerprints", "links", "load",
+    "locate", "radio_map", "rasterize", "register", "registries", "run", "survey", "train", "view",
 ]  # fmt: skip
 
 
@@ -132,6 +134,12 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
             module = {"agreement": agreement, "survey": surveying, "locate": locating}[command]
             with processes.limited_threads(config["threads"]):
                 module.run(config, folder)
+        case "view":
+            from gaigs import viewing
+
+            with processes.limited_threads(config["threads"]):
+                viewing.run(config)
         case unknown:
-            raise ValueError(f"command must be train, benchmark, agreement, survey, locate or devices, got {unknown!r}")
+            choices = "train, benchmark, agreement, survey, locate, view or devices"
+            raise ValueError(f"command must be {choices}, got {unknown!r}")
     return None

@@ -29,8 +29,8 @@ from gaigs.registry.holders import plugin_packages
 log = logging.getLogger(__name__)
 
 HARMLESS = (
-    "command", "folder", "survey", "locate", "save_every", "tensorboard", "threads", "trainer.enable_progress_bar",
-    "trainer.enable_model_summary",
+    "command", "folder", "survey", "locate", "view", "save_every", "tensorboard", "threads",
+    "trainer.enable_progress_bar", "trainer.enable_model_summary",
 )  # fmt: skip
 """Keys that change no result: a run may be resumed with other values."""
 
@@ -42,7 +42,7 @@ KEYS = {
     "kriging": bool, "kriging_fallback": dict | None, "baselines": list[dict], "command": str, "seed": int,
     "ensemble": int,
     "save_every": float, "tensorboard": bool, "threads": int | None, "folder": str | None, "survey": dict,
-    "locate": dict,
+    "locate": dict, "view": dict,
 }  # fmt: skip
 """Top-level keys and their types."""
 

@@ -1,0 +1,68 @@
+"""Time from a drag of the transmitter to its picture: python benchmarks/viewer.py FOLDER_OR_CHECKPOINT ... [--picture PNG].
+
+Serves each run, opens it in headless Chromium, which draws without a graphics card, and drags the transmitter through
+the room. A row has the median of the model's own answer and, of the whole way through server, browser and
+drawing, median and 95th percentile.
+"""
+
+import argparse
+import statistics
+import threading
+import time
+from pathlib import Path
+
+from browser import Browser
+
+from gaigs.viewing import View, contents_of
+from gaigs.viewing.server import server
+
+DRAGS = 40
+
+
+def place_on_screen(browser: Browser) -> list[float]:
+    """The transmitter's pixel in the window."""
+    return browser.run(
+        "const box = viewer.runs[0].canvas.getBoundingClientRect();"
+        "const [x, y] = viewer.state.camera.project(viewer.state.place, box.width, box.height);"
+        "return [box.x + x, box.y + y];"
+    )
+
+
+def drags(browser: Browser, count: int) -> list[float]:
+    """Times of drags back and forth [ms]."""
+    browser.wait("viewer.ready")
+    time.sleep(1)  # the radio map is drawn
+    x, y = place_on_screen(browser)
+    browser.run("viewer.latencies.length = 0")
+    steps = [(x + 6 * (k if k < count / 2 else count - k), y) for k in range(1, count)]
+    browser.drag((x, y), *steps, pause=150)
+    return browser.run("return viewer.latencies")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sources", nargs="+", help="run folders or checkpoints")
+    parser.add_argument("--picture", type=Path, help="PNG of the last view")
+    arguments = parser.parse_args()
+    print("| run | answer [ms] | drag to picture, median [ms] | 95 % [ms] |\n|---|---|---|---|")
+    for source in arguments.sources:
+        view = View([contents_of(source)])
+        (contents,) = view.contents
+        with server(view.page(), view.contents, 0) as serving, Browser(1400, 900) as browser:
+            threading.Thread(target=serving.serve_forever, daemon=True).start()
+            browser.open(f"http://127.0.0.1:{serving.server_port}")
+            times = drags(browser, DRAGS)
+            if arguments.picture:
+                browser.picture(arguments.picture)
+            serving.shutdown()
+        own = []
+        for place in (contents.scene.lower + (contents.scene.upper - contents.scene.lower) * k / 20 for k in range(20)):
+            start = time.perf_counter()
+            contents.answer(place.tolist(), 0)
+            own.append(1000 * (time.perf_counter() - start))
+        numbers = statistics.median(own), statistics.median(times), statistics.quantiles(times, n=20)[-1]
+        print(f"| {Path(source).name} |", " | ".join(f"{number:.0f}" for number in numbers), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()
