@@ -1,8 +1,8 @@
-"""Time from a drag of the transmitter to its picture: python benchmarks/viewer.py FOLDER_OR_CHECKPOINT ... [--picture PNG].
+"""Time from a drag of the transmitter to its picture: python benchmarks/viewer.py RUN ... [--picture PNG].
 
-Serves each run, opens it in headless Chromium, which draws without a graphics card, and drags the transmitter through
-the room. A row has the median of the model's own answer and, of the whole way through server, browser and
-drawing, median and 95th percentile.
+Serves each run or checkpoint, opens it in headless Chromium, which draws without a graphics card, and drags the
+transmitter through the room. A row has the median time of the model's answer alone and, from the mouse's move to the
+picture, median and 95th percentile.
 """
 
 import argparse

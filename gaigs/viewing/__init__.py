@@ -20,7 +20,7 @@ from gaigs.io.files import write_text
 from gaigs.model import Model
 from gaigs.model.kriging import Kriging
 from gaigs.registry import call, check_type, name_of
-from gaigs.runs import links_of, model_of
+from gaigs.runs import configuration_of, links_of, model_of
 from gaigs.viewing.contents import Contents
 from gaigs.viewing.server import server
 
@@ -155,7 +155,8 @@ def contents_of(source: str | Path) -> Contents:
     path = Path(source)
     if path.is_file():
         return Contents(checkpoint.load(path), title=path.stem)
-    return Contents(model_of(path), links_of(path), path.name)
+    in_memory = configuration_of(path)["data"]["name"] == "arrays"  # which a run does not store
+    return Contents(model_of(path), None if in_memory else links_of(path), path.name)
 
 
 def run(config: dict) -> None:

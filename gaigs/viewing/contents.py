@@ -136,7 +136,7 @@ class Contents:
         Args:
             step: Every so many rows and columns of a spectrum.
         """
-        answer: dict[str, Any] = {"place": plain(np.asarray(place))}
+        answer: dict[str, Any] = {}
         heard: Any = receiver
         points = torch.tensor([place])
         if self.kind == "level":
@@ -153,11 +153,11 @@ class Contents:
             answer["curves"] = {"predicted": self._curve(value[0], int(loudest(value[0])))}
             answer["level"] = plain(level(value)[0])
             answer["std"] = None if std is None else plain(level(std)[0])
-            answer["snr"] = None if snr is None else plain(snr[0])
+            answer["snr"] = None if snr is None else plain(snr[0].clamp_max(140))
         query, _ = Query.from_positions([place], receiver, self.frequency, self._names, self.scene.frequencies)
         paths = call_optional(self.model, "learnt_paths", query) or []
         answer["paths"] = [{"points": plain(path.points), "power": plain(path.power_db)} for path in paths]
-        return answer
+        return answer | {"place": plain(np.asarray(place))}
 
     def slice(self, height: float, receiver: int) -> dict:
         """The radio map over the training transmitters and receivers at a height [m]."""
@@ -197,7 +197,7 @@ class Contents:
             warnings.simplefilter("ignore", ExtrapolationWarning)  # a transmitter may be dragged anywhere
             options = {"frequency": self.frequency, "batch_size": POINTS, "interval": self.interval}
             with self.lock:
-                found = self.model.predict(points, receiver, **options)
+                found: Any = self.model.predict(points, receiver, **options)
         parts = (found.value, found.std, found.snr_db) if self.interval else (found, None, None)
         return tuple(None if part is None else part.cpu() for part in parts)  # type: ignore[return-value]
 
@@ -211,7 +211,7 @@ class Contents:
             x, names = 1e9 * delays, ("delay [ns]", f"|impulse response| [dB], element {element + 1}")
         return {
             "x": plain(x),
-            "y": plain(decibels(np.maximum(np.abs(responses), LEAST))),
+            "y": plain(np.maximum(decibels(responses), 20 * math.log10(LEAST))),
             "xlabel": names[0],
             "ylabel": names[1],
         }
