@@ -12,11 +12,14 @@ import time
 from pathlib import Path
 
 from browser import Browser
+from PIL import Image
 
+import gaigs
 from gaigs.viewing import View, contents_of
 from gaigs.viewing.server import server
 
 DRAGS = 40
+WINDOW = 1200, 860  # pixels
 
 
 def place_on_screen(browser: Browser) -> list[float]:
@@ -42,18 +45,26 @@ def drags(browser: Browser, count: int) -> list[float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sources", nargs="+", help="run folders or checkpoints")
+    parser.add_argument("--data", help="reader of the links that checkpoints are shown with, such as synthetic")
     parser.add_argument("--picture", type=Path, help="PNG of the last view")
     arguments = parser.parse_args()
     print("| run | answer [ms] | drag to picture, median [ms] | 95 % [ms] |\n|---|---|---|---|")
     for source in arguments.sources:
         view = View([contents_of(source)])
+        if arguments.data:
+            view = gaigs.view(gaigs.load(source), gaigs.links(arguments.data))
         (contents,) = view.contents
-        with server(view.page(), view.contents, 0) as serving, Browser(1400, 900) as browser:
+        with server(view.page(), view.contents, 0) as serving, Browser(*WINDOW) as browser:
             threading.Thread(target=serving.serve_forever, daemon=True).start()
             browser.open(f"http://127.0.0.1:{serving.server_port}")
             times = drags(browser, DRAGS)
             if arguments.picture:
+                if arguments.data:
+                    browser.run("choose(0, 0)")
+                    time.sleep(1)
                 browser.picture(arguments.picture)
+                picture = Image.open(arguments.picture).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE)
+                picture.save(arguments.picture, optimize=True)
             serving.shutdown()
         own = []
         for place in (contents.scene.lower + (contents.scene.upper - contents.scene.lower) * k / 20 for k in range(20)):

@@ -111,7 +111,7 @@ class Camera {
 class Drawing {
   constructor(canvas) {
     this.canvas = canvas;
-    const gl = this.gl = canvas.getContext("webgl2", {antialias: false, preserveDrawingBuffer: true});
+    const gl = this.gl = canvas.getContext("webgl2", {antialias: false});
     if (!gl) throw new Error("this browser has no WebGL 2; take a current one");
     this.programs = {}; this.layers = new Map();
     for (const kind in LAYOUT) {

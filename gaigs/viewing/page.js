@@ -30,6 +30,11 @@ const steps = (low, high, most) => {  // round numbers, by 1, 2 or 5
   return ticks;
 };
 
+const middle = (values, share) => {  // quantiles that leave out a share at both ends
+  const order = values.slice().sort((a, b) => a - b), at = share => order[Math.round(share * (order.length - 1))];
+  return [at(share), at(1 - share)];
+};
+
 const decoded = image => {  // bytes, stored as changes from pixel to pixel
   if (!image || image.values) return image;
   const changes = atob(image.changes);
@@ -80,7 +85,7 @@ class Run {
     Object.assign(this, {facts, number, source, colours: content.colours});
     this.canvas = element("canvas");
     this.labels = element("div", {className: "labels"});
-    this.legend = element("div", {className: "legend"});
+    this.legend = element("details", {className: "legend"});
     const about = facts.kind ? `${facts.task}, ${facts.receivers.length} receiver${facts.receivers.length > 1 ? "s" : ""}` : facts.task;
     const title = element("h2", {}, facts.title + " ", element("small", {textContent: about}));
     this.scene = element("div", {className: "scene"}, this.canvas, this.labels, this.legend, title);
@@ -162,8 +167,8 @@ class Run {
   drawTests() {
     const {tests} = this.facts;
     if (!tests) return;
-    const order = tests.scores.slice().sort((a, b) => a - b), at = share => order[Math.round(share * (order.length - 1))];
-    this.ends = [at(0.05), at(0.95)];
+    const alike = viewer.runs.map(run => run.facts.tests).filter(other => other && other.title === tests.title);
+    this.ends = middle(alike.flatMap(other => other.scores), 0.05);
     const numbers = [];
     tests.places.forEach((p, k) => {
       if (tests.receivers[k] !== state.receiver) return;
@@ -177,10 +182,8 @@ class Run {
     return this.colour("YlOrRd", this.facts.tests.rises ? 1 - share : share);
   }
 
-  drawMap(map) {
-    const {x, y, height, values} = map;
-    const order = values.slice().sort((a, b) => a - b), at = share => order[Math.round(share * (order.length - 1))];
-    const [low, high] = this.range = [at(0.01), at(0.99)];
+  drawMap({x, y, height, values}, range) {
+    const [low, high] = this.range = range;
     const corner = (i, j) => [x[i], y[j], height,
       ...this.colour("viridis", (values[j * x.length + i] - low) / (high - low || 1)), 0.8];
     const numbers = [];
@@ -369,7 +372,7 @@ class Run {
       this.range ? ["viridis", minus(digits(this.range[0])), withUnit(this.range[1], facts.map)] : null);
     if (facts.kind === "spectrum") add(["sphere"], "spectrum at the receiver", `border-radius:5px;background:${gradient("viridis")}`, true, ["viridis", "0", "1 amplitude"]);
     if (facts.planes.length) add(["paths"], "paths", "height:3px;background:#9c179e", true, ["plasma_r", minus("-30"), "0 dB of the strongest"]);
-    this.legend.replaceChildren(...layers.map(({names, text, swatch, on, scale}) => {
+    this.legend.replaceChildren(element("summary", {textContent: "legend"}), ...layers.map(({names, text, swatch, on, scale}) => {
       this.drawn = this.drawn || {};
       const is = this.drawn[names[0]] ?? on;
       const box = element("input", {type: "checkbox", checked: is, name: names[0]});
@@ -511,7 +514,6 @@ async function update() {
       const {since, place, receiver} = state;
       const answers = await Promise.all(viewer.runs.map(run => run.source.answer(run.number, place, receiver)));
       viewer.runs.forEach((run, k) => run.drawAnswer(answers[k]));
-      await painted();
       viewer.runs.forEach(run => run.drawFrame());
       await painted();  // the picture is on the screen
       viewer.latencies.push(performance.now() - since);
@@ -528,8 +530,12 @@ async function updateMaps() {
   try {
     while (mapsAsked) {
       mapsAsked = false;
-      for (const run of viewer.runs.filter(run => run.facts.map && run.drawn.map))
-        run.drawMap(await run.source.slice(run.number, state.height, state.receiver));
+      const runs = viewer.runs.filter(run => run.facts.map && run.drawn.map);
+      const maps = await Promise.all(runs.map(run => run.source.slice(run.number, state.height, state.receiver)));
+      runs.forEach((run, k) => {
+        const alike = maps.filter((_, other) => runs[other].facts.map === run.facts.map);  // one scale for both
+        run.drawMap(maps[k], middle(alike.flatMap(map => map.values), 0.01));
+      });
       redraw();
     }
   } catch (error) { fail(error); } finally { mapsBusy = false; }
@@ -556,7 +562,7 @@ async function start() {
   $("runs").classList.toggle("two", viewer.runs.length > 1);
   document.title = content.runs.map(run => run.title).join(" | ") + " - gaigs";
   const [first] = viewer.runs, {box, receivers} = first.facts;
-  viewer.runs.forEach(run => run.start());
+  viewer.runs.forEach(run => { run.start(); run.legend.open = viewer.runs.length === 1; });
   $("receiver").append(...receivers.map((receiver, k) => element("option", {value: k, textContent: receiver.name})));
   $("receiver").parentElement.hidden = receivers.length < 2;
   $("receiver").addEventListener("change", event => {
@@ -568,7 +574,12 @@ async function start() {
   [slider.min, slider.max] = content.stored ? [Math.min(...content.stored.heights), Math.max(...content.stored.heights)] : [first.low[2], first.high[2]];
   slider.parentElement.hidden = slider.min === slider.max;
   slider.addEventListener("input", () => move([state.place[0], state.place[1], +slider.value]));
-  const home = () => { state.camera = new Camera(first.low, first.high); redraw(); };
+  const home = () => {
+    const {clientWidth, clientHeight} = first.canvas;
+    state.camera = new Camera(first.low, first.high);
+    state.camera.distance *= Math.max(1, 1.3 * clientHeight / clientWidth);  // the whole room in a narrow window
+    redraw();
+  };
   $("reset").addEventListener("click", home);
   $("hint").textContent = "drag the transmitter; elsewhere: turn, right button: shift, wheel: zoom";
   addEventListener("resize", redraw);

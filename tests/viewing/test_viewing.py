@@ -187,7 +187,8 @@ def test_a_drag_changes_the_picture(is_served, browser, links, levels, tmp_path,
         browser.open(url)
         browser.wait("window.viewer && viewer.ready && viewer.runs[0].drawing.layers.get('map').numbers.length")
         pictures, before = browser.run("return viewer.pictures"), browser.run("return viewer.state.place")
-        shown = "return [viewer.runs[0].canvas.toDataURL(), document.querySelector('.results canvas').toDataURL()]"
+        canvases = "viewer.runs[0].canvas, document.querySelector('.results canvas')"
+        shown = f"viewer.runs[0].drawFrame(); return [{canvases}].map(canvas => canvas.toDataURL())"
         scene, plot = browser.run(shown)
         x, y = pixel(browser, "viewer.state.place")
         browser.drag((x, y), *((x + 20 * step, y) for step in range(1, 6)), pause=30)
