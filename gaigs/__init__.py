@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from gaigs.scene import Scene
     from gaigs.surveying import SurveyPlan, survey
     from gaigs.task import Metric
+    from gaigs.viewing import View, view
 
 log = logging.getLogger(__name__)
 
@@ -52,14 +53,15 @@ PLACES = {
     "locate": "locating", "Location": "locating", "fingerprints": "locating", "Fingerprints": "locating",
     "describe": "describing", "Description": "describing",
     "export": "exporting",
+    "view": "viewing", "View": "viewing",
 }  # fmt: skip
 """The module of each public name, which is imported when the name is first used: torch is slow to import."""
 
 __all__ = [
     "Array", "Description", "Estimate", "Fingerprints", "Grid", "Links", "Location", "Metric", "Model", "Pose", "Query",
-    "Rays", "Receiver", "Scene", "SurveyPlan", "__version__", "compose", "describe", "evaluate", "export",
+    "Rays", "Receiver", "Scene", "SurveyPlan", "View", "__version__", "compose", "describe", "evaluate", "export",
     "fingerprints", "links", "load", "locate", "radio_map", "rasterize", "register", "registries", "run", "survey",
-    "train",
+    "train", "view",
 ]  # fmt: skip
 
 
@@ -149,7 +151,12 @@ def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | Non
             }  # fmt: skip
             with processes.limited_threads(config["threads"]):
                 modules[command].run(config, folder)
+        case "view":
+            from gaigs import viewing
+
+            with processes.limited_threads(config["threads"]):
+                viewing.run(config)
         case unknown:
-            known = "train, benchmark, agreement, describe, survey, locate, export or devices"
+            known = "train, benchmark, agreement, describe, survey, locate, export, view or devices"
             raise ValueError(f"command must be {known}, got {unknown!r}")
     return None

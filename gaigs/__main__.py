@@ -30,7 +30,7 @@ def run(config: DictConfig) -> float | None:
     is_sweep, launcher = settings.mode is RunMode.MULTIRUN, settings.launcher["_target_"].rpartition(".")[2]
     folder, mode, command = Path(settings.runtime.output_dir), "sweep" if is_sweep else "run", config.get("command")
     goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
-    if command in ("agreement", "describe", "survey", "locate", "export"):
+    if command in ("agreement", "describe", "survey", "locate", "export", "view"):
         goes_on = "the same command starts anew"
     words = OmegaConf.to_container(settings.overrides.task)
     overrides = [word for word in words if not word.lstrip("+~").startswith(("command=", "benchmark=", "benchmark."))]

@@ -29,7 +29,7 @@ from gaigs.registry.holders import plugin_packages
 log = logging.getLogger(__name__)
 
 HARMLESS = (
-    "command", "folder", "survey", "locate", "export", "figures", "save_every", "tensorboard", "threads",
+    "command", "folder", "survey", "locate", "export", "view", "figures", "save_every", "tensorboard", "threads",
     "trainer.enable_progress_bar", "trainer.enable_model_summary",
 )  # fmt: skip
 """Keys that change no result: a run may be resumed with other values."""
@@ -42,7 +42,7 @@ KEYS = {
     "kriging": bool, "kriging_fallback": dict | None, "baselines": list[dict], "command": str, "seed": int,
     "ensemble": int,
     "save_every": float, "tensorboard": bool, "threads": int | None, "folder": str | None, "survey": dict,
-    "locate": dict, "export": dict, "figures": dict,
+    "locate": dict, "export": dict, "view": dict, "figures": dict,
 }  # fmt: skip
 """Top-level keys and their types."""
 
@@ -286,7 +286,7 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
         if not (is_new or last in has or is_open):
             raise ValueError(f"{place} has no key {suggest(last, has)}; it has: {listed(has)}")
         return name
-    searched = sections or plain.keys() - {*READ_BY_LINKS, "survey", "locate", "export", "figures"}
+    searched = sections or plain.keys() - {*READ_BY_LINKS, "survey", "locate", "export", "view", "figures"}
     keys = {key: key.rpartition(".")[2] for key in _options(plain, searched)}
     found = sorted(key for key, last in keys.items() if last == name)
     if not sections and f"model.{name}" in found:  # a model's own option wins over those of its parts

@@ -158,7 +158,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("baselines=[3]", "baselines, entry 0, must be a mapping, got 3"),
         ("seed=-1", "seed must be in 0..4294967295, got -1"),
         ("+thread=3", "the configuration has no key 'thread' (did you mean 'threads'?)"),
-        ("command=trian", "command must be train, benchmark, agreement, survey, locate, export or devices, got 'tr"),
+        ("command=trian", "command must be train, benchmark, agreement, describe, survey, locate, export, view or"),
         ("~command", "the configuration needs the key 'command'"),
         ("benchmark=step", "benchmark=step needs command=benchmark"),
         ("data=nerf2_spectrum", "data.root must be given, as it has no default; add data.root=..."),

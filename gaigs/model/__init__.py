@@ -304,8 +304,12 @@ class OptionalMethods(Protocol):
     def rendering(self, batch: Batch) -> Callable[[], object]:
         """The rendering alone of a batch, to be timed."""
 
-    def learnt_room(self, links: Links) -> object:
-        """The room learnt from the links, a ``gaigs.placement.learnt_room.LearntRoom`` for figures."""
+    def learnt_room(self, links: Links | None = None) -> object:
+        """The room learnt from the links, a ``gaigs.placement.learnt_room.LearntRoom`` for figures; without links that
+        of the state alone."""
+
+    def learnt_paths(self, query: Query) -> object:
+        """The strongest paths of some links together, a list of ``gaigs.placement.learnt_room.LearntPath``."""
 
     def export(self, folder: Path) -> None:
         """Writes files for other programs into a run's folder."""

@@ -27,8 +27,8 @@ from gaigs.kriging.links import PART, coordinates, folds_of, thinned
 from gaigs.kriging.paths import Equations, PathField, candidates
 from gaigs.kriging.scalar import ScalarProcess, is_scalar
 from gaigs.model import Model, Prediction, call_optional
-from gaigs.placement.learnt_room import LearntRoom
-from gaigs.query import Batch
+from gaigs.placement.learnt_room import LearntPath, LearntRoom
+from gaigs.query import Batch, Query
 from gaigs.registry import name_of, register, registry
 from gaigs.scene import Scene
 from gaigs.task import Task
@@ -362,8 +362,11 @@ class Kriging(Model):
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
         return call_optional(self.trend, "rendering", batch)
 
-    def learnt_room(self, links: Links) -> LearntRoom | None:
+    def learnt_room(self, links: Links | None = None) -> LearntRoom | None:
         return call_optional(self.trend, "learnt_room", links)
+
+    def learnt_paths(self, query: Query) -> list[LearntPath] | None:
+        return call_optional(self.trend, "learnt_paths", query)
 
     def export(self, folder: Path) -> None:
         call_optional(self.trend, "export", folder)

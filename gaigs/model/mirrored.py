@@ -15,7 +15,7 @@ from gaigs.deformation import Deformation
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.placement import Placement
-from gaigs.placement.learnt_room import LearntRoom
+from gaigs.placement.learnt_room import LearntPath, LearntRoom
 from gaigs.placement.mirrored import export
 from gaigs.placement.mirrored.channel_search import FEWEST, ChannelSearch
 from gaigs.placement.mirrored.lag_search import LagSearch
@@ -227,6 +227,10 @@ class MirroredSplatting(GaussianSplatting):
         """Links whose paths show where planes end."""
         return export.all_over(self.scene) if self.places is None else self.places
 
-    def learnt_room(self, links: Links) -> LearntRoom:
+    def learnt_room(self, links: Links | None = None) -> LearntRoom:
         """Planes, obstacles and paths for figures."""
         return export.learnt_room(self.placement, links)
+
+    def learnt_paths(self, query: Query) -> list[LearntPath]:
+        """The strongest paths of some links, folded through the room."""
+        return export.learnt_paths(self.placement, query)

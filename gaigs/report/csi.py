@@ -61,7 +61,7 @@ def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) ->
         rows = zip(axes, labels[..., order], predictions[..., order], _titles(shown), strict=True)
         for (magnitude, phase), label, prediction, (title, element) in rows:
             pair = np.stack((prediction[element], label[element]))
-            levels, angles = _decibels(pair), np.rad2deg(np.angle(pair))
+            levels, angles = decibels(pair), np.rad2deg(np.angle(pair))
             for name, level, angle in zip(LOOKS, levels, angles, strict=True):
                 look = LOOKS[name] | {"label": name} | mark
                 magnitude.plot(frequencies / scale, level, **look)
@@ -92,8 +92,8 @@ def impulse_responses(shown: Examples, frequencies: Float[ndarray, " s"]) -> Fig
     """
     titles, links = _titles(shown), zip(shown.labels, shown.predictions, strict=True)
     pairs = np.stack([(guess[e], label[e]) for (label, guess), (_, e) in zip(links, titles, strict=True)])
-    delays, responses = _impulse_response(pairs, frequencies)
-    levels = _decibels(responses)  # (k, 2, delays)
+    delays, responses = impulse_response(pairs, frequencies)
+    levels = decibels(responses)  # (k, 2, delays)
     levels -= levels[:, 1:].max(-1, keepdims=True)
     with rc_context(STYLE):
         figure = Figure(figsize=(PAGE, 2.7), layout="constrained")
@@ -121,7 +121,7 @@ def _titles(shown: Examples) -> list[tuple[str, int]]:
     ]
 
 
-def _decibels(amplitudes: Complex[ndarray, "..."]) -> Float[ndarray, "..."]:
+def decibels(amplitudes: Complex[ndarray, "..."]) -> Float[ndarray, "..."]:
     """Magnitudes [dB]; of 0 it is -inf, which leaves a gap in a line."""
     with np.errstate(divide="ignore"):
         return 20 * np.log10(np.abs(amplitudes))
@@ -141,7 +141,7 @@ def _draw_phase(ax: Axes, frequencies: Float[ndarray, " s"], angles: Float[ndarr
     ax.plot(np.insert(frequencies, jumps, np.nan), np.insert(angles, jumps, np.nan), **look)
 
 
-def _impulse_response(
+def impulse_response(
     channels: Complex[ndarray, "... s"], frequencies: Float[ndarray, " s"]
 ) -> tuple[Float[ndarray, " d"], Complex[ndarray, "... d"]]:
     """Delays [s], and the impulse response at them: the windowed mean over subcarriers of h exp(2 pi i f tau)."""

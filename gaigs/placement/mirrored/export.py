@@ -234,27 +234,38 @@ def _cut(corners: Float[ndarray, "c 3"], normal: Float[ndarray, "3"], offset: np
 
 
 @torch.no_grad()
-def learnt_room(placement: Mirrored, links: Links) -> LearntRoom:
-    """The room by the training links, and the strongest paths of the first test transmitter, for figures."""
-    found = survey(placement, some(links.query[links.split.train]))
-    test = links.query[links.split.test]
-    first = (test.transmitters == test.transmitters[:1]).all(1)
-    if test.frequencies is not None:
-        first &= test.frequencies == test.frequencies[:1]
+def learnt_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
+    """The room by the training links, and the strongest paths of the first test transmitter, for figures.
+
+    Without links it is the room by links ``all_over`` the scene, without paths.
+    """
+    found = survey(placement, all_over(placement.scene) if links is None else some(links.query[links.split.train]))
     matter = None
     if placement.obstacles is not None:
         blobs = placement.obstacles
         parts = blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities
         matter = Matter(*(part.cpu().double().numpy() for part in parts))
-    heard = survey(placement, test[first])
+    paths: list[LearntPath] = []
+    if links is not None:
+        test = links.query[links.split.test]
+        first = (test.transmitters == test.transmitters[:1]).all(1)
+        if test.frequencies is not None:
+            first &= test.frequencies == test.frequencies[:1]
+        paths = learnt_paths(placement, test[first])
+    return LearntRoom(outlines(placement, found), matter, paths)
+
+
+def learnt_paths(placement: Mirrored, query: Query) -> list[LearntPath]:
+    """At most 20 paths of some links together, within 30 dB of the strongest, which comes first."""
+    heard = survey(placement, query)
     powers = heard.powers / heard.powers.max(initial=np.finfo(float).tiny)
-    paths = []  # at most 20, within 30 dB of the strongest
+    paths = []
     for link, path in zip(*np.unravel_index(np.argsort(-powers, axis=None)[:20], powers.shape), strict=True):
         if powers[link, path] >= 1e-3:
             bounces = heard.bounces[link, path][heard.sequences[path] >= 0]
             points = np.concatenate((heard.transmitters[link, None], bounces, heard.receivers[link, None]))
             paths.append(LearntPath(points, 10 * math.log10(powers[link, path])))
-    return LearntRoom(outlines(placement, found), matter, paths)
+    return paths
 
 
 @torch.no_grad()
