@@ -143,8 +143,8 @@ def read(
     np.add.at(sums, which, np.where(heard, levels, 0))
     means = sums / counts.clip(1)
     rows, receivers = counts.nonzero()
-    if not len(rows):
-        raise ValueError(f"{table.file}: expected a reading that was heard, got none; see data.not_heard")
+    if (some := len(np.unique(rows))) < 2:
+        raise ValueError(f"{table.file}: expected levels at two places or more, got {some}; see data.not_heard")
     present, receivers = np.unique(receivers, return_inverse=True)
     names = [table.names[columns.gateways[k]] for k in present]
     repeats, noises, scatter = int(heard.sum()) - len(rows), None, 0.0
@@ -155,9 +155,9 @@ def read(
     silent = columns.silent + [table.names[k] for k in columns.gateways if table.names[k] not in names]
     marks = " and ".join(f"{mark:g}" for mark in sorted(columns.marks))
     unplaced = [name for name in names if name not in stands]
-    empty = len(places) - len(np.unique(rows))
+    empty = len(places) - some
     remarks = [
-        f"{len(rows)} readings of {len(np.unique(rows))} places at {len(names)} gateways",
+        f"{len(rows)} readings of {some} places at {len(names)} gateways",
         f"{int((~heard).sum())} cells were not heard: {marks or 'empty ones'}{marks and ', or empty'}",
         repeats
         and f"repeated readings of one place, of {len(levels)} rows, are averaged, and scatter by {scatter:.2g} dB",
