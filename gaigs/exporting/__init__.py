@@ -60,6 +60,7 @@ def export(
         'x,y,z,receiver,frequency,value,deviation,lower,upper'
     """
     check_type("model", model, Model)
+    check_type("file", file, str | Path)
     file = Path(file)
     suffix = check_suffix(file)
     if suffix in ROOMS:

@@ -12,7 +12,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from gaigs.data.sionna.meshes import Mesh
-from gaigs.data.synthetic.image_source import MATERIALS, conductivity
+from gaigs.data.synthetic.image_source import TABULATED, conductivity
 from gaigs.io.files import atomic_write, write_text
 from gaigs.model import Model
 from gaigs.model.ensemble import Ensemble
@@ -26,8 +26,8 @@ from gaigs.query import check_carrier
 COLOUR = 0.0, 0.45, 0.70, 0.35
 """Red, green, blue and opacity of planes: the figures' blue, through which the room shows."""
 
-TABULATED = 1e9, 40e9
-"""Lowest and highest carrier [Hz] at which all of ``MATERIALS`` are tabulated."""
+CARRIERS_OF_ITU = 1e9, 40e9
+"""Lowest and highest carrier [Hz] at which all of ``TABULATED`` are tabulated."""
 
 
 def write_room(model: Model, file: Path, frequency: float | None = None) -> list[Path]:
@@ -77,14 +77,14 @@ def write_scene(file: Path, meshes: Sequence[Mesh], materials: Sequence[Material
     scene.append(ElementTree.Comment(f" Learnt by gaigs; metres, z up; materials for {frequency:.7g} Hz. "))
     names = {material: f"{material.name}-{1e3 * material.thickness:.4g}mm" for material in materials}
     for material, name in names.items():
-        is_tabulated = TABULATED[0] <= frequency <= TABULATED[1]
+        is_tabulated = CARRIERS_OF_ITU[0] <= frequency <= CARRIERS_OF_ITU[1]
         surface = ElementTree.SubElement(scene, "bsdf", id=name)
         surface.set("type", "itu-radio-material" if is_tabulated else "radio-material")
         numbers = {"thickness": material.thickness}
         if is_tabulated:
             ElementTree.SubElement(surface, "string", name="type", value=material.name)
         else:
-            numbers["relative_permittivity"] = MATERIALS[material.name][0]
+            numbers["relative_permittivity"] = TABULATED[material.name][0]
             numbers["conductivity"] = conductivity(material.name, frequency)
         for key, number in numbers.items():
             ElementTree.SubElement(surface, "float", name=key, value=f"{number:.6g}")

@@ -20,12 +20,17 @@ MATERIALS = {
     "wood": (1.99, 0.0047, 1.0718),
     "glass": (6.31, 0.0036, 1.3394),
     "ceiling_board": (1.48, 0.0011, 1.0750),
-    "chipboard": (2.58, 0.0217, 0.7800),
-    "plywood": (2.71, 0.33, 0.0),
-    "marble": (7.074, 0.0055, 0.9262),
     "metal": (1.0, 1e7, 0.0),
 }
 """Relative permittivity, and c and d of the conductivity c (f / GHz)^d [S/m]; ITU-R P.2040-3, table 3, 1 to 40 GHz."""
+
+TABULATED = {
+    **MATERIALS,
+    "chipboard": (2.58, 0.0217, 0.7800),
+    "plywood": (2.71, 0.33, 0.0),
+    "marble": (7.074, 0.0055, 0.9262),
+}
+"""The same with those of the table that no simulated room has."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ def permittivity(material: str, frequency: float) -> complex:
 
 def conductivity(material: str, frequency: float) -> float:
     """Conductivity of a material [S/m] at a frequency [Hz]; extrapolated outside the tables."""
-    _, c, d = MATERIALS[material]
+    _, c, d = TABULATED[material]
     return c * (frequency / 1e9) ** d
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from scipy.constants import epsilon_0, speed_of_light
 
-from gaigs.data.synthetic.image_source import MATERIALS, conductivity
+from gaigs.data.synthetic.image_source import TABULATED, conductivity
 from gaigs.placement.mirrored.paths import Mirrored
 from gaigs.placement.mirrored.reflections import fold, images, polarised
 from gaigs.propagation import slab
@@ -17,7 +17,7 @@ HALF_SPACE = 1.0
 
 
 class Material(NamedTuple):
-    """A material of ``MATERIALS``, and the thickness of its slab [m]."""
+    """A material of ``TABULATED``, and the thickness of its slab [m]."""
 
     name: str
     thickness: float
@@ -43,7 +43,7 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
     learnt = half_space if placement.log_thicknesses is None else placement.log_thicknesses.exp()
     permittivities = {
         name: complex(real, -conductivity(name, frequency) / (2 * math.pi * epsilon_0 * frequency))
-        for name, (real, _, _) in MATERIALS.items()
+        for name, (real, _, _) in TABULATED.items()
     }
     options = [(name, thicknesses) for name in permittivities for thicknesses in (half_space, learnt)]
     errors, weights = normals.new_zeros(len(options), len(normals)), normals.new_zeros(len(normals))
