@@ -75,9 +75,13 @@ class View:
             port: Of http://127.0.0.1; 0 for any free one.
 
         Raises:
-            OSError: The port is in use.
+            OSError: The port cannot be opened.
         """
-        with server(self.page(), list(self.contents), port) as serving:
+        try:
+            serving = server(self.page(), list(self.contents), port)
+        except OSError as error:
+            raise OSError(f"port {port} cannot be opened ({error.strerror}); take another, or 0 for any") from None
+        with serving:
             print(f"open http://127.0.0.1:{serving.server_port} in a browser; Ctrl-C ends", flush=True)
             serving.serve_forever()
 

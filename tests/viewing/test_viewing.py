@@ -124,6 +124,14 @@ def test_the_server_answers_and_says_what_is_wrong(levels):
         assert "must be finite" in json.load(error.value)["error"]
 
 
+def test_a_port_in_use_is_named(levels):
+    view = View([Contents(levels)])
+    with serving(view) as url:
+        port = int(url.rstrip("/").rsplit(":", 1)[1])
+        with pytest.raises(OSError, match=f"port {port} cannot be opened"):
+            view.serve(port)
+
+
 def test_two_runs_have_the_same_receivers(levels, mirrored):
     with pytest.raises(ValueError, match="must have the same receivers, got"):
         gaigs.view(levels, other=mirrored)
