@@ -127,7 +127,7 @@ def test_numbers_are_short():
         (["benchmark=step"], "benchmark=step needs command=benchmark"),
         (["command=benchmark", "benchmark=step", "benchmark.repeats=0"], "benchmark.repeats must be at least 1, got 0"),
         (["command=benchmark"], "command=benchmark needs a benchmark; add benchmark=accuracy, budgets, rasterizer"),
-        (["command=bench"], "command must be train, benchmark, agreement, survey, locate or devices, got 'bench'"),
+        (["command=bench"], "command must be train, benchmark, agreement, describe, survey, locate"),
     ],
 )
 def test_bad_commands(overrides, message, tmp_path):
