@@ -138,8 +138,8 @@ def fingerprints(
         links: Links that the model was trained on. Transmitters are then likely where the known ones are dense, and
             held-out ones set the width of the likelihood and the size of regions. None: they are anywhere alike, and
             the errors of a label's numbers are independent, which makes regions too small.
-        region: Two corners of a box [[x, y, z], [x, y, z]] [m] in which transmitters are anywhere alike; None: the box
-            of the training transmitters.
+        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m] in which transmitters are anywhere alike; None: the
+            box of the training transmitters.
         frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
         points: Number of candidate places; None: 20,000, fewer where the model takes more than a minute for them.
 

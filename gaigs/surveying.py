@@ -103,8 +103,8 @@ def survey(
 
     Args:
         model: ``gaussian_process``, or a trained model with kriging.
-        region: Two corners of a box [[x, y, z], [x, y, z]] [m], over which the error is stated; None: the candidates
-            or, without these, the box of the training transmitters.
+        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the error is stated; None: the
+            candidates or, without these, the box of the training transmitters.
         count: Number of places; at most as many as there are candidates.
         candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
         frequency: Carrier [Hz]; None: that of the training links, of several the middle one.

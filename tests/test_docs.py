@@ -24,6 +24,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
+import gaigs
 from gaigs import configuration
 from gaigs.registry import find_holders, registry
 
@@ -227,6 +228,20 @@ def test_the_first_page_lists_the_choices(kind):
 def test_the_page_on_data_describes_each_component(kind):
     first_cells = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/data.md").read_text(), re.M)
     assert choices(kind) <= {*first_cells}
+
+
+def test_every_page_is_in_the_navigation_and_in_the_readmes_table():
+    nav, readme = ((ROOT / name).read_text() for name in ("mkdocs.yml", "README.md"))
+    for page in ROOT.glob("docs/*.md"):
+        assert f"- docs/{page.name}\n" in nav, page.name
+        assert f"](docs/{page.name})" in readme, page.name
+
+
+def test_the_reference_has_every_public_name():
+    listed = re.findall(r"^::: (\S+)$", (ROOT / "docs/reference.md").read_text(), re.M)
+    assert {f"gaigs.{name}" for name in gaigs.__all__} - {"gaigs.__version__"} <= {*listed}
+    for name in listed:
+        pkgutil.resolve_name(name)
 
 
 def test_the_documented_file_of_channels_is_read(tmp_path):

@@ -1,0 +1,50 @@
+"""Hooks of mkdocs: the site has the repository's layout, and each notebook is a page with its stored outputs."""
+
+import re
+from pathlib import Path
+
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File, Files
+from nbconvert import MarkdownExporter
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "LICENSE",
+    "CITATION.cff",
+    "plugins/*/README.md",
+    "docs/**/*.*",
+]
+
+
+@event_priority(100)  # before the plugins
+def on_files(files, config):
+    """The files of the theme and of the pages, below the repository's root in place of ``docs``."""
+    found = [file for file in files if file.src_dir != config.docs_dir]
+    for path in (path for pattern in PAGES for path in sorted(ROOT.glob(pattern)) if path.suffix != ".py"):
+        name = path.relative_to(ROOT).as_posix()
+        if path.suffix == ".ipynb":
+            found += _notebook(config, name)
+        if "__pycache__" not in path.parts:
+            found.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
+    return Files(found)
+
+
+def _notebook(config, name):
+    """The page of a notebook, and its pictures."""
+    text, resources = MarkdownExporter().from_filename(ROOT / name)
+    stem = name.removesuffix(".ipynb")
+    pictures = {f"{stem}/{file}": content for file, content in resources["outputs"].items()}
+    text = text.replace("](output_", f"]({Path(stem).name}/output_")
+    text = text.replace("\n", f"\n\n[Download this notebook]({Path(name).name})\n", 1)
+    yield File.generated(config, f"{stem}.md", content=text)
+    yield from (File.generated(config, path, content=content) for path, content in pictures.items())
+
+
+def on_page_markdown(markdown, page, **_):
+    """Links to a notebook lead to its page."""
+    if page.file.generated_by:
+        return markdown
+    return re.sub(r"(\]\([^)\s]+)\.ipynb\)", r"\1.md)", markdown)
