@@ -1,4 +1,4 @@
-"""Hooks of mkdocs: the site has the repository's layout, and each notebook is a page with its stored outputs."""
+"""Hooks of mkdocs: the repository's layout, a page for each notebook, and the viewer's file in its page."""
 
 import re
 from pathlib import Path
@@ -6,6 +6,8 @@ from pathlib import Path
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
+
+import gaigs
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -29,6 +31,8 @@ def on_files(files, config):
             found += _notebook(config, name)
         if "__pycache__" not in path.parts:
             found.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
+    view = gaigs.view(gaigs.load(ROOT / "examples/room.ckpt"), gaigs.links("synthetic"))
+    found.append(File.generated(config, "docs/room.html", content=view.page(view.stored())))
     return Files(found)
 
 
@@ -44,7 +48,10 @@ def _notebook(config, name):
 
 
 def on_page_markdown(markdown, page, **_):
-    """Links to a notebook lead to its page."""
+    """Links to a notebook lead to its page; the page of the viewer shows its file."""
     if page.file.generated_by:
         return markdown
+    if page.file.src_uri == "docs/view.md":
+        frame = '<iframe src="room.html" title="The built-in room" style="width: 100%; height: 40rem"></iframe>'
+        markdown = re.sub(r"!\[[^]]*\]\(figures/view.png\)", frame, markdown, count=1)
     return re.sub(r"(\]\([^)\s]+)\.ipynb\)", r"\1.md)", markdown)
