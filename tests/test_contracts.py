@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 import gaigs
 from gaigs import configuration
-from gaigs.data import load, nerf2_spectrum
+from gaigs.data import deepmimo, load, nerf2_spectrum
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.pooling.softmax_attention import SoftmaxAttention
 from gaigs.registry import registry
@@ -160,10 +160,26 @@ def write_channels(root):
     return [f"data.file={root / 'room.npz'}"]
 
 
+def write_wide_table(root):
+    rows = "".join(f"{k},{k % 3},-6{k % 10},{'' if k % 4 else -70 - k}\n" for k in range(20))
+    (root / "room.csv").write_text("x,y,one,two\n" + rows)
+    return [f"data.file={root / 'room.csv'}"]
+
+
+def write_scenario(root):
+    users = np.random.default_rng(0).uniform((1, -5, 0.5), (9, 5, 2), (20, 3))
+    bounces = np.full((20, 1, 0, 3), np.nan)
+    deepmimo.write(root, 3.5e9, users, [(np.zeros(3), 1j / np.linalg.norm(users, axis=1, keepdims=True), bounces)])
+    return [f"data.root={root}"]
+
+
 FILES = {
+    "deepmimo": write_scenario,
+    "deepmimo_rssi": write_scenario,
     "nerf2_rssi": write_rssi_folder,
     "nerf2_spectrum": write_spectrum_folder,
     "rssi_csv": write_rssi_table,
+    "rssi_wide": write_wide_table,
     "csi_npz": write_channels,
 }
 

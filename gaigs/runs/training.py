@@ -126,7 +126,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     kriged = make_kriged(model)
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
     if "tokenizer" in parts and getattr(model, "tokenizer", model) is None:
-        if parts["tokenizer"] != registry("model").options(name)["tokenizer"]:
+        if parts["tokenizer"] != registry("model").options(name).get("tokenizer", parts["tokenizer"]):
             words = "tokenizer=%s is not read, as deformation=%s takes no tokens"
             log.warning(words, parts["tokenizer"], parts["deformation"])
         parts["tokenizer"] = "none"

@@ -3,6 +3,7 @@
 import cmath
 import json
 import math
+import runpy
 import sys
 
 import numpy as np
@@ -13,7 +14,6 @@ from scipy.constants import speed_of_light
 
 from gaigs.antenna import Array, Receiver
 from gaigs.data import deepmimo, deepmimo_rssi, synthetic
-from gaigs.data.__main__ import main
 from gaigs.data.synthetic.image_source import respond
 from gaigs.testing import check_data
 
@@ -148,7 +148,7 @@ def test_the_built_in_room_is_written_and_read(tmp_path, monkeypatch):
     monkeypatch.setattr(
         sys, "argv", ["gaigs.data", str(tmp_path / "room"), "synthetic_csi", "--deepmimo", "transmitters=20"]
     )
-    main()
+    runpy.run_module("gaigs.data", run_name="__main__")
     links = deepmimo.read(tmp_path / "room", elements=[1, 1], subcarriers=1)
     receiver = Receiver("point", links.receivers[0].pose, Array.single())
     expected = respond(synthetic.ROOM, links.query.transmitters, receiver, 6.4896e9, torch.zeros(1), 2)
