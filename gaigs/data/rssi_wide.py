@@ -314,7 +314,7 @@ def _find_gateways(
     likely = [k for k in likely if table.names[k] in placed or _plain(table.names[k])[0] not in coordinate]
     pooled = table.numbers[:, likely]
     if not_heard is None:
-        marks = marks_of(pooled[np.isfinite(pooled)])
+        marks = marks_of(pooled)
     else:
         marks = [float(mark) for mark in (not_heard if isinstance(not_heard, list) else [not_heard])]
     gateways, silent, ignored = [], [], []
@@ -360,7 +360,7 @@ def _to_world(
     if epsg is not None or largest[:2].max() >= FAR:
         origin = np.floor(points[:count, :2].min(0))
         points[:, :2] -= origin
-        system = f"EPSG:{utm}" if utm else "the table's coordinates; data.epsg gives their system"
+        system = f"EPSG:{utm}" if utm else "the table's coordinates, whose system data.epsg names"
         remark = f"the world's origin is ({origin[0]:.0f}, {origin[1]:.0f}) in {system}"
     far = np.abs(points).max(1) >= FAR
     if far.any():

@@ -157,11 +157,20 @@ def test_an_estimated_place_is_as_far_off_as_it_says():
 
 def test_marks_are_found_and_levels_are_not():
     draw = np.random.default_rng(0)
-    own = np.round(draw.normal(-75, 9, 500)).clip(-104, -40)
-    for mark in (100, -200, 127, -110, -105, 0):
-        assert marks_of(np.concatenate((own, np.full(100, mark)))) == [mark]
+    own = np.round(draw.normal(-75, 9, (100, 5))).clip(-104, -40)
+    own[0, 0] = -104
+    unheard = draw.random(own.shape) < 0.4
+    for mark in (100, -200, 127, -110, -105, -100, 0):
+        assert marks_of(np.where(unheard, mark, own)) == [mark]
+    assert marks_of(np.where(unheard & (np.arange(5) == 2), -120, own)) == [-120]
+    own = own.clip(-88)
+    constant = np.where(np.arange(5) == 2, -95, own)
+    for levels in (own[own < -60][:, None], constant, np.where(constant == -95, -110, own)):
+        assert marks_of(levels) == []
+    own[3, 3] = -100
     assert marks_of(own) == []
-    assert marks_of(np.append(own, 555.0)) == []
+    own[3, 3] = 555
+    assert marks_of(own) == []
 
 
 DEFECTS = [
