@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-import gaigs
+from gaigs.data import divide
 from gaigs.data.gateways import estimate_place
 from gaigs.data.readings import marks_of
 from gaigs.data.rssi_wide import read
@@ -111,7 +111,7 @@ def test_places_of_gateways_come_from_a_file_or_from_training_links(survey, tmp_
     links = survey(table(), gateways=str(tmp_path / name))
     assert [receiver.pose.position.tolist() for receiver in links.receivers[:2]] == [[*p] for p in known.values()]
     assert links.uncertainties.tolist() == [0, 0, float("inf")]
-    split = gaigs.links("rssi_wide", file=str(tmp_path / "survey.csv"), gateways=str(tmp_path / name))
+    split = divide(links, {"name": "random"})
     place, deviation = split.receivers[2].pose.position, split.uncertainties[2].item()
     assert (place[:2] - torch.tensor([2.0, 4.5])).norm() < 1
     assert 0 < deviation < 2
@@ -119,21 +119,19 @@ def test_places_of_gateways_come_from_a_file_or_from_training_links(survey, tmp_
 
 
 def test_test_links_do_not_move_a_gateway(survey, tmp_path):
-    survey(table())
-    first = gaigs.links("rssi_wide", file=str(tmp_path / "survey.csv"))
+    first = divide(survey(table()), {"name": "random"})
     text = (tmp_path / "survey.csv").read_text().splitlines()
     for row in first.rows[first.split.test].unique().tolist():
         text[row + 1] = re.sub(r"-\d+", "-30", text[row + 1])
-    survey("\n".join(text))
-    second = gaigs.links("rssi_wide", file=str(tmp_path / "survey.csv"))
+    second = divide(survey("\n".join(text)), {"name": "random"})
     for a, b in zip(first.receivers, second.receivers, strict=True):
         assert torch.equal(a.pose.position, b.pose.position)
 
 
-def test_receivers_without_training_links_are_left_out(survey, tmp_path):
+def test_receivers_without_training_links_are_left_out(survey):
     text = table(before=("-55",)).replace("x,y,-55", "x,y,rare").splitlines()
-    survey("\n".join([text[0], *(line.replace(",-55,", ",,", 1) for line in text[1:-1]), text[-1]]))
-    seeds = [gaigs.links("rssi_wide", file=str(tmp_path / "survey.csv"), **{"split.seed": seed}) for seed in range(6)]
+    links = survey("\n".join([text[0], *(line.replace(",-55,", ",,", 1) for line in text[1:-1]), text[-1]]))
+    seeds = [divide(links, {"name": "random", "seed": seed}) for seed in range(6)]
     counts = {len(links.receivers) for links in seeds}
     assert counts == {3, 4}
     (fewer, *_) = [links for links in seeds if len(links.receivers) == 3]
