@@ -30,7 +30,7 @@ PAIRS = (
 )
 """Names of the columns of x and y, of easting and northing, of longitude and latitude, in small letters and digits."""
 
-HEIGHTS, FLOORS = PLAIN["z"] | {"alt", "altitude", "elevation", "height"}, {"floor", "storey", "floorid", "level"}
+HEIGHTS, FLOORS = PLAIN["z"] | {"alt", "altitude", "elevation", "height"}, {"floor", "storey", "floorid"}
 NAMES = {"name", "gateway", "ap", "id", "mac", "bssid", "ssid", "station", "anchor", "beacon"}
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
@@ -338,7 +338,7 @@ def _find_gateways(
     bad = {row + 2: table.cell(row, gateways[int(wrong[row].argmax())]) for row in wrong.any(1).nonzero()[0].tolist()}
     marked = ", ".join(f"{mark:g}" for mark in marks) or "an empty cell"
     tables.refuse(table.file, bad, f"a level from {QUIETEST:g} to {LOUDEST:g} dBm ({marked} where nothing was heard)")
-    return Columns(gateways, marks, silent, [name for name in ignored if name])
+    return Columns(gateways, marks, *([name for name in names if name] for names in (silent, ignored)))
 
 
 def _to_world(

@@ -81,6 +81,11 @@ def test_degrees_become_metres_of_utm(survey):
     np.testing.assert_allclose(back, columns[0][::-1], atol=1e-5)
     span = links.query.transmitters.amax(0) - links.query.transmitters.amin(0)
     torch.testing.assert_close(span[:2], torch.tensor([7.0, 4.0]), atol=0.3, rtol=0)
+    columns[:, 1] += 179.99995 - columns[0, 1]
+    columns[columns > 180] -= 360
+    links = survey(table(("lat", "lon"), columns=columns))
+    span = links.query.transmitters.amax(0) - links.query.transmitters.amin(0)
+    torch.testing.assert_close(span[:2], torch.tensor([7.0, 4.0]), atol=0.3, rtol=0)
     with pytest.raises(ValueError, match="expected latitudes within 90 degrees in column lat"):
         survey(table(("lon", "lat"), columns=columns + np.array([0, 100])))
 
