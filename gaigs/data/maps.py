@@ -32,7 +32,8 @@ def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 
     except ImportError:
         raise ImportError("coordinates of maps need pyproj: pip install 'gaigs[maps]'") from None
     try:
-        lon, lat = Transformer.from_crs(epsg, 4326, always_xy=True).transform(*points[0].tolist(), errcheck=True)
+        x, y = points[0].tolist()
+        lon, lat = Transformer.from_crs(epsg, 4326, always_xy=True).transform(x, y, errcheck=True)
         utm = (32700 if lat < 0 else 32600) + int((lon + 180) % 360 // 6) + 1
         east, north = points.T
         moved = Transformer.from_crs(epsg, utm, always_xy=True).transform(east, north, errcheck=True)
