@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -23,7 +23,7 @@ from gaigs.task.rssi import Rssi
 from gaigs.task.scalar import with_unit
 
 LINKS, RECEIVERS = 2000, 12
-"""Most links whose labels are read, evenly spread, and most receivers that the text lists."""
+"""Most links whose spectra or channels are read, evenly spread, and most receivers that the text lists."""
 
 SPANS = 0.3, 1000.0
 """Least and largest usual extent of a measured room [m]; others are probably in another unit."""
@@ -67,7 +67,7 @@ def describe(links: Links) -> Description:
         ()
     """
     check_type("links", links, Links)
-    places, index = links.query.transmitters, evenly(torch.arange(len(links)), LINKS)
+    places, index = links.query.transmitters, _read(links)
     sites, values = places.unique(dim=0), levels(links, index)
     axes = zip("xyz", sites.amin(0).tolist(), sites.amax(0).tolist(), strict=True)
     quantity, unit = quantity_of(links)
@@ -76,7 +76,8 @@ def describe(links: Links) -> Description:
     read = [
         f"{links.task.name}: {len(links)} links of {len(sites)} places at {count} receiver{'s' * (count != 1)}",
         "places [m]: " + ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in axes),
-        f"{with_unit(quantity, unit)}: {low:.3g} to {high:.3g}, median {middle:.3g}",
+        f"{with_unit(quantity, unit)}: {low:.3g} to {high:.3g}, median {middle:.3g}"
+        + f" of {len(index)} links" * (len(index) < len(links)),
     ]
     if links.split is not None:
         read.append(f"split {links.split.name}: " + ", ".join(f"{len(p)} {n}" for n, p in links.split.parts().items()))
@@ -94,6 +95,12 @@ def describe(links: Links) -> Description:
         if count > RECEIVERS:
             read.append(f"... and {count - RECEIVERS} more receivers with fewer links")
     return Description(tuple(read), tuple(suspicions(links, sites)))
+
+
+def _read(links: Links) -> Int[Tensor, " k"]:
+    """The links whose labels are read: all of one number each, otherwise at most ``LINKS``."""
+    index = torch.arange(len(links))
+    return evenly(index, LINKS) if links.task.shape else index
 
 
 def quantity_of(links: Links) -> tuple[str, str]:
@@ -151,7 +158,7 @@ def suspicions_of_levels(links: Links, stands: Float[Tensor, "r 3"], given: Tens
     values = links.labels[torch.arange(len(links))].double()
     if positive := int((values > 0).sum()):
         yield f"{positive} levels are above 0 dBm; was a sign lost?"
-    for mark in marks_of(values.numpy()):
+    for mark in marks_of(values[:, None].numpy()):
         yield f"{int((values == mark).sum())} levels are {mark:g} dBm; does it mean not heard?"
     places, which = query.transmitters.unique(dim=0, return_inverse=True)
     table = torch.full((len(names), len(places)), math.nan, dtype=torch.float64)
@@ -209,7 +216,7 @@ def run(config: dict, folder: Path) -> None:
 
 def figure(links: Links) -> Figure:
     """Places and receivers from above, with the number of receivers or the level there; histogram of the levels."""
-    index = evenly(torch.arange(len(links)), LINKS)
+    index = _read(links)
     values, (quantity, unit) = levels(links, index), quantity_of(links)
     places, counts = links.query.transmitters.unique(dim=0, return_counts=True)
     colours, label = counts, "receivers that hear the place"

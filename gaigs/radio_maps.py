@@ -4,12 +4,12 @@ import math
 import time
 import warnings
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from gaigs.geometry import ExtrapolationWarning
@@ -48,6 +48,12 @@ class RadioMap:
     unit: str = "dBm"
     frequency: float | None = None
     deviations: Float[ndarray, "receivers rows columns"] | None = None
+
+    def only(self, index: Int[ndarray, " k"]) -> "RadioMap":
+        """The maps of some receivers."""
+        deviations = None if self.deviations is None else self.deviations[index]
+        names = tuple(self.receivers[number] for number in index)
+        return replace(self, values=self.values[index], receivers=names, deviations=deviations)
 
     def save(self, path: str | Path) -> None:
         """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and all other attributes that are known.

@@ -1,11 +1,16 @@
 """A first look at links: each fault is named, and sound links have none."""
 
+import functools
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import gaigs
+from gaigs.data.readings import gateway
+from gaigs.query import Query
 from gaigs.testing import example_links
 
 PLACES = np.random.default_rng(0).uniform([0, 0, 1], [9, 5, 1.5], (60, 3))
@@ -14,8 +19,18 @@ APART = np.linalg.norm(PLACES[:, None] - GATEWAYS, axis=2)
 LEVELS = -40 - 28 * np.log10(APART) + np.random.default_rng(1).normal(0, 2, APART.shape)
 
 
+@functools.cache
+def sound():
+    return gaigs.links(task="rssi", transmitters=PLACES, receivers=GATEWAYS, labels=LEVELS)
+
+
 def described(places=PLACES, gateways=GATEWAYS, levels=LEVELS):
-    return gaigs.describe(gaigs.links(task="rssi", transmitters=places, receivers=gateways, labels=levels))
+    numbers = sound().query.receivers
+    query = Query(torch.tensor(places).float().repeat_interleave(len(gateways), 0), numbers)
+    receivers = tuple(gateway(f"rx{k}", torch.tensor(place).float()) for k, place in enumerate(gateways))
+    return gaigs.describe(
+        replace(sound(), query=query, receivers=receivers, labels=torch.tensor(levels).flatten().float())
+    )
 
 
 def changed(column, values):

@@ -11,7 +11,7 @@ def is_utm(epsg: int) -> bool:
 
 
 def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 2"], int]:
-    """Eastings and northings [m] in the UTM zone of the points' middle, and its EPSG code.
+    """Eastings and northings [m] in the UTM zone of the first point, and its EPSG code.
 
     Points of UTM stay as they are. Degrees are longitude before latitude.
 
@@ -32,7 +32,7 @@ def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 
     except ImportError:
         raise ImportError("coordinates of maps need pyproj: pip install 'gaigs[maps]'") from None
     try:
-        x, y = points.mean(0).tolist()
+        x, y = points[0].tolist()
         lon, lat = Transformer.from_crs(epsg, 4326, always_xy=True).transform(x, y, errcheck=True)
         utm = (32700 if lat < 0 else 32600) + int((lon + 180) % 360 // 6) + 1
         east, north = points.T

@@ -32,23 +32,29 @@ def to_dbm(file: Path, rows: Rows, names: Sequence[str], lowest: float, not_hear
     return to_numbers(file, rows, names, holds, expected)
 
 
-def marks_of(levels: Float[ndarray, " n"]) -> list[float]:
-    """Values among readings [dBm] that mean "not heard".
+def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
+    """Values among readings [dBm] that mean "not heard", a gateway a column; NaN for an empty cell.
 
-    They are repeated or usual values out of bounds; the lowest value if it is usual and 5 dB below all others, or has
-    5 % of the readings and five times those of each value within 5 dB; and 0 if it is 10 dB above all others.
+    They are repeated or usual values out of bounds, and 0 if it is 10 dB above all others. Of columns with two values
+    or more, they are usual values from -105 down that are 5 dB below all others, and the lowest and usual ones that
+    have 5 % of the readings, five times those of each value within 5 dB, and stand in two columns or the only one.
     """
-    values, counts = np.unique(levels, return_counts=True)
+    values, counts = np.unique(levels[np.isfinite(levels)], return_counts=True)
     outside = (values < QUIETEST) | (values > LOUDEST)
     marks = values[outside & ((counts > 1) | np.isin(values, MARKS))].tolist()
-    values, counts = values[~outside], counts[~outside]
-    if len(values) < 2:
-        return marks
-    often, near = max(3, 0.05 * counts.sum()), counts[1:][values[1:] < values[0] + 5]
-    if (counts[0] >= often and counts[0] > 5 * near.max(initial=0)) or (values[0] in ROUND and not len(near)):
-        marks.append(float(values[0]))
-    if values[-1] == 0 and values[-2] < -10:
+    values = values[~outside]
+    if len(values) > 1 and values[-1] == 0 and values[-2] < -10:
         marks.append(0.0)
+    lowest = values.min(initial=0)
+    own = np.where((levels >= QUIETEST) & (levels <= LOUDEST), levels, np.nan)
+    own = own[:, [len(np.unique(column[~np.isnan(column)])) > 1 for column in own.T]]
+    values, counts = np.unique(own[~np.isnan(own)], return_counts=True)
+    for value in values[np.isin(values, [*ROUND, lowest])].tolist():
+        count, near = counts[values == value][0], counts[(values != value) & (np.abs(values - value) < 5)]
+        is_often = count >= max(3, 0.05 * counts.sum()) and count > 5 * near.max(initial=0)
+        is_apart = value in ROUND[1:] and value == lowest and not len(near)
+        if is_apart or (is_often and (own == value).any(0).sum() >= min(2, own.shape[1])):
+            marks.append(value)
     return marks
 
 

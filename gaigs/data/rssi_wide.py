@@ -30,7 +30,7 @@ PAIRS = (
 )
 """Names of the columns of x and y, of easting and northing, of longitude and latitude, in small letters and digits."""
 
-HEIGHTS, FLOORS = PLAIN["z"] | {"alt", "altitude", "elevation", "height"}, {"floor", "storey", "floorid", "level"}
+HEIGHTS, FLOORS = PLAIN["z"] | {"alt", "altitude", "elevation", "height"}, {"floor", "storey", "floorid"}
 NAMES = {"name", "gateway", "ap", "id", "mac", "bssid", "ssid", "station", "anchor", "beacon"}
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
@@ -314,7 +314,7 @@ def _find_gateways(
     likely = [k for k in likely if table.names[k] in placed or _plain(table.names[k])[0] not in coordinate]
     pooled = table.numbers[:, likely]
     if not_heard is None:
-        marks = marks_of(pooled[np.isfinite(pooled)])
+        marks = marks_of(pooled)
     else:
         marks = [float(mark) for mark in (not_heard if isinstance(not_heard, list) else [not_heard])]
     gateways, silent, ignored = [], [], []
@@ -338,7 +338,7 @@ def _find_gateways(
     bad = {row + 2: table.cell(row, gateways[int(wrong[row].argmax())]) for row in wrong.any(1).nonzero()[0].tolist()}
     marked = ", ".join(f"{mark:g}" for mark in marks) or "an empty cell"
     tables.refuse(table.file, bad, f"a level from {QUIETEST:g} to {LOUDEST:g} dBm ({marked} where nothing was heard)")
-    return Columns(gateways, marks, silent, [name for name in ignored if name])
+    return Columns(gateways, marks, *([name for name in names if name] for names in (silent, ignored)))
 
 
 def _to_world(
@@ -360,7 +360,7 @@ def _to_world(
     if epsg is not None or largest[:2].max() >= FAR:
         origin = np.floor(points[:count, :2].min(0))
         points[:, :2] -= origin
-        system = f"EPSG:{utm}" if utm else "the table's coordinates; data.epsg gives their system"
+        system = f"EPSG:{utm}" if utm else "the table's coordinates, whose system data.epsg names"
         remark = f"the world's origin is ({origin[0]:.0f}, {origin[1]:.0f}) in {system}"
     far = np.abs(points).max(1) >= FAR
     if far.any():

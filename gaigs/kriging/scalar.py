@@ -280,9 +280,13 @@ class ScalarProcess(nn.Module):
         return float(found.fun), own, made._replace(scale=float(made.scale))
 
     def _held_out(self, held: Int[Tensor, " h"], folds: Int[Tensor, " k"], most: int) -> tuple[Tensor, Around]:
-        """About ``most`` of the rows that may be held out (m,), and the readings of other folds around each."""
+        """About ``most`` of the rows that may be held out (m,), and the readings of other folds around each.
+
+        Receivers have 16 each or more, unless that makes four times as many.
+        """
         own = [held[self.receivers[held] == receiver] for receiver in self.receivers[held].unique()]
-        asked = torch.cat([evenly(rows, max(16, most // len(own))) for rows in own])
+        each = max(1, most // len(own), min(16, 4 * most // len(own)))
+        asked = torch.cat([evenly(rows, each) for rows in own])
         nearest = self._nearest(self.places[asked], self.receivers[asked], folds[asked], folds, reach=True)
         return asked, self._around(self.places[asked], self.receivers[asked], nearest)
 

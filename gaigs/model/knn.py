@@ -85,6 +85,8 @@ class KNearestNeighbours(Model):
         weights = weights / weights.sum(1, keepdim=True)
         used = near.any(0)
         labels, align = self.links.labels[index[used]], self.scene.task.align
+        if not self.scene.task.shape:  # a radio map of many receivers asks for millions of numbers
+            return weights[:, used].to(labels) @ labels
         rows = []
         for own, first in zip(weights[:, used], apart[:, used].argmin(1).tolist(), strict=True):
             near = own.nonzero()[:, 0]

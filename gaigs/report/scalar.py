@@ -23,8 +23,8 @@ from gaigs.report.figures import TaskFigures, own_scores, scores_of_systems
 from gaigs.report.style import BLUE, GREY, ORANGE, PAGE, STYLE, round_step
 from gaigs.task.scalar import Scalar, with_unit
 
-PANELS = 6
-"""Largest number of panels of a figure, a panel a receiver."""
+PANELS, MOST = 6, 12
+"""Largest numbers of panels of a figure, a panel a receiver, and of receivers in the figures of a run."""
 
 FEW = 400
 """Largest number of dots of a panel that can be told apart."""
@@ -40,11 +40,14 @@ class ScalarFigures(TaskFigures):
                 run[name] for name in ("transmitters", "receiver", "labels", "prediction")
             )
         gateways = {one.name: one.pose.position.numpy() for one in links.receivers}
+        # Of many receivers those with the most test readings, in their order.
+        shown = np.sort((-np.bincount(receiver, minlength=len(gateways))).argsort(kind="stable")[:MOST])
+        own = np.isin(receiver, shown)
         readings = np.column_stack((transmitters[:, :2], labels))
         measured = {name: readings[receiver == index] for index, name in enumerate(gateways)}
-        radio_map, edges = RadioMap.load(folder / "radio_map.npz"), links.edges.numpy()
+        radio_map, edges = RadioMap.load(folder / "radio_map.npz").only(shown), links.edges.numpy()
         maps = map_pages(radio_map, gateways, measured, edges, task)
-        pages = predicted_against_measured(labels, predictions, receiver, [*gateways], task)
+        pages = predicted_against_measured(labels[own], predictions[own], receiver[own], [*gateways], task)
         # The last hundredth would squeeze all others.
         furthest = float(max(np.quantile(error, 0.99) for error in errors.values())) or None
         title = with_unit("|error|", task.error_unit)
@@ -113,6 +116,8 @@ def predicted_against_measured(
                 bar = figure.colorbar(image, ax=axes, label=label, format="{x:g}", aspect=30, shrink=0.7)
                 bar.set_ticks(ticks[ticks <= colours.vmax])
                 bar.minorticks_off()
+            if len(heard) < len(names):
+                figure.suptitle(f"{len(heard)} of {len(names)} receivers", size=8)
             figures.append(figure)
     return figures
 
@@ -164,6 +169,8 @@ def radio_maps(
     lines = {"colors": "white", "linestyles": "solid", "linewidths": 0.4, "alpha": 0.5}
     carrier = "" if radio_map.frequency is None else f" at {radio_map.frequency / 1e9:.6g} GHz"
     title = f"Predicted {radio_map.quantity} of a transmitter at z = {radio_map.height:.2f} m{carrier}"
+    if (count := len(radio_map.receivers)) < len(gateways):
+        title += f" at {count} of {len(gateways)} receivers"
     figures = []
     with rc_context(STYLE):
         for first in range(0, len(radio_map.receivers), PANELS):

@@ -1,6 +1,7 @@
 """Tables for terminals, Markdown and CSV; the scores of a run beside those of its baselines."""
 
 import csv
+import itertools
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,9 @@ from rich.text import Text
 from gaigs.io.files import atomic_write
 from gaigs.registry import registry
 from gaigs.task import Metric, Task
+
+ROWS = 20
+"""Most receivers in the table of a run."""
 
 
 class Spread(NamedTuple):
@@ -137,11 +141,14 @@ def metrics_table(metrics: Mapping) -> Group:
 
 
 def _receivers_table(receivers: Mapping, name: str, metric: Metric) -> Table:
-    """Receivers down, models across: one metric."""
+    """Receivers down, models across: one metric; of many receivers the first ``ROWS``."""
     table = Table("receiver", title=f"{escape(metric.title)} at each receiver")
+    if len(receivers) > ROWS:
+        table.caption = f"the first {ROWS} of {len(receivers)} receivers; all are in metrics.json"
     for model in next(iter(receivers.values())):
         table.add_column(escape(model), justify="right")
-    for receiver, models in receivers.items():  # markup would make emojis of addresses such as 00:cd:11
+    for receiver, models in itertools.islice(receivers.items(), ROWS):
+        # Markup would make emojis of addresses such as 00:cd:11.
         table.add_row(Text(receiver), *_cells(models, name, metric.higher_is_better).values())
     return table
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-import gaigs
+from gaigs.data import divide
 from gaigs.data.gateways import estimate_place
 from gaigs.data.readings import marks_of
 from gaigs.data.rssi_wide import read
@@ -81,6 +81,11 @@ def test_degrees_become_metres_of_utm(survey):
     np.testing.assert_allclose(back, columns[0][::-1], atol=1e-5)
     span = links.query.transmitters.amax(0) - links.query.transmitters.amin(0)
     torch.testing.assert_close(span[:2], torch.tensor([7.0, 4.0]), atol=0.3, rtol=0)
+    columns[:, 1] += 179.99995 - columns[0, 1]
+    columns[columns > 180] -= 360
+    links = survey(table(("lat", "lon"), columns=columns))
+    span = links.query.transmitters.amax(0) - links.query.transmitters.amin(0)
+    torch.testing.assert_close(span[:2], torch.tensor([7.0, 4.0]), atol=0.3, rtol=0)
     with pytest.raises(ValueError, match="expected latitudes within 90 degrees in column lat"):
         survey(table(("lon", "lat"), columns=columns + np.array([0, 100])))
 
@@ -111,7 +116,7 @@ def test_places_of_gateways_come_from_a_file_or_from_training_links(survey, tmp_
     links = survey(table(), gateways=str(tmp_path / name))
     assert [receiver.pose.position.tolist() for receiver in links.receivers[:2]] == [[*p] for p in known.values()]
     assert links.uncertainties.tolist() == [0, 0, float("inf")]
-    split = gaigs.links("rssi_wide", file=str(tmp_path / "survey.csv"), gateways=str(tmp_path / name))
+    split = divide(links, {"name": "random"})
     place, deviation = split.receivers[2].pose.position, split.uncertainties[2].item()
     assert (place[:2] - torch.tensor([2.0, 4.5])).norm() < 1
     assert 0 < deviation < 2
@@ -119,21 +124,19 @@ def test_places_of_gateways_come_from_a_file_or_from_training_links(survey, tmp_
 
 
 def test_test_links_do_not_move_a_gateway(survey, tmp_path):
-    survey(table())
-    first = gaigs.links("rssi_wide", file=str(tmp_path / "survey.csv"))
+    first = divide(survey(table()), {"name": "random"})
     text = (tmp_path / "survey.csv").read_text().splitlines()
     for row in first.rows[first.split.test].unique().tolist():
         text[row + 1] = re.sub(r"-\d+", "-30", text[row + 1])
-    survey("\n".join(text))
-    second = gaigs.links("rssi_wide", file=str(tmp_path / "survey.csv"))
+    second = divide(survey("\n".join(text)), {"name": "random"})
     for a, b in zip(first.receivers, second.receivers, strict=True):
         assert torch.equal(a.pose.position, b.pose.position)
 
 
-def test_receivers_without_training_links_are_left_out(survey, tmp_path):
+def test_receivers_without_training_links_are_left_out(survey):
     text = table(before=("-55",)).replace("x,y,-55", "x,y,rare").splitlines()
-    survey("\n".join([text[0], *(line.replace(",-55,", ",,", 1) for line in text[1:-1]), text[-1]]))
-    seeds = [gaigs.links("rssi_wide", file=str(tmp_path / "survey.csv"), **{"split.seed": seed}) for seed in range(6)]
+    links = survey("\n".join([text[0], *(line.replace(",-55,", ",,", 1) for line in text[1:-1]), text[-1]]))
+    seeds = [divide(links, {"name": "random", "seed": seed}) for seed in range(6)]
     counts = {len(links.receivers) for links in seeds}
     assert counts == {3, 4}
     (fewer, *_) = [links for links in seeds if len(links.receivers) == 3]
@@ -157,11 +160,20 @@ def test_an_estimated_place_is_as_far_off_as_it_says():
 
 def test_marks_are_found_and_levels_are_not():
     draw = np.random.default_rng(0)
-    own = np.round(draw.normal(-75, 9, 500)).clip(-104, -40)
-    for mark in (100, -200, 127, -110, -105, 0):
-        assert marks_of(np.concatenate((own, np.full(100, mark)))) == [mark]
+    own = np.round(draw.normal(-75, 9, (100, 5))).clip(-104, -40)
+    own[0, 0] = -104
+    unheard = draw.random(own.shape) < 0.4
+    for mark in (100, -200, 127, -110, -105, -100, 0):
+        assert marks_of(np.where(unheard, mark, own)) == [mark]
+    assert marks_of(np.where(unheard & (np.arange(5) == 2), -120, own)) == [-120]
+    own = own.clip(-88)
+    constant = np.where(np.arange(5) == 2, -95, own)
+    for levels in (own[own < -60][:, None], constant, np.where(constant == -95, -110, own)):
+        assert marks_of(levels) == []
+    own[3, 3] = -100
     assert marks_of(own) == []
-    assert marks_of(np.append(own, 555.0)) == []
+    own[3, 3] = 555
+    assert marks_of(own) == []
 
 
 DEFECTS = [

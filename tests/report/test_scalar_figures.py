@@ -1,15 +1,20 @@
 """Predicted against measured values and radio maps, read back from their artists."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.contour import QuadContourSet
 
+from gaigs.data import Split
 from gaigs.radio_maps import RadioMap
 from gaigs.report import scalar
 from gaigs.report.scalar import PANELS, predicted_against_measured, radio_maps
 from gaigs.report.style import round_step
 from gaigs.task.rssi import Rssi
+from gaigs.testing import example_links
 
 
 def task(quantity, unit, error_unit):
@@ -245,3 +250,21 @@ def test_colours_hold_the_map_and_the_readings_but_not_a_peak():
     low, high = panels(figure)[0].images[0].get_clim()
     assert low <= -97
     assert -52 < high < 0
+
+
+def test_a_run_draws_the_receivers_with_most_readings(tmp_path):
+    receiver = np.repeat(np.arange(20), np.where(np.arange(20) % 2, 3, 5))
+    links = example_links("rssi")
+    receivers = tuple(replace(links.receivers[0], name=f"g{i}") for i in range(20))
+    places, labels = np.zeros((len(receiver), 3)), -60 - np.arange(len(receiver)) / 9
+    arrays = {"transmitters": places, "receiver": receiver, "labels": labels, "prediction": labels}
+    np.savez(tmp_path / "predictions.npz", **arrays, error_knn=labels)
+    maps(20).save(tmp_path / "radio_map.npz")
+    links = replace(links, receivers=receivers, split=Split("random", *torch.zeros(3, 0, dtype=torch.long)))
+    drawn = scalar.ScalarFigures().of_run(Rssi(), tmp_path, links)
+    names = "radio_map", "predicted_against_measured"
+    assert {*drawn} == {"error_cdf", *(f"{name}{page}" for name in names for page in ("", "_2"))}
+    titles = [ax.get_title() for page in ("", "_2") for ax in panels(drawn[f"radio_map{page}"])]
+    assert titles == [f"g{i}" for i in (0, 1, 2, 3, 4, 6, 8, 10, 12, 14, 16, 18)]
+    assert "12 of 20 receivers" in drawn["radio_map"].get_suptitle()
+    assert drawn["predicted_against_measured"].get_suptitle() == "12 of 20 receivers"
