@@ -25,6 +25,13 @@ ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples/room.ckpt"
 
 
+@pytest.fixture(autouse=True)
+def few_places(monkeypatch):
+    monkeypatch.setattr("gaigs.viewing.PLACES", 8)
+    monkeypatch.setattr("gaigs.viewing.FEWEST", 4)
+    monkeypatch.setattr("gaigs.viewing.contents.POINTS", 6)
+
+
 @pytest.fixture(scope="module")
 def links():
     return {task: example_links(task) for task in ("spectrum", "rssi", "csi")}
@@ -87,10 +94,7 @@ def test_a_channels_impulse_response_peaks_at_the_direct_path(links):
 
 
 @pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_a_file_has_all_answers(task, links, monkeypatch):
-    monkeypatch.setattr("gaigs.viewing.PLACES", 8)
-    monkeypatch.setattr("gaigs.viewing.FEWEST", 4)
-    monkeypatch.setattr("gaigs.viewing.contents.POINTS", 6)
+def test_a_file_has_all_answers(task, links):
     view = gaigs.view(gaigs.train("mean", links[task]), links[task])
     found = content(view.page(view.stored()))
     (facts,), stored = found["runs"], found["stored"]
@@ -107,7 +111,7 @@ def test_a_file_has_all_answers(task, links, monkeypatch):
 @contextmanager
 def serving(view):
     with server(view.page(), view.contents, 0) as started:
-        threading.Thread(target=started.serve_forever, daemon=True).start()
+        threading.Thread(target=started.serve_forever, args=(0.05,), daemon=True).start()
         try:
             yield f"http://127.0.0.1:{started.server_port}/"
         finally:
@@ -185,8 +189,7 @@ def pixel(browser, place):
 
 
 @pytest.mark.parametrize("is_served", [True, False], ids=["server", "file"])
-def test_a_drag_changes_the_picture(is_served, browser, links, levels, tmp_path, monkeypatch):
-    monkeypatch.setattr("gaigs.viewing.contents.POINTS", 6)
+def test_a_drag_changes_the_picture(is_served, browser, links, levels, tmp_path):
     view = gaigs.view(levels, links["rssi"])
     with serving(view) as url:
         if not is_served:
