@@ -184,6 +184,7 @@ class Run {
 
   drawMap({x, y, height, values}, range) {
     const [low, high] = this.range = range;
+    this.level = height;
     const corner = (i, j) => [x[i], y[j], height,
       ...this.colour("viridis", (values[j * x.length + i] - low) / (high - low || 1)), 0.8];
     const numbers = [];
@@ -368,7 +369,7 @@ class Run {
       add(["tests"], `test links by ${nameOf(facts.tests.title)}; click one`, "width:9px;height:9px;margin:auto;border-radius:5px;background:#fd8d3c;border:1px solid #555", true,
         ["YlOrRd", minus(digits(scale[0])), withUnit(scale[1], facts.tests.title)]);
     }
-    if (facts.map) add(["map"], `radio map: ${nameOf(facts.map)} at this height`, `background:${gradient("viridis")}`, true,
+    if (facts.map) add(["map"], `radio map: ${nameOf(facts.map)}${this.range ? ` at z = ${minus(digits(this.level))} m` : ""}`, `background:${gradient("viridis")}`, true,
       this.range ? ["viridis", minus(digits(this.range[0])), withUnit(this.range[1], facts.map)] : null);
     if (facts.kind === "spectrum") add(["sphere"], "spectrum at the receiver", `border-radius:5px;background:${gradient("viridis")}`, true, ["viridis", "0", "1 amplitude"]);
     if (facts.planes.length) add(["paths"], "paths", "height:3px;background:#9c179e", true, ["plasma_r", minus("-30"), "0 dB of the strongest"]);
@@ -571,7 +572,8 @@ async function start() {
     update(); updateMaps();
   });
   const slider = $("height");
-  [slider.min, slider.max] = content.stored ? [Math.min(...content.stored.heights), Math.max(...content.stored.heights)] : [first.low[2], first.high[2]];
+  const heights = content.stored ? content.stored.places.map(place => place[2]) : [first.low[2], first.high[2]];
+  [slider.min, slider.max] = [Math.min(...heights), Math.max(...heights)];
   slider.parentElement.hidden = slider.min === slider.max;
   slider.addEventListener("input", () => move([state.place[0], state.place[1], +slider.value]));
   const home = () => {

@@ -100,7 +100,8 @@ def test_maps_without_a_place_on_earth_say_so(rssi, tmp_path, caplog):
     assert first["geometry"]["coordinates"] == gaigs.radio_map(model, pitch=1.0).x[:1].tolist() * 2
 
 
-def test_figures_are_pages(rssi, tmp_path):
+def test_figures_are_pages(rssi, tmp_path, monkeypatch):
+    monkeypatch.setattr("gaigs.report.style.DPI", 60)
     model, _ = rssi
     with figure_formats("svg"):  # those of reports, not of exports
         names = [path.name for path in gaigs.export(model, tmp_path / "floor.PNG", pitch=1.0)]

@@ -145,7 +145,7 @@ def test_two_runs_have_the_same_receivers(levels, mirrored):
 def test_the_example_predicts(mirrored):
     assert EXAMPLE.stat().st_size < 1e6
     links = gaigs.links("synthetic")
-    test = links.split.test[:20]
+    test = links.split.test[:8]
     values = mirrored.predict(links.query[test])
     assert links.task.scores(links.labels[test], values)["ssim"].median() > 0.9
     shown = contents_of(EXAMPLE).facts()
