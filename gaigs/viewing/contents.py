@@ -157,7 +157,7 @@ class Contents:
         query, _ = Query.from_positions([place], receiver, self.frequency, self._names, self.scene.frequencies)
         paths = call_optional(self.model, "learnt_paths", query) or []
         answer["paths"] = [{"points": plain(path.points), "power": plain(path.power_db)} for path in paths]
-        return answer | {"place": plain(np.asarray(place))}
+        return answer | {"place": plain(place)}
 
     def slice(self, height: float, receiver: int) -> dict:
         """The radio map over the training transmitters and receivers at a height [m]."""

@@ -20,6 +20,7 @@ const withUnit = (value, title) => {  // "error [dB]" is the title of "2.1 dB"
   const unit = /\[(.*)\]/.exec(title);
   return minus(digits(value)) + (unit ? ` ${unit[1]}` : "");
 };
+const short = name => name.length > 16 ? `${name.slice(0, 7)}\u2026${name.slice(-7)}` : name;  // both ends tell apart
 const nameOf = title => title.replace(/ \[.*/, "");
 const minus = text => String(text).replace("-", "\u2212");
 const steps = (low, high, most) => {  // round numbers, by 1, 2 or 5
@@ -316,7 +317,7 @@ class Run {
       const y = row * (k + 0.5) + 2, value = answer.levels[k], own = k === state.receiver;
       pen.font = `${own ? "600 " : ""}11px system-ui, sans-serif`;
       pen.textAlign = "right"; pen.fillStyle = own ? "#00664a" : "#444";
-      pen.fillText(facts.receivers[k].name, left - 8, y + 4, left - 12);
+      pen.fillText(short(facts.receivers[k].name), left - 8, y + 4, left - 12);
       pen.strokeStyle = pen.fillStyle = own ? "#009e73" : "#6e6e6e"; pen.lineWidth = 2;
       pen.beginPath(); pen.moveTo(at(value - stds[k]), y); pen.lineTo(at(value + stds[k]), y); pen.stroke();
       pen.beginPath(); pen.arc(at(value), y, 4.5, 0, 7); pen.fill();
