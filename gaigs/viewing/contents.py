@@ -84,6 +84,7 @@ class Contents:
             "title": self.title,
             "task": self.task.name,
             "kind": self.kind,
+            "carrier": self.frequency if len(self.scene.frequencies) > 1 else None,
             "quantity": quantity,
             "map": {"level": quantity, "channel": "power [dB]"}.get(self.kind or ""),
             "box": plain(torch.stack((self.scene.lower, self.scene.upper))),

@@ -88,7 +88,7 @@ class Run {
     this.labels = element("div", {className: "labels"});
     this.legend = element("details", {className: "legend"});
     const about = facts.kind ? `${facts.task}, ${facts.receivers.length} receiver${facts.receivers.length > 1 ? "s" : ""}` : facts.task;
-    const title = element("h2", {}, facts.title + " ", element("small", {textContent: about}));
+    const title = element("h2", {}, facts.title + " ", element("small", {textContent: about + (facts.carrier ? `, predictions at ${+(facts.carrier / 1e9).toPrecision(5)} GHz` : "")}));
     this.scene = element("div", {className: "scene"}, this.canvas, this.labels, this.legend, title);
     this.prediction = element("div"); this.comparison = element("div");
     this.results = element("div", {className: "results"}, this.prediction, this.comparison);
