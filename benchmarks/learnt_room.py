@@ -7,7 +7,8 @@ The room is exported as a scene of Mitsuba, loaded by Sionna RT, and traced at t
 as the model has. Furniture is no part of the scene: the model knows it as Gaussians of matter. So traced channels are
 compared with the model's without them, and also after the attenuation by them along each traced path. Each receiver's
 traced channels have one complex gain, ``fit_gain`` to what they are compared with: the model's own gain of a receiver
-makes up for the mean attenuation by its obstacles. Prints tables in Markdown. Needs gaigs[sionna].
+makes up for the mean attenuation by its obstacles. Two rows are without it. Prints tables in Markdown. Needs
+gaigs[sionna].
 """
 
 import copy
@@ -62,7 +63,7 @@ def fitted(
     channels: Complex[Tensor, "b e s"], others: Complex[Tensor, "b e s"], query: Query
 ) -> Complex[Tensor, "b e s"]:
     """Channels with one gain for each receiver, that over other channels."""
-    found = channels.to(torch.complex128)
+    found = channels.clone()
     for own in (query.receivers == receiver for receiver in query.receivers.unique()):
         found[own] *= fit_gain(others[own], found[own])
     return found.to(others.dtype)
@@ -111,6 +112,8 @@ def main(folder: Path) -> None:
         ("traced", "the model without kriging and obstacles", fitted(traced, walls, query), walls),
         ("traced, with the learnt obstacles", "the model without kriging", fitted(dimmed, plain, query), plain),
         ("traced, with the learnt obstacles", "measured", fitted(dimmed, measured, query), measured),
+        ("traced, no gain", "the model without kriging and obstacles", traced.to(walls.dtype), walls),
+        ("traced, no gain, with the learnt obstacles", "the model without kriging", dimmed.to(plain.dtype), plain),
     ]
     lines = [("channels", "against", "median SNR [dB]", "mean SINAD [dB]", "NMSE [dB]")]
     for name, other, values, labels in rows:

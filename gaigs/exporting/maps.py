@@ -9,6 +9,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 import tifffile
 from jaxtyping import Float
+from matplotlib import rc_context
 from matplotlib.backends.backend_pdf import PdfPages
 from numpy import ndarray
 
@@ -63,14 +64,14 @@ def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     tags: list[tuple] = [
         (33550, "d", 3, (width, height, 0.0), True),  # ModelPixelScale
         (33922, "d", 6, (0.0, 0.0, 0.0, x[0] - width / 2, y[-1] + height / 2, 0.0), True),  # ModelTiepoint
-        (42112, "s", 0, f"<GDALMetadata>{items}</GDALMetadata>", True),
+        (42112, "s", 0, f"<GDALMetadata>{items}</GDALMetadata>".encode(), True),
     ]
     if scene.frame is not None:  # GeoKeyDirectory: projected, pixels are areas, EPSG code
         keys = (1, 1, 1, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, scene.frame.epsg)
         tags.append((34735, "H", len(keys), keys, True))
     options: dict[str, Any] = {"photometric": "minisblack", "planarconfig": "separate", "metadata": None}
     with atomic_write(file) as part:
-        tifffile.imwrite(part, bands, description=title(floor), extratags=tags, **options)
+        tifffile.imwrite(part, bands, description=title(floor).encode(), extratags=tags, **options)
     return [file]
 
 
@@ -136,7 +137,7 @@ def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     task: Any = scene.task
     pages = map_pages(floor, gateways, none, np.zeros((0, 2, 3), np.float32), task)
     if file.suffix.lower() == ".pdf":
-        with atomic_write(file) as part, PdfPages(part) as document:
+        with atomic_write(file) as part, rc_context(style.STYLE), PdfPages(part) as document:
             for page in pages.values():
                 document.savefig(page)
         return [file]
@@ -144,7 +145,8 @@ def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     for name, page in pages.items():
         ending = name.removeprefix("radio_map").replace("deviation_map", "_deviation")
         files.append(file.with_stem(f"{file.stem}{ending}"))
-        style.save(page, files[-1])
+        with atomic_write(files[-1]) as part, rc_context(style.STYLE):
+            page.savefig(part, dpi=style.DPI)
     return files
 
 

@@ -22,6 +22,7 @@ from gaigs.placement.learnt_room import LearntPlane
 from gaigs.placement.mirrored import export
 from gaigs.placement.mirrored.materials import Material, materials
 from gaigs.query import check_carrier
+from gaigs.registry import name_of
 
 COLOUR = 0.0, 0.45, 0.70, 0.35
 """Red, green, blue and opacity of planes: the figures' blue, through which the room shows."""
@@ -43,7 +44,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     own: Any = model.members[0] if isinstance(model, Ensemble) else model
     own = own.trend if isinstance(own, Kriging) else own
     if not isinstance(own, MirroredSplatting):
-        raise ValueError(f"a learnt room takes a model 'mirrored', got {type(own).__name__}; train it on the same data")
+        raise ValueError(f"a learnt room takes a model 'mirrored', got {name_of(own)!r}; train it on the same data")
     suffix, found = file.suffix.lower(), export.survey(own.placement, own.surveyed)
     if suffix == ".obj":
         write_text(file, export.wavefront_obj(own.placement, found))
@@ -88,23 +89,22 @@ def write_scene(file: Path, meshes: Sequence[Mesh], materials: Sequence[Material
             numbers["conductivity"] = conductivity(material.name, frequency)
         for key, number in numbers.items():
             ElementTree.SubElement(surface, "float", name=key, value=f"{number:.6g}")
-    folder = file.with_name(f"{file.stem}_meshes")
-    folder.mkdir(exist_ok=True)
-    files = []
-    for mesh, material in zip(meshes, materials, strict=True):
-        files.append(folder / f"{mesh.name}.ply")
-        vertices = np.array([*mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"])
-        faces = np.array([(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))])
-        elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-        with atomic_write(files[-1]) as part:
-            PlyData(elements, byte_order="<").write(str(part))
-        shape = ElementTree.SubElement(scene, "shape", type="ply", id=f"mesh-{mesh.name}")
-        ElementTree.SubElement(shape, "string", name="filename", value=f"{folder.name}/{files[-1].name}")
-        ElementTree.SubElement(shape, "boolean", name="face_normals", value="true")
-        ElementTree.SubElement(shape, "ref", id=names[material], name="bsdf")
-    ElementTree.indent(scene)
-    write_text(file, ElementTree.tostring(scene, encoding="unicode") + "\n")
-    return [file, *files]
+    folder, files = file.with_name(f"{file.stem}_meshes"), [file]
+    with atomic_write(file) as part:
+        folder.mkdir(exist_ok=True)
+        for mesh, material in zip(meshes, materials, strict=True):
+            files.append(folder / f"{mesh.name}.ply")
+            vertices = np.array([*mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"])
+            faces = np.array([(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))])
+            elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+            PlyData(elements, byte_order="<").write(str(files[-1]))
+            shape = ElementTree.SubElement(scene, "shape", type="ply", id=f"mesh-{mesh.name}")
+            ElementTree.SubElement(shape, "string", name="filename", value=f"{folder.name}/{files[-1].name}")
+            ElementTree.SubElement(shape, "boolean", name="face_normals", value="true")
+            ElementTree.SubElement(shape, "ref", id=names[material], name="bsdf")
+        ElementTree.indent(scene)
+        part.write_text(ElementTree.tostring(scene, encoding="unicode") + "\n", encoding="utf-8")
+    return files
 
 
 def write_gltf(file: Path, meshes: Sequence[Mesh], extras: Sequence[Mapping[str, float]]) -> None:

@@ -17,6 +17,7 @@ from gaigs import checkpoint
 from gaigs.data import Links
 from gaigs.geometry import even_places
 from gaigs.io.files import write_text
+from gaigs.kriging.links import evenly
 from gaigs.model import Model
 from gaigs.model.kriging import Kriging
 from gaigs.registry import call, check_type, name_of
@@ -103,7 +104,8 @@ class View:
         scene = self.contents[0].scene
         count = len(scene.receivers)
         places = even_places(scene.lower, scene.upper, max(FEWEST, PLACES // count))
-        heights = places[:, 2].unique().tolist()[: max(1, MAPS // count)]
+        heights = places[:, 2].unique()
+        heights = heights[evenly(torch.arange(len(heights)), max(1, MAPS // count))].tolist()
         runs = []
         for one in self.contents:
             answers = [[one.answer(place, k, STEP) for k in range(count)] for place in places.tolist()]

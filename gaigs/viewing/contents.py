@@ -84,6 +84,7 @@ class Contents:
             "title": self.title,
             "task": self.task.name,
             "kind": self.kind,
+            "carrier": self.frequency if len(self.scene.frequencies) > 1 else None,
             "quantity": quantity,
             "map": {"level": quantity, "channel": "power [dB]"}.get(self.kind or ""),
             "box": plain(torch.stack((self.scene.lower, self.scene.upper))),
@@ -157,7 +158,7 @@ class Contents:
         query, _ = Query.from_positions([place], receiver, self.frequency, self._names, self.scene.frequencies)
         paths = call_optional(self.model, "learnt_paths", query) or []
         answer["paths"] = [{"points": plain(path.points), "power": plain(path.power_db)} for path in paths]
-        return answer | {"place": plain(np.asarray(place))}
+        return answer | {"place": plain(place)}
 
     def slice(self, height: float, receiver: int) -> dict:
         """The radio map over the training transmitters and receivers at a height [m]."""

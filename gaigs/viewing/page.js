@@ -20,6 +20,7 @@ const withUnit = (value, title) => {  // "error [dB]" is the title of "2.1 dB"
   const unit = /\[(.*)\]/.exec(title);
   return minus(digits(value)) + (unit ? ` ${unit[1]}` : "");
 };
+const short = name => name.length > 16 ? `${name.slice(0, 7)}\u2026${name.slice(-7)}` : name;  // both ends tell apart
 const nameOf = title => title.replace(/ \[.*/, "");
 const minus = text => String(text).replace("-", "\u2212");
 const steps = (low, high, most) => {  // round numbers, by 1, 2 or 5
@@ -87,7 +88,7 @@ class Run {
     this.labels = element("div", {className: "labels"});
     this.legend = element("details", {className: "legend"});
     const about = facts.kind ? `${facts.task}, ${facts.receivers.length} receiver${facts.receivers.length > 1 ? "s" : ""}` : facts.task;
-    const title = element("h2", {}, facts.title + " ", element("small", {textContent: about}));
+    const title = element("h2", {}, facts.title + " ", element("small", {textContent: about + (facts.carrier ? `, predictions at ${+(facts.carrier / 1e9).toPrecision(5)} GHz` : "")}));
     this.scene = element("div", {className: "scene"}, this.canvas, this.labels, this.legend, title);
     this.prediction = element("div"); this.comparison = element("div");
     this.results = element("div", {className: "results"}, this.prediction, this.comparison);
@@ -184,6 +185,7 @@ class Run {
 
   drawMap({x, y, height, values}, range) {
     const [low, high] = this.range = range;
+    this.level = height;
     const corner = (i, j) => [x[i], y[j], height,
       ...this.colour("viridis", (values[j * x.length + i] - low) / (high - low || 1)), 0.8];
     const numbers = [];
@@ -315,7 +317,7 @@ class Run {
       const y = row * (k + 0.5) + 2, value = answer.levels[k], own = k === state.receiver;
       pen.font = `${own ? "600 " : ""}11px system-ui, sans-serif`;
       pen.textAlign = "right"; pen.fillStyle = own ? "#00664a" : "#444";
-      pen.fillText(facts.receivers[k].name, left - 8, y + 4, left - 12);
+      pen.fillText(short(facts.receivers[k].name), left - 8, y + 4, left - 12);
       pen.strokeStyle = pen.fillStyle = own ? "#009e73" : "#6e6e6e"; pen.lineWidth = 2;
       pen.beginPath(); pen.moveTo(at(value - stds[k]), y); pen.lineTo(at(value + stds[k]), y); pen.stroke();
       pen.beginPath(); pen.arc(at(value), y, 4.5, 0, 7); pen.fill();
@@ -368,7 +370,7 @@ class Run {
       add(["tests"], `test links by ${nameOf(facts.tests.title)}; click one`, "width:9px;height:9px;margin:auto;border-radius:5px;background:#fd8d3c;border:1px solid #555", true,
         ["YlOrRd", minus(digits(scale[0])), withUnit(scale[1], facts.tests.title)]);
     }
-    if (facts.map) add(["map"], `radio map: ${nameOf(facts.map)} at this height`, `background:${gradient("viridis")}`, true,
+    if (facts.map) add(["map"], `radio map: ${nameOf(facts.map)}${this.range ? ` at z = ${minus(digits(this.level))} m` : ""}`, `background:${gradient("viridis")}`, true,
       this.range ? ["viridis", minus(digits(this.range[0])), withUnit(this.range[1], facts.map)] : null);
     if (facts.kind === "spectrum") add(["sphere"], "spectrum at the receiver", `border-radius:5px;background:${gradient("viridis")}`, true, ["viridis", "0", "1 amplitude"]);
     if (facts.planes.length) add(["paths"], "paths", "height:3px;background:#9c179e", true, ["plasma_r", minus("-30"), "0 dB of the strongest"]);
@@ -571,7 +573,8 @@ async function start() {
     update(); updateMaps();
   });
   const slider = $("height");
-  [slider.min, slider.max] = content.stored ? [Math.min(...content.stored.heights), Math.max(...content.stored.heights)] : [first.low[2], first.high[2]];
+  const heights = content.stored ? content.stored.places.map(place => place[2]) : [first.low[2], first.high[2]];
+  [slider.min, slider.max] = [Math.min(...heights), Math.max(...heights)];
   slider.parentElement.hidden = slider.min === slider.max;
   slider.addEventListener("input", () => move([state.place[0], state.place[1], +slider.value]));
   const home = () => {

@@ -12,6 +12,7 @@ from scipy.io import netcdf_file
 
 import gaigs
 from gaigs.geometry import Frame
+from gaigs.report.formats import figure_formats
 
 CORNER = Frame(32632, 500_000.0, 0.0)
 """Where the central meridian of UTM zone 32 meets the equator: 9 degrees east, 0 degrees north."""
@@ -27,7 +28,8 @@ def rssi():
 def on_map(rssi):
     model, _ = rssi
     inside = model.scene
-    model.scene = replace(inside, frame=CORNER)
+    first, *others = inside.receivers
+    model.scene = replace(inside, frame=CORNER, receivers=(replace(first, name="Küche & Flur"), *others))
     yield model
     model.scene = inside
 
@@ -48,6 +50,7 @@ def test_a_geotiff_has_each_value_at_its_place(on_map, tmp_path):
     (width, height, _), (*_, left, top, _) = tags["ModelPixelScale"], tags["ModelTiepoint"]
     assert tags["ProjectedCSTypeGeoKey"] == 32632
     assert names.count("<Item") == len(bands) == 2 * len(floor.receivers)
+    assert "Küche &amp; Flur: RSSI [dBm]" in names
     for row, column in ((0, 0), (3, 5), (-1, 2)):
         east, north = CORNER.x + floor.x[column], CORNER.y + floor.y[row]
         pixel = int((top - north) // height), int((east - left) // width)
@@ -97,10 +100,12 @@ def test_maps_without_a_place_on_earth_say_so(rssi, tmp_path, caplog):
     assert first["geometry"]["coordinates"] == gaigs.radio_map(model, pitch=1.0).x[:1].tolist() * 2
 
 
-def test_figures_are_pages(rssi, tmp_path):
+def test_figures_are_pages(rssi, tmp_path, monkeypatch):
+    monkeypatch.setattr("gaigs.report.style.DPI", 60)
     model, _ = rssi
-    names = [path.name for path in gaigs.export(model, tmp_path / "floor.png", pitch=1.0)]
-    assert names == ["floor.png", "floor_deviation.png"]
+    with figure_formats("svg"):  # those of reports, not of exports
+        names = [path.name for path in gaigs.export(model, tmp_path / "floor.PNG", pitch=1.0)]
+    assert names == ["floor.PNG", "floor_deviation.PNG"]
     assert {path.name for path in tmp_path.iterdir()} == {*names}
     gaigs.export(model, tmp_path / "floor.PDF", pitch=1.0)
     assert (tmp_path / "floor.PDF").read_bytes().count(b"/Type /Page ") == 2
@@ -160,7 +165,7 @@ def test_spectra_have_axes_in_degrees(tmp_path):
         ("test.csv", {"places": torch.zeros(0, 3)}, "predictions take one place or more"),
         ("test.csv", {"places": [[1.0, 2.0]]}, r"places must be \(\.\.\., 3\) positions"),
         ("test.nc", {"places": [[1.0, 2.0, 1.0]], "interval": 1.0}, "interval must be a probability between 0 and 1"),
-        ("room.glb", {}, "a learnt room takes a model 'mirrored', got PathLoss"),
+        ("room.glb", {}, "a learnt room takes a model 'mirrored', got 'path_loss'"),
     ],
 )
 def test_impossible_exports_are_refused(file, options, message, rssi, tmp_path):

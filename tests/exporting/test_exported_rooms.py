@@ -104,3 +104,5 @@ def test_materials_need_a_carrier(tmp_path):
     with pytest.raises(ValueError, match="materials depend on the carrier"):
         gaigs.export(rssi, tmp_path / "room.xml")
     assert len(gaigs.export(rssi, tmp_path / "room.xml", frequency=2.4e9)) > 1
+    with pytest.raises(FileNotFoundError, match="could not be written"):
+        gaigs.export(rssi, tmp_path / "missing/room.xml", frequency=2.4e9)

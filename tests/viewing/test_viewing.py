@@ -25,6 +25,13 @@ ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples/room.ckpt"
 
 
+@pytest.fixture(autouse=True)
+def few_places(monkeypatch):
+    monkeypatch.setattr("gaigs.viewing.PLACES", 8)
+    monkeypatch.setattr("gaigs.viewing.FEWEST", 4)
+    monkeypatch.setattr("gaigs.viewing.contents.POINTS", 6)
+
+
 @pytest.fixture(scope="module")
 def links():
     return {task: example_links(task) for task in ("spectrum", "rssi", "csi")}
@@ -87,10 +94,7 @@ def test_a_channels_impulse_response_peaks_at_the_direct_path(links):
 
 
 @pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
-def test_a_file_has_all_answers(task, links, monkeypatch):
-    monkeypatch.setattr("gaigs.viewing.PLACES", 8)
-    monkeypatch.setattr("gaigs.viewing.FEWEST", 4)
-    monkeypatch.setattr("gaigs.viewing.contents.POINTS", 6)
+def test_a_file_has_all_answers(task, links):
     view = gaigs.view(gaigs.train("mean", links[task]), links[task])
     found = content(view.page(view.stored()))
     (facts,), stored = found["runs"], found["stored"]
@@ -107,7 +111,7 @@ def test_a_file_has_all_answers(task, links, monkeypatch):
 @contextmanager
 def serving(view):
     with server(view.page(), view.contents, 0) as started:
-        threading.Thread(target=started.serve_forever, daemon=True).start()
+        threading.Thread(target=started.serve_forever, args=(0.05,), daemon=True).start()
         try:
             yield f"http://127.0.0.1:{started.server_port}/"
         finally:
@@ -141,7 +145,7 @@ def test_two_runs_have_the_same_receivers(levels, mirrored):
 def test_the_example_predicts(mirrored):
     assert EXAMPLE.stat().st_size < 1e6
     links = gaigs.links("synthetic")
-    test = links.split.test[:20]
+    test = links.split.test[:8]
     values = mirrored.predict(links.query[test])
     assert links.task.scores(links.labels[test], values)["ssim"].median() > 0.9
     shown = contents_of(EXAMPLE).facts()
@@ -185,8 +189,7 @@ def pixel(browser, place):
 
 
 @pytest.mark.parametrize("is_served", [True, False], ids=["server", "file"])
-def test_a_drag_changes_the_picture(is_served, browser, links, levels, tmp_path, monkeypatch):
-    monkeypatch.setattr("gaigs.viewing.contents.POINTS", 6)
+def test_a_drag_changes_the_picture(is_served, browser, links, levels, tmp_path):
     view = gaigs.view(levels, links["rssi"])
     with serving(view) as url:
         if not is_served:
