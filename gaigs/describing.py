@@ -215,13 +215,16 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(links: Links) -> Figure:
-    """Places and receivers from above, with the number of receivers or the level there; histogram of the levels."""
+    """Places and receivers from above, with a histogram of levels; colours are the number of receivers that hear a place,
+    or the level at the first one if all places have the same number."""
     index = _read(links)
     values, (quantity, unit) = levels(links, index), quantity_of(links)
     places, counts = links.query.transmitters.unique(dim=0, return_counts=True)
     colours, label = counts, "receivers that hear the place"
-    if len(links.receivers) == 1:
-        places, colours, label = links.query.transmitters[index], values, with_unit(quantity, unit)
+    if counts.min() == counts.max():
+        first = links.query.receivers[index] == 0
+        places, colours, label = links.query.transmitters[index[first]], values[first], with_unit(quantity, unit)
+        label += f" at {links.receivers[0].name}" if len(links.receivers) > 1 else ""
     with rc_context(style.STYLE):
         drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
         left, right = drawn.subplots(1, 2)
