@@ -215,8 +215,10 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(links: Links) -> Figure:
-    """Places and receivers from above, with a histogram of levels; colours are the number of receivers that hear a place,
-    or the level at the first one if all places have the same number."""
+    """Places and receivers from above, and a histogram of levels.
+
+    Colours are the number of receivers that hear a place, or the level at the first one if all numbers are equal.
+    """
     index = _read(links)
     values, (quantity, unit) = levels(links, index), quantity_of(links)
     places, counts = links.query.transmitters.unique(dim=0, return_counts=True)
