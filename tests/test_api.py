@@ -94,6 +94,16 @@ def test_a_model_is_trained_by_the_preset_of_its_experiment(experiment):
     assert {k: here[k] for k in here.keys() - chosen_by_data} == {k: there[k] for k in there.keys() - chosen_by_data}
 
 
+def test_scores_print_in_a_notebook_as_in_a_terminal(monkeypatch):
+    links = gaigs.links("synthetic_rssi", transmitters=20, order=0)
+    result = gaigs.evaluate(gaigs.train("mean", links), links, baselines=[])
+    plain = str(result)
+    assert "MAE" in plain
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert str(result) == plain
+
+
 @pytest.mark.parametrize(
     ("experiment", "small"),
     [("spectrum", {"gaussians.count": 20}), ("mirrored_rssi", {"placement.planes": 6, "placement.order": 0})],

@@ -191,7 +191,7 @@ class Evaluation(JupyterMixin):
 
     def __str__(self) -> str:
         text = io.StringIO()
-        Console(file=text, width=120).print(self)
+        Console(file=text, width=120, force_jupyter=False, force_terminal=False).print(self)
         return text.getvalue().rstrip()
 
 
