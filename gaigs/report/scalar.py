@@ -27,7 +27,7 @@ PANELS, MOST = 6, 12
 """Largest numbers of panels of a figure, a panel a receiver, and of receivers in the figures of a run."""
 
 FEW = 400
-"""Largest number of dots of a panel that can be told apart."""
+"""Largest number of dots of a panel that do not hide each other."""
 
 
 class ScalarFigures(TaskFigures):
