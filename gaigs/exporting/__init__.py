@@ -1,8 +1,8 @@
-"""Export for other programs: radio maps, predictions and the learnt room, by the suffix of the file."""
+"""Export for other programs: radio maps, predictions, the learnt room and its paths, by the suffix of the file."""
 
 from pathlib import Path
 
-from gaigs.exporting import maps, predictions, rooms
+from gaigs.exporting import maps, predictions, rooms, scenarios
 from gaigs.model import Model
 from gaigs.radio_maps import has_radio_map, radio_map
 from gaigs.registry import call, check_type
@@ -18,7 +18,8 @@ MAPS = {
 }
 PREDICTIONS = ".csv", ".nc"
 ROOMS = ".glb", ".gltf", ".obj", ".xml"
-SUFFIXES = (*dict.fromkeys((*MAPS, *PREDICTIONS, *ROOMS)),)
+SCENARIO = ".deepmimo"
+SUFFIXES = (*dict.fromkeys((*MAPS, *PREDICTIONS, *ROOMS, SCENARIO)),)
 
 
 def export(
@@ -36,9 +37,10 @@ def export(
         model: A fitted or loaded model.
         file: ``.tif``, ``.geojson``, ``.nc``, ``.png`` or ``.pdf`` for the radio map, with deviations where the model
             states them; ``.csv`` or ``.nc`` for predictions at places; ``.glb``, ``.gltf``, ``.obj`` or ``.xml`` (a
-            scene of Mitsuba for Sionna RT) for the learnt room.
-        places: Of predictions: positions (n, 3) [m], from which each receiver hears; a query; or links, whose test is
-            predicted and written beside its labels.
+            scene of Mitsuba for Sionna RT) for the learnt room; ``.deepmimo`` for the paths of mirrored channels, a
+            folder with a scenario of DeepMIMO v4.
+        places: Of predictions and scenarios: positions (n, 3) [m], from which each receiver hears; a query; or links,
+            whose test is predicted and written beside its labels.
         pitch, height: Of a radio map [m], as for ``gaigs.radio_map``.
         frequency: Carrier of radio map, places and materials of the room [Hz]; None: that of the training links.
         interval: Probability with which the intervals of predictions hold the label.
@@ -65,6 +67,8 @@ def export(
     suffix = check_suffix(file)
     if suffix in ROOMS:
         return rooms.write_room(model, file, frequency)
+    if suffix == SCENARIO:
+        return scenarios.write_scenario(model, file, places, frequency)
     if suffix in PREDICTIONS and (places is not None or suffix not in MAPS):
         return predictions.write_predictions(model, file, places, frequency, interval)
     return MAPS[suffix](file, radio_map(model, pitch, height, frequency=frequency), model.scene)
@@ -87,9 +91,10 @@ def run(config: dict, folder: Path) -> None:
         raise ValueError(f"command=export needs export.format, one of {', '.join(one[1:] for one in SUFFIXES)}")
     suffix = check_suffix(Path(f"export.{form}"))
     model = model_of(config["folder"])
-    if places is None and suffix in PREDICTIONS and (suffix not in MAPS or not has_radio_map(model.scene.task)):
+    takes_places = suffix in (*PREDICTIONS, SCENARIO)
+    if places is None and takes_places and (suffix not in MAPS or not has_radio_map(model.scene.task)):
         places = "test"
-    name = "room" if suffix in ROOMS else "predictions" if suffix in PREDICTIONS and places else "radio_map"
+    name = "predictions" if suffix in PREDICTIONS and places else "radio_map" if suffix in MAPS else "room"
     places = links_of(config["folder"]) if places == "test" else places
     folder.mkdir(parents=True, exist_ok=True)
     call("export", export, options, model=model, file=folder / f"{name}{suffix}", places=places)

@@ -18,6 +18,7 @@ from gaigs.io.netcdf import Variable, write_netcdf
 from gaigs.kriging.intervals import Estimate
 from gaigs.model import Model
 from gaigs.query import Query, as_positions
+from gaigs.scene import Scene
 from gaigs.task import Task
 from gaigs.task.csi import Csi
 
@@ -43,22 +44,11 @@ def write_predictions(
     """
     scene, labels, subcarriers = model.scene, None, None
     asked: Any = places
-    if places is None:
-        raise ValueError("predictions take places: positions [m], a query, or links with a test")
+    query = query_of("predictions", scene, places, frequency)
     if isinstance(places, Links):
-        check_fit(places, scene)
         asked = places.held_out or places
         subcarriers = None if places.held_out is None else asked.task.frequencies
-        labels, query = asked.labels[asked.split.test], asked.query[asked.split.test]
-    elif isinstance(places, Query):
-        query = places
-    else:
-        points, names = as_positions("places", places).reshape(-1, 3), [receiver.name for receiver in scene.receivers]
-        receivers = torch.arange(len(names)).repeat(len(points))
-        points = points.repeat_interleave(len(names), 0)
-        query, _ = Query.from_positions(points, receivers, frequency, names, scene.frequencies)
-    if not len(query):
-        raise ValueError("predictions take one place or more; give positions [m], or links with a test")
+        labels = asked.labels[asked.split.test]
     if not 0 < interval < 1:
         raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
     if subcarriers is None and model.calibration is not None and model.calibration.gives(interval):
@@ -76,6 +66,26 @@ def write_predictions(
         about |= {"frame_epsg": scene.frame.epsg, "frame_x": scene.frame.x, "frame_y": scene.frame.y}
     write_netcdf(file, variables, about)
     return [file]
+
+
+def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -> Query:
+    """The links of ``places``, one or more, as for ``write_predictions``; ``kind`` names the file in errors."""
+    if places is None:
+        raise ValueError(f"{kind} take places: positions [m], a query, or links with a test")
+    if isinstance(places, Links):
+        check_fit(places, scene)
+        asked = places.held_out or places
+        query = asked.query[asked.split.test]
+    elif isinstance(places, Query):
+        query = places
+    else:
+        points, names = as_positions("places", places).reshape(-1, 3), [receiver.name for receiver in scene.receivers]
+        receivers = torch.arange(len(names)).repeat(len(points))
+        points = points.repeat_interleave(len(names), 0)
+        query, _ = Query.from_positions(points, receivers, frequency, names, scene.frequencies)
+    if not len(query):
+        raise ValueError(f"{kind} take one place or more; give positions [m], or links with a test")
+    return query
 
 
 def tabulate(query: Query, names: list[str], task: Task, found: Estimate, labels: Tensor | None) -> dict[str, Variable]:

@@ -41,10 +41,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     Raises:
         ValueError: The model has no planes, or a scene's carrier is unknown or impossible.
     """
-    own: Any = model.members[0] if isinstance(model, Ensemble) else model
-    own = own.trend if isinstance(own, Kriging) else own
-    if not isinstance(own, MirroredSplatting):
-        raise ValueError(f"a learnt room takes a model 'mirrored', got {name_of(own)!r}; train it on the same data")
+    own = mirrored_of("a learnt room", model)
     suffix, found = file.suffix.lower(), export.survey(own.placement, own.surveyed)
     if suffix == ".obj":
         write_text(file, export.wavefront_obj(own.placement, found))
@@ -60,6 +57,15 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     check_carrier("frequency", frequency)
     chosen = materials(own.placement, own.surveyed, frequency)
     return write_scene(file, [*map(mesh_of, planes)], [chosen[plane.number] for plane in planes], frequency)
+
+
+def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
+    """The mirrored Gaussians of a model, without its kriging, of an ensemble those of its first member."""
+    own: Any = model.members[0] if isinstance(model, Ensemble) else model
+    own = own.trend if isinstance(own, Kriging) else own
+    if not isinstance(own, MirroredSplatting):
+        raise ValueError(f"{kind} takes a model 'mirrored', got {name_of(own)!r}; train it on the same data")
+    return own
 
 
 def mesh_of(plane: LearntPlane) -> Mesh:

@@ -159,7 +159,7 @@ def test_spectra_have_axes_in_degrees(tmp_path):
 @pytest.mark.parametrize(
     ("file", "options", "message"),
     [
-        ("floor.shp", {}, r"must end with one of \.tif, .*\.xml, got 'floor.shp'"),
+        ("floor.shp", {}, r"must end with one of \.tif, .*\.xml, .deepmimo, got 'floor.shp'"),
         ("floor", {}, "got 'floor'"),
         ("test.csv", {}, r"predictions take places: positions \[m\], a query, or links"),
         ("test.csv", {"places": torch.zeros(0, 3)}, "predictions take one place or more"),
