@@ -53,7 +53,6 @@ class MirroredSplatting(GaussianSplatting):
     revisions = (0.0, 0.06, 0.25, 0.5, 0.75)
 
     places: Query | None = None  # set by fit
-    search: LagSearch | None = None  # set by fit, for spectra with known carriers
 
     def __init__(
         self,
@@ -68,6 +67,7 @@ class MirroredSplatting(GaussianSplatting):
         trend: str | Mapping | Model | None = None,
     ):
         super().__init__(scene, placement, tokenizer, deformation, projection, rasterizer, pooling, gaussians, trend)
+        self.search: LagSearch | None = None  # set by fit, for spectra with known carriers
 
     @staticmethod
     def own_pooling(scene: Scene) -> str:

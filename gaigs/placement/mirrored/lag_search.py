@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.constants import speed_of_light
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from gaigs.antenna import Array
@@ -195,7 +195,7 @@ class ReceiverLags:
         return (both.T @ third).real.view(len(moves), len(turns), len(turns))
 
 
-class LagSearch:
+class LagSearch(nn.Module):
     """Moves planes to where reflections explain the interference that spectra show.
 
     A spectrum gives back the covariances of the array's elements (``Beamformer.lags``). Their largest part is the
@@ -203,6 +203,8 @@ class LagSearch:
     fields are that path's wave, with a phase that follows from its length. So the sum of these waves over all links, a
     periodogram over offset and two tilts, proposes planes. Lengths are linear within a tile of it. The error of the
     covariances decides between proposals, after a descent on it. The strongest plane comes first.
+
+    It is a module, as a part of its model whose calls ``gaigs.training.revision`` times: each error is one call.
 
     Args:
         links: Their training links count; of the task ``spectrum``.
@@ -223,6 +225,7 @@ class LagSearch:
         order: int,
         most: int = 300,
     ):
+        super().__init__()
         self.order, self.receivers, self.doubts = min(order, 2), [], []
         self.wavelength = speed_of_light / frequencies.max().item()
         train, query = links.split.train, links.query
@@ -267,7 +270,7 @@ class LagSearch:
                 planes = self.moved(planes, k, reach)
             everything = torch.ones(len(planes), dtype=torch.bool)
             polished = self.polish(planes, everything, 40, 3e-3)
-            gains = self.errors(planes, self.receivers) - self.errors(polished, self.receivers)
+            gains = self(planes, self.receivers) - self(polished, self.receivers)
             planes = polished if is_sure(gains) else planes
         return planes
 
@@ -284,7 +287,7 @@ class LagSearch:
     def powers(self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"]) -> Float[Tensor, " n"]:
         return torch.cat([part.paths(planes, sequences)[0].abs().square() for part in self.few]).mean(0)
 
-    def errors(
+    def forward(
         self, planes: Float[Tensor, "w 4"], receivers: list[ReceiverLags], sequences: Tensor | None = None
     ) -> Float[Tensor, " b"]:
         """Log of the share of each link's squared covariances that paths do not explain: none must rule."""
@@ -306,7 +309,7 @@ class LagSearch:
         sequences = self.sequences(planes)
 
         def rated(tried: Float[Tensor, "w 4"]) -> tuple[float, Tensor, Tensor]:
-            errors = self.errors(tried, self.receivers, sequences)
+            errors = self(tried, self.receivers, sequences)
             return errors.mean().item(), tried, errors
 
         rates = [rated(tried) for tried in trials]
@@ -385,7 +388,7 @@ class LagSearch:
         for step in range(steps):
             optimizer.param_groups[0]["lr"] = rate * 0.05 ** (step / steps)
             optimizer.zero_grad()
-            self.errors(now(), self.few, sequences).mean().backward()
+            self(now(), self.few, sequences).mean().backward()
             optimizer.step()
         return now().detach()
 
