@@ -234,6 +234,13 @@ def _read_station(root: Path, code: str, name: str, with_angles: bool) -> tuple[
             at, got = f"{files[key]}: {key}{wrong[0].tolist()}", f"{array[tuple(wrong[0])]:.7g}"
             raise ValueError(f"{at}: expected {expected}, got {got} ({len(wrong)} of {array.size})")
         arrays[key] = array if is_position else np.where(exists, array, 0)
+    powers = arrays["power"][exists]
+    if len(powers) and 0 <= powers.min() and powers.max() <= 1:  # no passive path has a gain of 0 dB or more
+        span = f"{powers.min():.3g} to {powers.max():.3g}"
+        raise ValueError(
+            f"{files['power']}: expected gains in dB, got {span} for all paths, as if linear\n"
+            "store 10 log10 of powers, or 20 log10 of amplitudes"
+        )
     departures = None
     if with_angles:
         azimuths, zeniths = np.deg2rad(arrays["aod_az"]), np.deg2rad(arrays["aod_el"])

@@ -169,6 +169,7 @@ def test_the_built_in_room_is_written_and_read(tmp_path, monkeypatch):
         ({"aod_el": np.full((3, 2), -20.0)}, r"aod_el\[0, 0\]: expected an angle from the z axis.*got -20"),
         ({"phase": np.zeros((3, 1))}, r"expected the shape \(3, 2\) to power_t000.* of \(3, 2\), got \(3, 1\)"),
         ({"power": np.full((3, 2), NAN)}, "expected a path to a user in power_t000_tx000_r001.npz, got none"),
+        ({"power": 1e-9 - 0 * np.array(matrices()["power"])}, "expected gains in dB, got 1e-09 to 1e-09 for all paths"),
         ({"power": np.full((3, 2), "x")}, "cannot parse .*power_t000.*; expected an array 'power' of real numbers"),
         ({"rx_pos": np.full((3, 3), 5e6)}, r"rx_pos\[0, 0\]: expected positions within 1e5 m"),
     ],
