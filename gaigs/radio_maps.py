@@ -1,5 +1,6 @@
 """Radio maps: predictions of one real number, e.g. RSSI, for transmitters anywhere on a floor."""
 
+import logging
 import math
 import time
 import warnings
@@ -15,6 +16,8 @@ from numpy import ndarray
 from gaigs.geometry import ExtrapolationWarning
 from gaigs.io.files import atomic_write
 from gaigs.task import Task
+
+log = logging.getLogger(__name__)
 
 POINTS = 128
 """Approximate limit of points along the longer side of a map of no given pitch; points predicted at a time."""
@@ -105,7 +108,8 @@ def radio_map(
         model: A fitted or loaded model of a task whose label is one real number, e.g. RSSI.
         pitch: Distance between neighbouring points [m]. The points are its multiples, so maps of one pitch share them.
             None: 0.1, more in a room with a side above 12.8 m; doubled until the map of a slow model takes a minute.
-        height: Height of the transmitters [m]; None: half-way between the lowest and the highest of training.
+        height: Height of the transmitters [m]; None: half-way between the lowest and the highest of training, and of
+            several floors that with most training places.
         margin: Widening of the box on each side [m].
         receivers: Names, or one name; None: all receivers.
         frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
@@ -138,7 +142,11 @@ def radio_map(
         raise ValueError(f"receivers must be among {', '.join(known)}, got {', '.join(map(repr, names)) or 'none'}")
     lower, upper = scene.lower.double().numpy(), scene.upper.double().numpy()
     pitch, margin = None if pitch is None else float(pitch), float(margin)
-    height = float(lower[2] + upper[2]) / 2 if height is None else float(height)
+    if height is None and len(scene.floors):
+        others = ", ".join(f"{floor:.2f}" for floor in sorted(scene.floors[1:].tolist()))
+        words = "radio map at z = %.2f m, the floor with most training places; others are at %s m: set height"
+        log.info(words, scene.height, others)
+    height = scene.height if height is None else float(height)
     if not np.isfinite(height) or not 0 <= margin < np.inf:
         raise ValueError(f"height must be finite and margin at least 0 [m], got height {height} and margin {margin}")
     corners = np.stack((lower, upper, *(receiver.pose.position.numpy() for receiver in scene.receivers)))[:, :2]

@@ -29,6 +29,7 @@ class Scene:
         bandwidth: Band around each carrier over which a label's power is averaged, 0 for a carrier alone [Hz]; None if
             unknown.
         frame: Place of the world frame on a map; None if unknown.
+        floors: Heights of separate floors of training transmitters, that with most places first (k,) [m]; empty of one.
 
     Example:
         >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
@@ -44,6 +45,7 @@ class Scene:
     frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0))
     bandwidth: float | None = None
     frame: Frame | None = None
+    floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0))
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""
@@ -54,6 +56,11 @@ class Scene:
         """Diagonal of the box that holds the training transmitters and all receivers [m]."""
         ends = torch.cat((torch.stack((self.lower, self.upper)), self.positions(self.lower)))
         return (ends.amax(0) - ends.amin(0)).norm().item()
+
+    @property
+    def height(self) -> float:
+        """Height of the floor with most training places; of one floor half-way between lowest and highest [m]."""
+        return float(self.floors[0] if len(self.floors) else (self.lower[2].double() + self.upper[2].double()) / 2)
 
     @property
     def has_band(self) -> bool:
@@ -81,7 +88,10 @@ class Scene:
                 for receiver in self.receivers
             ],
             "task": self.task.state(),
-            **{name: getattr(self, name) for name in ("lower", "upper", "spacing", "frequencies", "bandwidth")},
+            **{
+                name: getattr(self, name)
+                for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors")
+            },
             "frame": self.frame and tuple(self.frame),
         }
 

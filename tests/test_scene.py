@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from gaigs.antenna import PATTERNS, Array, Receiver
+from gaigs.data import floors_of
 from gaigs.geometry import Grid, Pose
 from gaigs.query import Query
 from gaigs.scene import Scene
@@ -25,6 +26,22 @@ def stored(state):
     torch.save(state, file)
     file.seek(0)
     return torch.load(file, weights_only=True)
+
+
+def test_separate_floors_have_their_heights():
+    """Places of a floor scatter by hand-held heights; among heights of a drone there is no floor."""
+    rng = np.random.default_rng(0)
+    heights = [floor + rng.uniform(0.9, 1.5, count) for floor, count in ((0, 20), (4, 50), (8, 30))]
+    places = lambda z: torch.from_numpy(np.column_stack((rng.uniform(size=(len(z), 2)), z))).float()
+    several = places(np.concatenate(heights))
+    np.testing.assert_allclose(floors_of(several), [5.2, 9.2, 1.2], atol=0.2)
+    links = example_links("rssi")
+    scene = replace(links.scene, floors=floors_of(several))
+    assert scene.height == floors_of(several)[0]
+    assert torch.equal(Scene.from_state(stored(scene.state())).floors, scene.floors)
+    for heights in (rng.uniform(0, 30, 40), np.array([0.0, 1.9, 5.0, 6.5]), np.array([1.0, 1.0, 2.5])):
+        assert not len(floors_of(places(heights)))
+    assert links.scene.height == pytest.approx((links.scene.lower[2] + links.scene.upper[2]).item() / 2)
 
 
 # --- arrays ---

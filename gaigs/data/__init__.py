@@ -138,13 +138,27 @@ class Links:
             raise ValueError(f"training takes transmitters at two points or more, got {len(train)}; check the split")
         frequencies = torch.zeros(0) if training.frequencies is None else training.frequencies.unique()
         box = train.amin(0), train.amax(0), median_spacing(train)
-        return Scene(self.receivers, *box, self.task, frequencies, self.bandwidth, self.frame)
+        return Scene(self.receivers, *box, self.task, frequencies, self.bandwidth, self.frame, floors_of(train))
 
 
 def median_spacing(places: Float[Tensor, "n 3"]) -> float:
     """Median distance from a place to the nearest other one [m]; takes two places or more."""
     distances, _ = cKDTree(places.double().numpy()).query(places.double().numpy(), k=2)
     return float(np.median(distances[:, 1]))
+
+
+def floors_of(places: Float[Tensor, "n 3"]) -> Float[Tensor, " k"]:
+    """Heights of separate floors [m], that with most places first; empty of one floor.
+
+    No place lies in the 2 m between two floors, nor in twice the range of heights of a floor's places.
+    """
+    heights = places[:, 2].sort().values
+    gaps = heights.diff()
+    ends = (gaps > 2).nonzero()[:, 0]
+    floors = heights.tensor_split(ends + 1)
+    if not len(ends) or gaps[ends].min() < 2 * max(floor[-1] - floor[0] for floor in floors):
+        return heights[:0]
+    return torch.stack([floor.median() for floor in sorted(floors, key=len, reverse=True)])
 
 
 def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:

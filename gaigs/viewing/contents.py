@@ -88,6 +88,7 @@ class Contents:
             "quantity": quantity,
             "map": {"level": quantity, "channel": "power [dB]"}.get(self.kind or ""),
             "box": plain(torch.stack((self.scene.lower, self.scene.upper))),
+            "height": self.scene.height,
             "receivers": [
                 {"name": one.name, "place": plain(one.pose.position), "axes": plain(one.pose.rotation.mT)}
                 for one in self.scene.receivers

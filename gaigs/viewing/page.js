@@ -563,7 +563,7 @@ async function start() {
   viewer.runs = content.runs.map((facts, k) => new Run(facts, k, content, viewer.source));
   $("runs").classList.toggle("two", viewer.runs.length > 1);
   document.title = content.runs.map(run => run.title).join(" | ") + " - gaigs";
-  const [first] = viewer.runs, {box, receivers} = first.facts;
+  const [first] = viewer.runs, {box, height, receivers} = first.facts;
   viewer.runs.forEach(run => { run.start(); run.legend.open = viewer.runs.length === 1; });
   $("receiver").append(...receivers.map((receiver, k) => element("option", {value: k, textContent: receiver.name})));
   $("receiver").parentElement.hidden = receivers.length < 2;
@@ -587,7 +587,7 @@ async function start() {
   $("hint").textContent = "drag the transmitter; elsewhere: turn, right button: shift, wheel: zoom";
   addEventListener("resize", redraw);
   home();
-  show(viewer.source.snap(box[0].map((x, k) => (x + box[1][k]) / 2)));
+  show(viewer.source.snap([(box[0][0] + box[1][0]) / 2, (box[0][1] + box[1][1]) / 2, height]));
   await update();
   viewer.ready = true;
   await updateMaps();
