@@ -8,8 +8,9 @@ from torch import Tensor, nn
 from gaigs.data import Links
 from gaigs.gaussians import Gaussians
 from gaigs.kriging.links import evenly
-from gaigs.model import Model, Prediction
-from gaigs.query import Batch
+from gaigs.model import Model, Prediction, call_optional
+from gaigs.placement.learnt_room import LearntPath, LearntRoom
+from gaigs.query import Batch, Query
 from gaigs.registry import register, registry
 from gaigs.scene import Scene
 
@@ -49,6 +50,14 @@ class Ensemble(Model):
         """Of the first member."""
         first: Any = self.members[0]
         return first.primitives
+
+    def learnt_room(self, links: Links | None = None) -> LearntRoom | None:
+        """Of the first member."""
+        return call_optional(self.members[0], "learnt_room", links)
+
+    def learnt_paths(self, query: Query) -> list[LearntPath] | None:
+        """Of the first member."""
+        return call_optional(self.members[0], "learnt_paths", query)
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.model.ensemble import Ensemble
 from gaigs.testing import example_links
 from gaigs.viewing import View, contents_of, side_by_side
 from gaigs.viewing.contents import Contents
@@ -69,6 +70,13 @@ def test_a_spectrum_and_its_paths_are_the_models(mirrored):
     receiver = mirrored.scene.receivers[0].pose.position
     for path in answer["paths"]:
         np.testing.assert_allclose([path["points"][0], path["points"][-1]], [place, receiver.tolist()], atol=1e-3)
+
+
+def test_an_ensemble_shows_the_room_of_its_first_member(mirrored):
+    both = Contents(Ensemble(mirrored.scene, [mirrored, mirrored])), Contents(mirrored)
+    planes, alone = (shown.facts()["planes"] for shown in both)
+    assert planes == alone != []
+    assert len({json.dumps(shown.answer([1.0, 1.2, 1.1], 0)["paths"]) for shown in both}) == 1
 
 
 def test_levels_deviations_and_map_are_the_models(levels):
