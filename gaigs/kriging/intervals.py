@@ -57,9 +57,10 @@ class Calibration:
     """Quantiles of the absolute errors at links not seen over a model's own deviation, in groups.
 
     Links are in one group per receiver where each has at least ``ENOUGH`` of them; of a model that states no
-    deviation also by the distance to the nearest known place of their receiver. Pixels of a spectrum are in ``BINS``
-    groups by their predicted amplitude too. A group of n links has an interval of level p by the quantile p (n + 1) / n
-    of its errors: it then holds a new link's label with probability p, if links are exchangeable.
+    deviation also by the distance to the nearest known place of their receiver, if errors rise with it. Pixels of a
+    spectrum are in ``BINS`` groups by their predicted amplitude too. A group of n links has an interval of level p by
+    the quantile p (n + 1) / n of its errors: it then holds a new link's label with probability p, if links are
+    exchangeable.
 
     Attributes:
         edges: Of the distances (r or 1, g - 1) [m].
@@ -113,7 +114,9 @@ class Calibration:
             levels = torch.arange(1, groups, dtype=torch.float64) / groups
             edges = torch.stack([apart[rows == row].quantile(levels) for row in range(int(rows.max()) + 1)])
             own = rows * groups + torch.searchsorted(edges[rows], apart[:, None])[:, 0]
-            if groups == 1 or own.bincount(minlength=len(edges) * groups).min() >= ENOUGH // 2:
+            counts = own.bincount(minlength=len(edges) * groups)
+            squares = torch.stack([errors[own == group].square().mean() for group in range(len(counts))])
+            if groups == 1 or (counts.min() >= ENOUGH // 2 and (squares.view(-1, groups).diff() > 0).all()):
                 break
             groups -= 1
         amplitudes = values.new_zeros(0, dtype=torch.float64)
@@ -121,7 +124,6 @@ class Calibration:
             some = _thin(values.flatten()[None], 10**6)[0].double()
             amplitudes = some.quantile(torch.arange(1, BINS, dtype=torch.float64) / BINS)
         bins = torch.bucketize(values.double(), amplitudes) if len(amplitudes) else torch.zeros_like(errors).long()
-        counts = own.bincount(minlength=len(edges) * groups)
         quantiles = errors.new_zeros(len(counts), len(amplitudes) + 1, STEPS + 1, dtype=torch.float64)
         sizes = quantiles[..., 0].clone()
         for group in range(len(counts)):

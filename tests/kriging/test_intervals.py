@@ -80,6 +80,16 @@ def test_intervals_widen_with_the_distance_to_known_places():
     assert far > near
 
 
+def test_intervals_do_not_narrow_with_the_distance_to_known_places():
+    """Errors that fall with it are those of other regions, or chance: no model is surer of what it has not seen."""
+    kind, labels, values, query = made("rssi", 400)
+    known = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long))
+    apart = query.transmitters.norm(dim=1)
+    labels = values + (labels - values) / apart
+    calibration = Calibration.of(kind, labels, values, torch.ones(400), query, apart.double(), known)
+    assert len(calibration.counts) == 1
+
+
 def test_a_models_own_deviation_scales_the_interval():
     kind, labels, values, query = made("rssi", 200)
     deviations = 1 + query.transmitters[:, 0]
