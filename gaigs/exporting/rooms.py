@@ -1,15 +1,20 @@
 """Learnt rooms for 3-D programs, as glTF and Wavefront OBJ, and for ray tracers, as scenes of Mitsuba."""
 
 import base64
+import cmath
 import json
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
+import torch
+from jaxtyping import Complex
 from plyfile import PlyData, PlyElement
+from torch import Tensor
 
 from gaigs.data.sionna.meshes import Mesh
 from gaigs.data.synthetic.image_source import TABULATED, conductivity
@@ -21,18 +26,25 @@ from gaigs.model.mirrored import MirroredSplatting
 from gaigs.placement.learnt_room import LearntPlane
 from gaigs.placement.mirrored import export
 from gaigs.placement.mirrored.materials import Material, materials
+from gaigs.placement.mirrored.sheets import Sheet, fit_sheets
 from gaigs.query import check_carrier
 from gaigs.registry import name_of
 
 COLOUR = 0.0, 0.45, 0.70, 0.35
 """Red, green, blue and opacity of planes: the figures' blue, through which the room shows."""
 
+THINNEST = 1e-5
+"""Thickness of the sheets of obstacles [m]: thin against the wavelength, so that only the conductance counts."""
+
+FREE_SPACE = 376.73
+"""Wave impedance of free space [ohm]."""
+
 CARRIERS_OF_ITU = 1e9, 40e9
 """Lowest and highest carrier [Hz] at which all of ``TABULATED`` are tabulated."""
 
 
 def write_room(model: Model, file: Path, frequency: float | None = None) -> list[Path]:
-    """Writes the planes that a model has learnt, of an ensemble those of its first member; gives the files.
+    """Writes the planes and obstacles that a model has learnt, of an ensemble its first member; gives the files.
 
     Args:
         file: ``.gltf``, ``.glb``, ``.obj``, or a scene ``.xml`` of Mitsuba, whose meshes get a folder beside it.
@@ -43,12 +55,16 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     """
     own = mirrored_of("a learnt room", model)
     suffix, found = file.suffix.lower(), export.survey(own.placement, own.surveyed)
-    if suffix == ".obj":
-        write_text(file, export.wavefront_obj(own.placement, found))
-        return [file]
     planes = export.outlines(own.placement, found)
+    corners = np.concatenate([found.ends, *(plane.corners for plane in planes)])
+    sheets, rest = fit_sheets(own.placement, own.surveyed, corners.min(0), corners.max(0))
+    meshes = [*map(mesh_of, planes), *(mesh_of_sheet(number, sheet) for number, sheet in enumerate(sheets))]
+    if suffix == ".obj":
+        write_text(file, export.wavefront_obj(own.placement, found, sheets))
+        return [file]
     if suffix != ".xml":
-        write_gltf(file, [*map(mesh_of, planes)], [{"share": plane.share} for plane in planes])
+        extras = [*({"share": plane.share} for plane in planes), *({"loss_db": sheet.loss_db} for sheet in sheets)]
+        write_gltf(file, meshes, extras)
         return [file]
     known = own.scene.frequencies
     if frequency is None and not len(known):
@@ -56,7 +72,13 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     frequency = float(known[len(known) // 2] if frequency is None else frequency)
     check_carrier("frequency", frequency)
     chosen = materials(own.placement, own.surveyed, frequency)
-    return write_scene(file, [*map(mesh_of, planes)], [chosen[plane.number] for plane in planes], frequency)
+    bsdfs = [itu_bsdf(chosen[plane.number], frequency) for plane in planes] + [*map(sheet_bsdf, sheets)]
+    comments = [f"Materials for {frequency:.7g} Hz."]
+    if own.scene.task.dtype.is_complex:
+        for receiver, gain in zip(own.scene.receivers, traced_gains(own, rest).tolist(), strict=True):
+            turned = f"{abs(gain):.4g}, turned by {math.degrees(cmath.phase(gain)):.2f} degrees"
+            comments.append(f"Channels of {receiver.name} are those traced times {turned}.")
+    return write_scene(file, meshes, bsdfs, comments)
 
 
 def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
@@ -74,31 +96,62 @@ def mesh_of(plane: LearntPlane) -> Mesh:
     return Mesh(f"plane_{plane.number}", "", corners, (tuple(range(len(corners))),))
 
 
-def write_scene(file: Path, meshes: Sequence[Mesh], materials: Sequence[Material], frequency: float) -> list[Path]:
-    """Writes a scene of Mitsuba for Sionna RT, and a mesh ``.ply`` of each surface beside it; gives the files.
+def mesh_of_sheet(number: int, sheet: Sheet) -> Mesh:
+    """Surfaces of obstacles as a mesh of triangles."""
+    vertices, faces = (tuple(map(tuple, part.tolist())) for part in (sheet.vertices, sheet.faces))
+    return Mesh(f"obstacle_{number}", "", vertices, faces)
 
-    Materials are those of ITU-R P.2040 by name, which follow the carrier that is set in Sionna RT. For a carrier [Hz]
-    outside their tables they are the extrapolated numbers of this carrier.
+
+@torch.no_grad()
+def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " receivers"]:
+    """Gain of each receiver's channels over those that Sionna RT traces; ``rest`` is that of ``fit_sheets`` [Np]."""
+    placement = model.placement
+    amplitudes = (placement.receiver_gains + placement.path_gains[0] + rest).exp() * model.pooling.strength
+    return torch.polar(amplitudes, placement.receiver_phases)
+
+
+class Bsdf(NamedTuple):
+    """What a mesh is made of, as a BSDF of Mitsuba: its name, its type and its properties."""
+
+    name: str
+    kind: str
+    properties: tuple[tuple[str, str | float], ...]
+
+
+def itu_bsdf(material: Material, frequency: float) -> Bsdf:
+    """A material of ITU-R P.2040 by its name, which follows the carrier that is set in Sionna RT.
+
+    For a carrier [Hz] outside the tables it is the extrapolated numbers of this carrier.
     """
+    name, thickness = f"{material.name}-{1e3 * material.thickness:.4g}mm", ("thickness", material.thickness)
+    if CARRIERS_OF_ITU[0] <= frequency <= CARRIERS_OF_ITU[1]:
+        return Bsdf(name, "itu-radio-material", (("type", material.name), thickness))
+    numbers = TABULATED[material.name][0], conductivity(material.name, frequency)
+    parts = zip(("relative_permittivity", "conductivity"), numbers, strict=True)
+    return Bsdf(name, "radio-material", (thickness, *parts))
+
+
+def sheet_bsdf(sheet: Sheet) -> Bsdf:
+    """A sheet of obstacles, which reflects nothing: all of that energy is scattered, which Sionna RT leaves out."""
+    conductivity = sheet.conductance / (THINNEST * FREE_SPACE)
+    properties = (("thickness", THINNEST), ("conductivity", conductivity), ("scattering_coefficient", 1.0))
+    return Bsdf(f"sheet-{sheet.loss_db:.4g}dB", "radio-material", (("relative_permittivity", 1.0), *properties))
+
+
+def write_scene(file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comments: Sequence[str] = ()) -> list[Path]:
+    """Writes a scene of Mitsuba for Sionna RT, and a mesh ``.ply`` of each surface beside it; gives the files."""
     scene = ElementTree.Element("scene", version="2.1.0")
-    scene.append(ElementTree.Comment(f" Learnt by gaigs; metres, z up; materials for {frequency:.7g} Hz. "))
-    names = {material: f"{material.name}-{1e3 * material.thickness:.4g}mm" for material in materials}
-    for material, name in names.items():
-        is_tabulated = CARRIERS_OF_ITU[0] <= frequency <= CARRIERS_OF_ITU[1]
-        surface = ElementTree.SubElement(scene, "bsdf", id=name)
-        surface.set("type", "itu-radio-material" if is_tabulated else "radio-material")
-        numbers = {"thickness": material.thickness}
-        if is_tabulated:
-            ElementTree.SubElement(surface, "string", name="type", value=material.name)
-        else:
-            numbers["relative_permittivity"] = TABULATED[material.name][0]
-            numbers["conductivity"] = conductivity(material.name, frequency)
-        for key, number in numbers.items():
-            ElementTree.SubElement(surface, "float", name=key, value=f"{number:.6g}")
+    for comment in ("Learnt by gaigs; metres, z up.", *comments):
+        scene.append(ElementTree.Comment(f" {comment.replace('--', '-')} "))
+    for bsdf in {bsdf.name: bsdf for bsdf in bsdfs}.values():
+        element = ElementTree.SubElement(scene, "bsdf", id=bsdf.name, type=bsdf.kind)
+        for name, value in bsdf.properties:
+            kind, text = ("string", value) if isinstance(value, str) else ("float", f"{value:.6g}")
+            ElementTree.SubElement(element, kind, name=name, value=text)
     folder, files = file.with_name(f"{file.stem}_meshes"), [file]
     with atomic_write(file) as part:
         folder.mkdir(exist_ok=True)
-        for mesh, material in zip(meshes, materials, strict=True):
+        for mesh, bsdf in zip(meshes, bsdfs, strict=True):
             files.append(folder / f"{mesh.name}.ply")
             vertices = np.array([*mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"])
             faces = np.array([(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))])
@@ -107,7 +160,7 @@ def write_scene(file: Path, meshes: Sequence[Mesh], materials: Sequence[Material
             shape = ElementTree.SubElement(scene, "shape", type="ply", id=f"mesh-{mesh.name}")
             ElementTree.SubElement(shape, "string", name="filename", value=f"{folder.name}/{files[-1].name}")
             ElementTree.SubElement(shape, "boolean", name="face_normals", value="true")
-            ElementTree.SubElement(shape, "ref", id=names[material], name="bsdf")
+            ElementTree.SubElement(shape, "ref", id=bsdf.name, name="bsdf")
         ElementTree.indent(scene)
         part.write_text(ElementTree.tostring(scene, encoding="unicode") + "\n", encoding="utf-8")
     return files

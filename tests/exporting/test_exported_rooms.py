@@ -12,9 +12,12 @@ import torch
 
 import gaigs
 from gaigs.data.sionna.meshes import Mesh
-from gaigs.exporting.rooms import write_scene
+from gaigs.exporting.rooms import itu_bsdf, sheet_bsdf, write_scene
 from gaigs.io.meshes import positions, read_obj, read_ply
+from gaigs.placement.mirrored import sheets
 from gaigs.placement.mirrored.materials import Material
+from gaigs.placement.mirrored.obstacles import Obstacles
+from gaigs.placement.mirrored.sheets import Sheet
 
 SIZE = 7.0, 5.0, 3.0
 WALL = Mesh("wall", "", ((0.0, 4.0, -9.0), (9.0, 4.0, -9.0), (9.0, 4.0, 9.0), (0.0, 4.0, 9.0)), ((0, 1, 2, 3),))
@@ -67,7 +70,7 @@ def test_a_scene_has_a_material_and_a_mesh_for_each_plane(mirrored, tmp_path):
 
 
 def test_a_carrier_outside_the_tables_has_numbers(tmp_path):
-    write_scene(tmp_path / "room.xml", [WALL], [Material("concrete", 0.2)], 0.92e9)
+    write_scene(tmp_path / "room.xml", [WALL], [itu_bsdf(Material("concrete", 0.2), 0.92e9)])
     (material,) = ElementTree.parse(tmp_path / "room.xml").getroot().findall("bsdf")
     assert material.get("type") == "radio-material"
     numbers = {one.get("name"): float(one.get("value")) for one in material}
@@ -78,7 +81,7 @@ def test_a_carrier_outside_the_tables_has_numbers(tmp_path):
 
 @pytest.mark.parametrize("frequency", [0.92e9, 6e9])
 def test_the_ray_tracer_reflects_at_the_material(frequency, tracer, tmp_path):
-    file, _ = write_scene(tmp_path / "room.xml", [WALL], [Material("concrete", 1.0)], frequency)
+    file, _ = write_scene(tmp_path / "room.xml", [WALL], [itu_bsdf(Material("concrete", 1.0), frequency)])
     scene = tracer.open_scene(frequency, file)
     paths = tracer.trace_scene(scene, torch.tensor([5.0, 0.0, 0.0]), torch.tensor([[3.0, 0.0, 0.0]]), depth=1)
     gains = {round(image[1].item()): gain for image, gain in zip(paths.images[0], paths.gains[0], strict=True)}
@@ -87,6 +90,38 @@ def test_the_ray_tracer_reflects_at_the_material(frequency, tracer, tmp_path):
     root = np.sqrt(permittivity - (1 - cosine**2))
     assert gains[0].item() == pytest.approx(1, abs=1e-2)
     assert gains[8].item() == pytest.approx((cosine - root) / (cosine + root), abs=1e-2)
+
+
+@pytest.mark.parametrize("frequency", [1e9, 30e9])
+def test_the_ray_tracer_passes_a_sheet_without_a_turn_or_a_reflection(frequency, tracer, tmp_path):
+    file, _ = write_scene(tmp_path / "room.xml", [WALL], [sheet_bsdf(Sheet(3.0, np.zeros((0, 3)), np.zeros((0, 3))))])
+    scene, receiver = tracer.open_scene(frequency, file), torch.tensor([5.0, 3.0, 0.0])
+    through = tracer.trace_scene(scene, receiver, torch.tensor([[3.0, 5.0, 0.0]]), depth=1, reflections=1)
+    assert through.gains[0].tolist() == pytest.approx([1 / (1 + 1.5 * 2**0.5)], abs=3e-2)  # TE at 45 degrees
+    beside = tracer.trace_scene(scene, receiver, torch.tensor([[3.0, 3.0, 0.0]]), depth=1, reflections=1)
+    assert beside.gains[0].abs().tolist() == pytest.approx([1.0], abs=1e-3)
+
+
+def test_obstacles_are_surfaces_and_the_gain_of_channels_is_told(mirrored, tmp_path, monkeypatch):
+    for limit, value in (("VOXELS", 50_000), ("CANDIDATES", 3), ("PATHS", 300)):
+        monkeypatch.setattr(sheets, limit, value)
+    placement = mirrored.placement
+    placement.obstacles = Obstacles(1, -placement.middle, placement.middle)
+    with torch.no_grad():
+        placement.obstacles.places.zero_()
+        placement.obstacles.log_widths.fill_(np.log(0.3))
+        placement.obstacles.log_densities.fill_(np.log(4.0))
+    file, *meshes = gaigs.export(mirrored, tmp_path / "room.xml")
+    pieces = [positions(read_ply(path)[0]) for path in meshes if path.stem.startswith("obstacle")]
+    radii = [np.linalg.norm(piece - placement.middle.numpy(), axis=1) for piece in pieces]
+    assert radii
+    assert all(np.ptp(radius) < 0.01 and 0.2 < radius.mean() < 1.0 for radius in radii)
+    assert "Channels of gateway1 are those traced times" in file.read_text()
+    gaigs.export(mirrored, tmp_path / "room.obj")
+    _, faces = read_obj(tmp_path / "room.obj")
+    assert len(faces) == 6 + len(pieces)
+    content, _ = chunks(gaigs.export(mirrored, tmp_path / "room.glb")[0].read_bytes())
+    assert len(content["nodes"][0]["children"]) == 6 + len(pieces)
 
 
 def test_obj_and_kriging_on_top(mirrored, tmp_path):
@@ -100,7 +135,8 @@ def test_obj_and_kriging_on_top(mirrored, tmp_path):
 
 def test_materials_need_a_carrier(tmp_path):
     scene = replace(gaigs.links("synthetic_rssi", transmitters=10, order=0).scene, frequencies=torch.zeros(0))
-    rssi = gaigs.registries["model"].build("mirrored", scene=scene)
+    options = {"name": "mirrored", "placement": {"name": "mirrored", "obstacles": 0}}
+    rssi = gaigs.registries["model"].build(options, scene=scene)
     with pytest.raises(ValueError, match="materials depend on the carrier"):
         gaigs.export(rssi, tmp_path / "room.xml")
     assert len(gaigs.export(rssi, tmp_path / "room.xml", frequency=2.4e9)) > 1

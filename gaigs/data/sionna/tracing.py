@@ -97,9 +97,16 @@ def trace(
 
 
 def trace_scene(
-    scene: Any, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], depth: int = DEPTH
+    scene: Any,
+    receiver: Float[Tensor, "3"],
+    transmitters: Float[Tensor, "b 3"],
+    depth: int = DEPTH,
+    reflections: int | None = None,
 ) -> Paths:
-    """As ``trace``, in a scene that is ``set_up``; without a path all gains are 0."""
+    """As ``trace``, in a scene that is ``set_up``; without a path all gains are 0.
+
+    With a largest number of reflections there are no diffractions: each triangle of a curved surface has edges.
+    """
     from sionna import rt
 
     scene.add(rt.Transmitter("receiver", receiver.tolist()))
@@ -109,8 +116,14 @@ def trace_scene(
         names = [f"transmitter {k}" for k in range(len(chunk))]
         for name, position in zip(names, chunk.tolist(), strict=True):
             scene.add(rt.Receiver(name, position))
-        paths = solver(scene, max_depth=depth, samples_per_src=RAYS, max_num_paths_per_src=CANDIDATES, diffraction=True)
-        found += _strongest(paths, receiver.double().numpy(), float(scene.wavelength[0]))
+        paths = solver(
+            scene,
+            max_depth=depth,
+            samples_per_src=RAYS,
+            max_num_paths_per_src=CANDIDATES,
+            diffraction=reflections is None,
+        )
+        found += _strongest(paths, receiver.double().numpy(), float(scene.wavelength[0]), reflections)
         scene.remove(names)
     scene.remove("receiver")
     images = pad_sequence([torch.from_numpy(places) for places, _ in found], batch_first=True, padding_value=1e3)
@@ -172,9 +185,16 @@ def set_up(scene: Any, frequency: float) -> None:
     scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
 
 
-def _strongest(paths: Any, receiver: np.ndarray, wavelength: float) -> list[tuple[np.ndarray, np.ndarray]]:
+def _strongest(
+    paths: Any, receiver: np.ndarray, wavelength: float, reflections: int | None
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Images (p, 3) [m] and gains (p,) of each transmitter's paths, without the weakest."""
     fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, 0, 0]
+    if reflections is not None:
+        from sionna.rt.constants import InteractionType
+
+        counts = (paths.interactions.numpy()[:, :, 0] == InteractionType.SPECULAR).sum(0)
+        fields = np.where(counts <= reflections, fields, 0)
     lengths, zenith, azimuth = (array.numpy()[:, 0].astype(float) for array in (paths.tau, paths.theta_t, paths.phi_t))
     lengths *= speed_of_light
     horizontal = np.sin(zenith)

@@ -1,6 +1,7 @@
 """The learnt room of mirrored Gaussians: tables, figures and files of planes, obstacles and paths."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from gaigs.io.files import write_text
 from gaigs.placement.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
 from gaigs.placement.mirrored.paths import Mirrored
 from gaigs.placement.mirrored.reflections import fold, images
+from gaigs.placement.mirrored.sheets import Sheet
 from gaigs.propagation import fresnel
 from gaigs.query import Query
 from gaigs.scene import Scene
@@ -289,8 +291,11 @@ def export(placement: Mirrored, query: Query, folder: Path) -> None:
     write_ply(folder / "obstacles.ply", parts, comment)
 
 
-def wavefront_obj(placement: Mirrored, found: Survey) -> str:
-    """The planes as a Wavefront OBJ file [m]: an object of one face each, counterclockwise as seen from outside."""
+def wavefront_obj(placement: Mirrored, found: Survey, sheets: Sequence[Sheet] = ()) -> str:
+    """The planes, and sheets of obstacles, as objects of a Wavefront OBJ file [m].
+
+    A plane is one face, counterclockwise as seen from outside.
+    """
     planes = _planes(placement, found)
     lines = [
         "# Planes learnt by gaigs; coordinates in metres, z up, the world frame of the data.",
@@ -308,4 +313,9 @@ def wavefront_obj(placement: Mirrored, found: Survey) -> str:
             "f " + " ".join(str(count + corner + 1) for corner in range(len(plane.corners))),
         ]
         count += len(plane.corners)
+    for number, sheet in enumerate(sheets):
+        lines += [f"# loss {sheet.loss_db:.1f} dB", f"o obstacle_{number}"]
+        lines += ["v {:.4f} {:.4f} {:.4f}".format(*corner) for corner in sheet.vertices.tolist()]
+        lines += ["f {} {} {}".format(*face) for face in (sheet.faces + count + 1).tolist()]
+        count += len(sheet.vertices)
     return "\n".join(lines) + "\n"
