@@ -54,7 +54,7 @@ class SurveyPlan:
         unit: Of the errors.
 
     Example:
-        >>> links = gaigs.links("synthetic_rssi", transmitters=20)
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
         >>> print(gaigs.survey(gaigs.train("gaussian_process", links), count=3))
         3 more places bring the expected mean error from ...
     """
@@ -113,7 +113,7 @@ def survey(
         ValueError: The model has no process over places, the count is less than 1, or a place is impossible.
 
     Example:
-        >>> model = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=20))
+        >>> model = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=60))
         >>> plan = gaigs.survey(model, count=5)
         >>> plan.places.shape, bool(plan.errors[-1] < plan.errors[0])
         (torch.Size([5, 3]), True)

@@ -183,7 +183,7 @@ class Model(nn.Module):
             >>> channels = gaigs.train("friis", gaigs.links("synthetic_csi", transmitters=20, order=0))
             >>> channels.predict([1.0, 2.0, 1.5], frequencies=[5.0e9, 5.1e9]).shape
             torch.Size([16, 2])
-            >>> levels = gaigs.train("knn", gaigs.links("synthetic_rssi", transmitters=50))
+            >>> levels = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=100))
             >>> low, high = levels.predict([1.0, 2.0, 1.5], interval=0.9)[2:4]  # [dBm]
             >>> bool(low < high)
             True
