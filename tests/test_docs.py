@@ -209,6 +209,7 @@ def test_configuration_keys_exist(page, composed, place):
             # A key that only some option of its group has, such as data.root, exists too.
             names = sorted(options, key=lambda name: rest[0] not in options[name])  # likely ones first
             if not any(_has(composed(f"{top}={name}"), key) for name in names):
+                assert "=" in word, word
                 composed(word)  # of a section to which any key may be added
 
 
