@@ -21,7 +21,6 @@ import torch
 from hatchling.builders.wheel import WheelBuilder
 from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 import gaigs
@@ -156,8 +155,8 @@ def test_modules_and_files_of_commands_exist(page):
             assert (ROOT / command[command.index("-c") + 1]).is_file(), command
 
 
-@page_by_page
-def test_commands_compose(page, composed):
+def composable_lines(page):
+    """The overrides of each command; of a sweep each word once, beside the others' first."""
     for words in filter(None, map(overrides, commands(page))):
         parsed = OverridesParser.create().parse_overrides(composable(words))
         choices = [
@@ -167,47 +166,69 @@ def test_commands_compose(page, composed):
             for o in parsed
         ]
         first = [values[0] for values in choices]
-        composed(*first)
-        for position, values in enumerate(choices):  # each word of a sweep once, beside the others' first
+        yield first
+        for position, values in enumerate(choices):
             for value in (value for value in values[1:] if not re.search(r"=[-+.\de]+$", value)):
-                composed(*first[:position], value, *first[position + 1 :])
+                yield [*first[:position], value, *first[position + 1 :]]
+
+
+def chosen(line):
+    """The words that choose parts, in their order; the others set values, in whatever order."""
+    return tuple(word for word in line if re.match(r"~|[+]*[\w/@]+=", word))
+
+
+@functools.cache
+def together():
+    """All words of all pages that stand beside the same choices, each key once: they compose in one go."""
+    found = {}
+    for line in (line for page in PAGES for line in composable_lines(page)):
+        found.setdefault(chosen(line), {}).update((word.partition("=")[0], word) for word in line)
+    return found
+
+
+@page_by_page
+def test_commands_compose(page, composed):
+    for line in composable_lines(page):
+        composed(*together()[chosen(line)].values())
 
 
 @of_today
 def test_configuration_keys_exist(page, composed, place):
-    with contextlib.chdir(place):
-        folders = [configuration.conf_dir(), *configuration.plugin_conf_dirs()]
     for word in spoken(page):
         match = re.fullmatch(r"\+?(?P<top>[a-z_]+)(\.[a-z_]+)*(=\S+)?", word)
         if match is None or not set(".=") & set(word) or Path(word).suffix in FILES:
             continue
         if match["top"] not in composed() and not (configuration.conf_dir() / match["top"]).is_dir():
             continue
-        key = word.removeprefix("+").partition("=")[0]
+        key, _, value = word.removeprefix("+").partition("=")
         top, *rest = key.split(".")
-        if _has(composed, [], word):
-            continue
-        # A key that only some option of its group has, such as data.root, exists too.
+        options = options_of(top, place)
+        if options and not rest:
+            assert value.strip('"') in options, word
+        elif not _has(composed(), key):
+            # A key that only some option of its group has, such as data.root, exists too.
+            names = sorted(options, key=lambda name: rest[0] not in options[name])  # likely ones first
+            if not any(_has(composed(f"{top}={name}"), key) for name in names):
+                assert "=" in word, word
+                composed(word)  # of a section to which any key may be added
+
+
+@functools.cache
+def options_of(top, place):
+    """Names of the files and components of a group, and their keys."""
+    with contextlib.chdir(place):
+        folders = [configuration.conf_dir(), *configuration.plugin_conf_dirs()]
         options = {file.stem: OmegaConf.load(file) for folder in folders for file in folder.glob(f"{top}/*.yaml")}
         if top in configuration.CONSTRUCTED:
-            with contextlib.chdir(place):
-                options |= {name: registry(top).options(name) for name in registry(top).names() if name not in options}
-        names = sorted(options, key=lambda name: not rest or rest[0] not in options[name])  # likely ones first
-        assert rest, word
-        assert any(_has(composed, [f"{top}={name}"], word) for name in names), word
+            options |= {name: registry(top).options(name) for name in registry(top).names() if name not in options}
+    return options
 
 
-def _has(composed, base, word):
-    if "=" in word:
-        with contextlib.suppress(HydraException):
-            composed(*base, word)
-            return True
-        return False
-    config = composed(*base)
-    for key in word.split("."):
-        if not isinstance(config, dict) or key not in config:
+def _has(config, key):
+    for part in key.split("."):
+        if not isinstance(config, dict) or part not in config:
             return False
-        config = config[key]
+        config = config[part]
     return True
 
 

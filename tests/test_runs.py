@@ -76,10 +76,11 @@ def configure(*overrides):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def no_figures():
-    """Figures take longer than all else; the tests of gaigs.report and of the command line draw them."""
+def quick():
+    """Figures and times take longer than all else; the tests of gaigs.report and of the command line have them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
+        patch.setattr(evaluation, "median_ms", lambda work: (work(), 1.0)[1])
         yield
 
 

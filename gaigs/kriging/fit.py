@@ -92,11 +92,13 @@ def fit_hyperparameters(
     each_receiver = (hold_out(scene, links, index, scale, residuals, each) for index in known)
     held_out = [held for held in each_receiver if held is not None]
 
+    def value(logarithms: Tensor) -> Tensor:
+        return sum((negative_log_likelihood(scene, held, *logarithms.exp()) for held in held_out), torch.zeros(()))
+
     def cost(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         with torch.enable_grad():
             leaf = torch.tensor(logarithms, requires_grad=True)
-            costs = (negative_log_likelihood(scene, held, *leaf.exp()) for held in held_out)
-            total = sum(costs, torch.zeros(()))
+            total = value(leaf)
             (gradient,) = torch.autograd.grad(total, leaf)
         return total.item(), gradient.numpy()
 
@@ -105,7 +107,7 @@ def fit_hyperparameters(
         # From the best point of a coarse grid: the likelihood may have several maxima.
         axes = [low + (high - low) * np.array([1, 3, 5]) / 6 for low, high in bounds]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(bounds))
-        start = min(grid, key=lambda point: cost(point)[0])
+        start = min(grid, key=lambda point: value(torch.from_numpy(point)).item())
         found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds)
         best, least = found.x, float(found.fun)
     return Hyperparameters(*np.exp(best).tolist()), least

@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Inexact, Int
+from jaxtyping import Bool, Float, Inexact, Int
 from torch import Tensor
 
 from gaigs.geometry import FAR
@@ -104,7 +104,7 @@ class Calibration:
             known: Links that the calibrated model knows.
         """
         errors = (task.align(labels, values) - values).abs() / _shaped(deviations, values)
-        errors, values = (_thin(part) for part in (errors, values))
+        errors, values = (thin(part) for part in (errors, values))
         count = int(torch.cat((query.receivers, known.receivers)).max()) + 1
         heard = query.receivers.bincount(minlength=count)
         rows = query.receivers if heard.min() >= ENOUGH and count > 1 else torch.zeros_like(query.receivers)
@@ -121,7 +121,7 @@ class Calibration:
             groups -= 1
         amplitudes = values.new_zeros(0, dtype=torch.float64)
         if values.shape[1] > 1 and not values.is_complex():
-            some = _thin(values.flatten()[None], 10**6)[0].double()
+            some = thin(values.flatten()[None], 10**6)[0].double()
             amplitudes = some.quantile(torch.arange(1, BINS, dtype=torch.float64) / BINS)
         bins = torch.bucketize(values.double(), amplitudes) if len(amplitudes) else torch.zeros_like(errors).long()
         quantiles = errors.new_zeros(len(counts), len(amplitudes) + 1, STEPS + 1, dtype=torch.float64)
@@ -192,6 +192,13 @@ def nearest(query: Query, places: Float[Tensor, "k 3"], receivers: Int[Tensor, "
     return found
 
 
+def holds(estimate: Estimate, labels: Inexact[Tensor, " k *shape"]) -> Bool[Tensor, " k *shape"]:
+    """True for each number of aligned labels that is within its interval."""
+    if estimate.radius is not None:
+        return (labels - estimate.value).abs() <= estimate.radius
+    return (estimate.lower <= labels) & (labels <= estimate.upper)  # type: ignore[operator]
+
+
 def interval_scores(
     task: Task, labels: Inexact[Tensor, " k *shape"], half: Estimate, most: Estimate
 ) -> dict[str, Float[Tensor, " k"]]:
@@ -205,14 +212,7 @@ def interval_scores(
     value, std = most.value, most.std
     labels = task.align(labels, value)
     errors = labels - value
-    inside: list[Any] = []
-    for estimate in (half, most):
-        covered = (
-            errors.abs() <= estimate.radius
-            if estimate.radius is not None
-            else (estimate.lower <= labels) & (labels <= estimate.upper)
-        )
-        inside.append(covered)
+    inside = holds(half, labels), holds(most, labels)
     width = 2 * most.radius if most.radius is not None else most.upper - most.lower
     if errors.is_complex():
         errors, std = torch.view_as_real(errors), (std / math.sqrt(2))[..., None].expand(*std.shape, 2)
@@ -247,7 +247,7 @@ def _shaped(deviations: Tensor, values: Tensor) -> Tensor:
     return shaped.clamp_min(torch.finfo(real.dtype).tiny).expand(values.shape)
 
 
-def _thin(numbers: Tensor, most: int = NUMBERS) -> Tensor:
+def thin(numbers: Tensor, most: int = NUMBERS) -> Tensor:
     """At most ``most`` numbers of each label (n, m), evenly spread."""
     flat = numbers[..., None].flatten(1)
     return flat[:, :: math.ceil(flat.shape[1] / most)].contiguous()

@@ -23,7 +23,7 @@ from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.geometry import even_places
 from gaigs.io.files import atomic_write
-from gaigs.kriging.intervals import Calibration, interval_scores, nearest, summarise_intervals
+from gaigs.kriging.intervals import Calibration, holds, interval_scores, nearest, summarise_intervals, thin
 from gaigs.kriging.links import evenly, folds_of
 from gaigs.kriging.scalar import is_scalar
 from gaigs.model import Model, call_optional
@@ -303,16 +303,21 @@ def score(
 def shares(
     calibration: Calibration, task: Task, labels: Tensor, values: Tensor, deviations: Tensor, query: Query
 ) -> np.ndarray:
-    """Shares of the labels of at most 300 links within intervals of the levels 0.05 to 0.95 (19,)."""
+    """Shares of the labels of at most 300 links within intervals of the levels 0.05 to 0.95 (19,).
+
+    Of each label at most ``NUMBERS`` numbers count, as for the calibration.
+    """
     some = evenly(torch.arange(len(labels)), 300)
-    parts = labels[some], values[some], deviations[some], query[some]
+    aligned, values, deviations = task.align(labels[some], values[some]), values[some], deviations[some]
+    aligned, values = thin(aligned), thin(values)
+    deviations, query = thin(deviations) if deviations.ndim > 1 else deviations, query[some]
     found = []
     for level in np.arange(1, 20) / 20:
         if not calibration.gives(level):
             found.append(math.nan)
             continue
-        estimate = calibration.estimate(*parts[1:], level)
-        found.append(interval_scores(task, parts[0], estimate, estimate)["coverage_90"].mean().item())
+        inside = holds(calibration.estimate(values, deviations, query, level), aligned)
+        found.append(inside.double().mean().item())
     return np.array(found)
 
 
