@@ -7,7 +7,6 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,8 +37,8 @@ POINTS, SECONDS, FEWEST = 20_000, 60.0, 1000
 ELSEWHERE = 0.1
 """Prior probability that a transmitter is not near a known place but anywhere in their box."""
 
-HELD_OUT, SCORED = 500, 200
-"""Most fingerprints of a fold whose errors give the axes, and most that set the posterior's width; two folds do."""
+HELD_OUT, SCORED, ENOUGH = 500, 200, 300
+"""Most fingerprints of a fold whose errors give the axes, and most that are located; folds are made until enough are."""
 
 DEGREES = (0.25, 1.0, 4.0, 30.0)
 """Degrees of freedom of the likelihood to choose from."""
@@ -47,11 +46,17 @@ DEGREES = (0.25, 1.0, 4.0, 30.0)
 TEMPERS = tuple(2.0 ** (power / 2) for power in range(-8, 17))
 """Exponents of the likelihood to choose from."""
 
+CHOICES = tuple(itertools.product(DEGREES, TEMPERS))
+
 JUMP = 1e-4
 """Density of a move to any place over that of a move to the same one: a track may jump."""
 
-KEPT = 500
-"""Candidates of each value of a track that are linked to those before and after."""
+KEPT, SPREAD = 1000, 100
+"""Candidates of each value of a track that are linked to those before and after, and those over which its own posterior
+spreads: regions of tracks reach far beyond the likeliest candidates."""
+
+STAYS = 10
+"""Most values of a held-out track at each of its places."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,8 @@ class Location:
         median: Place with the least expected distance from the transmitter (n, 3) [m].
         likeliest: Place of the highest density (n, 3) [m].
         region: True for candidates in the region that holds the transmitter with the asked probability (n, g).
+        sizes: Prior probability of each region (n,).
+        calibrated: True if held-out fingerprints set the region; else the posterior does, often too small.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -79,11 +86,35 @@ class Location:
     median: Float[Tensor, "n 3"]
     likeliest: Float[Tensor, "n 3"]
     region: Bool[Tensor, "n g"]
+    sizes: Float[Tensor, " n"]
+    calibrated: bool
 
     def holds(self, places: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """True for each value whose region holds a place: that has the candidate nearest to it."""
         near = distances(places.double(), self.places.double()).argmin(1)
         return self.region.gather(1, near[:, None])[:, 0]
+
+
+class Candidates(NamedTuple):
+    """Candidate places (g, 3) [m], and logarithms of their prior probability and, but for a constant, density."""
+
+    places: Float[Tensor, "g 3"]
+    prior: Float[Tensor, " g"]
+    density: Float[Tensor, " g"]
+
+
+class Held(NamedTuple):
+    """Held-out fingerprints in the map of a model that does not know them, by a likelihood chosen without them.
+
+    Attributes:
+        candidates: Of the map.
+        likelihoods: Logarithms there, with known and with unknown power (2, n, g).
+        truth: Their places (n, 3) [m].
+    """
+
+    candidates: Candidates
+    likelihoods: Float[Tensor, "2 n g"]
+    truth: Float[Tensor, "n 3"]
 
 
 @dataclass(frozen=True)
@@ -100,8 +131,7 @@ class Fingerprints:
         values: Predictions at the candidates along these axes (g, r, k).
         deviations: Standard deviations of labels of one number (g, r); else 1.
         degrees, temper: Of the likelihood, see ``log_likelihood``.
-        drops: Logarithm of the best candidate's density over that at the true place, of held-out fingerprints,
-            ascending (h,); empty without links.
+        held: Held-out fingerprints of each fold, which calibrate regions; empty without links.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -120,7 +150,27 @@ class Fingerprints:
     deviations: Float[Tensor, "g r"]
     degrees: float = 4.0
     temper: float = 1.0
-    drops: Float[Tensor, " h"] = field(default_factory=lambda: torch.zeros(0))
+    held: tuple[Held, ...] = ()
+    _drops: dict = field(default_factory=dict, repr=False, compare=False)
+
+    def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
+        """Logarithm of the best candidate's density over that at the true place, of held-out fingerprints, ascending.
+
+        Options are those of ``locate``. With ``step`` fingerprints are values of walks, see ``walk``.
+        """
+        if (unknown_power, step) not in self._drops:
+            found = [torch.zeros(0, dtype=torch.float64)]
+            for own, likelihoods, truth in self.held:
+                logarithms = likelihoods[int(unknown_power)] + own.prior.double()
+                if step is not None:
+                    order = walk(truth, step)
+                    own, logarithms = track(own, logarithms[order], step)
+                    truth = truth[order]
+                heights = logarithms - own.prior + own.density
+                near = distances(truth.double(), own.places.double()).argmin(1)
+                found.append(heights.amax(1) - heights.gather(1, near[:, None])[:, 0])
+            self._drops[unknown_power, step] = torch.cat(found).sort().values
+        return self._drops[unknown_power, step]
 
 
 @torch.no_grad()
@@ -177,7 +227,7 @@ def fingerprints(
     known = torch.zeros(0).long() if links is None else at_carrier(links, frequency, "train", "validation")
     made = mapped(model, known)
     tries: list[Any] = []
-    for one, part, others in islice(unseen(model, links) if links is not None else (), 2):
+    for one, part, others in unseen(model, links) if links is not None else ():
         one.calibration = model.calibration
         rows = rows_of(links)  # those known links that share a transmission with the part
         asked, truth = received(links, known[torch.isin(rows[known], rows[part])])
@@ -185,6 +235,8 @@ def fingerprints(
         if len(some):
             errors = asked[some] - predicted(one, truth[some], frequency)[0]
             tries.append((mapped(one, others[torch.isin(others, known)]), asked[some], truth[some], errors))
+        if sum(min(len(places), SCORED) for _, _, places, _ in tries) >= ENOUGH:
+            break
     if len(tries) == 1 and len(tries[0][1]) > 1:
         one, *parts = tries[0]
         tries = [(one, *(part[half::2] for part in parts)) for half in range(2)]
@@ -193,7 +245,8 @@ def fingerprints(
         # Axes of the other errors: along those of its own a value would be too near.
         one = along(one, [errors for other, (*_, errors) in enumerate(tries) if other != number])
         some = evenly(torch.arange(len(truth)), SCORED)
-        held.append(Try(one, *squares(one, asked[some] @ one.axes), truth[some]))
+        both = [squares(one, asked[some] @ one.axes, unknown) for unknown in (False, True)]
+        held.append(Try(one, both, truth[some]))
     made = along(made, [errors for *_, errors in tries])
     return fitted(made, held) if held else made
 
@@ -219,8 +272,9 @@ def locate(
         unknown_power: True if all labels of a transmission share an unknown offset [dB], or factor of amplitudes.
             Channels are always compared without their power and phase.
         step: Standard deviation of the move from one value to the next along each axis, if values are a track [m].
-        level: Probability with which the region holds the transmitter, by held-out fingerprints (9 or more for 0.9).
-            With fewer, without links and on tracks the posterior counts, whose regions are often too small.
+        level: Probability with which the region holds the transmitter, by held-out fingerprints (9 or more for 0.9),
+            with ``step`` by walks among them, once for each step. With fewer and without links the posterior counts,
+            whose regions are often too small.
 
     Raises:
         ValueError: A value has another shape than the labels, or was heard by no receiver; or an option is impossible.
@@ -254,19 +308,24 @@ def posterior(
     if step is not None and not 0 < step < math.inf:
         raise ValueError(f"step must be above 0 m, got {step!r}")
     parts = squares(prints, asked @ prints.axes, unknown_power)
-    logarithms, places = log_likelihood(*parts, prints.degrees, prints.temper) + prints.prior, prints.places
+    logarithms = log_likelihood(*parts, prints.degrees, prints.temper) + prints.prior
+    drops, count = prints.drops(unknown_power, step), sum(len(one.truth) for one in prints.held)
+    own = Candidates(prints.places, prints.prior, prints.density)
     if step is not None:
-        logarithms = smoothed(logarithms, places.double(), step)
-    probabilities, heights = torch.softmax(logarithms, 1), logarithms - prints.prior + prints.density
-    order, count = heights.argsort(1, descending=True), len(prints.drops)
+        own, logarithms = track(own, logarithms, step)
+    places = own.places
+    probabilities, heights = torch.softmax(logarithms, 1), logarithms - own.prior + own.density
+    order, calibrated = heights.argsort(1, descending=True), count >= fewest(level)
     ordered = probabilities.gather(1, order)
     region = torch.zeros_like(order, dtype=torch.bool).scatter(1, order, ordered.cumsum(1) - ordered < level)
-    if count and step is None:
-        near = heights >= heights.gather(1, order[:, :1]) - prints.drops[min(math.ceil(level * (count + 1)), count) - 1]
-        region = near if count >= fewest(level) else near | region
+    if count:
+        rank = min(math.ceil(level * (count + 1) / count * len(drops)), len(drops))
+        near = heights >= heights.gather(1, order[:, :1]) - drops[rank - 1]
+        region = near if calibrated else near | region
     mean = (probabilities @ places.double()).float()
     median = torch.cat([geometric_median(places, part) for part in probabilities.split(64)])
-    return Location(places, probabilities, mean, median, places[order[:, 0]], region)
+    sizes = (region * own.prior.softmax(0)).sum(1)
+    return Location(places, probabilities, mean, median, places[order[:, 0]], region, sizes, calibrated)
 
 
 def run(config: dict, folder: Path) -> None:
@@ -294,10 +353,11 @@ def run(config: dict, folder: Path) -> None:
     }
     numbers["locate"] |= {
         f"region_{100 * options['level']:g}": found.holds(truth).double().mean().item(),
-        f"share_{100 * options['level']:g}": (found.region * prints.prior.softmax(0)).sum(1).mean().item(),
+        f"share_{100 * options['level']:g}": found.sizes.mean().item(),
         "milliseconds": 1e3 * taken / len(truth),
     }
     numbers |= {"transmissions": len(truth), "candidates": len(prints.places), "map_seconds": made}
+    numbers["calibrated"] = found.calibrated
     numbers |= {"task": links.task.name, "split": links.split.name}
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "locate.json", json.dumps(numbers, indent=2) + "\n")
@@ -309,7 +369,11 @@ def run(config: dict, folder: Path) -> None:
     style.save(figure(truth, found.mean, places, errors), folder / "locate.png")
     shown = numbers["locate"], numbers["knn"]
     words = (f"median {part['median_m']:.3g} m, mean {part['mean_m']:.3g} m" for part in shown)
-    print(f"{len(truth)} transmitters: {'; nearest neighbours '.join(words)}\nresults: {folder}")
+    print(f"{len(truth)} transmitters: {'; nearest neighbours '.join(words)}")
+    if not found.calibrated:
+        count = sum(len(one.truth) for one in prints.held)
+        print(f"regions are not calibrated: {count} fingerprints are held out, and {fewest(options['level'])} needed")
+    print(f"results: {folder}")
 
 
 def figure(
@@ -511,41 +575,69 @@ def log_likelihood(
 
 
 class Try(NamedTuple):
-    """Held-out values: ``squares`` of them in the map of a model that does not know them, and their places (n, 3)."""
+    """Held-out values: ``squares`` of them in the map of a model that does not know them, and their places (n, 3).
+
+    The squares are those with known and with unknown power.
+    """
 
     prints: Fingerprints
-    total: Float[Tensor, "n g"]
-    logarithms: Float[Tensor, "n g"]
-    count: Float[Tensor, " n"]
+    squares: Sequence[tuple[Tensor, Tensor, Tensor]]
     truth: Float[Tensor, "n 3"]
 
-    def likelihood(self, degrees: float, temper: float) -> Float[Tensor, "n g"]:
-        return log_likelihood(self.total, self.logarithms, self.count, degrees, temper)
+    def score(self, degrees: float, temper: float) -> float:
+        """Sum of the energy scores of the posteriors by a likelihood.
+
+        Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation, 2007, section 4.3.
+        """
+        probabilities = torch.softmax(log_likelihood(*self.squares[0], degrees, temper) + self.prints.prior, 1)
+        rng = torch.Generator().manual_seed(0)
+        drawn = self.prints.places[torch.multinomial(probabilities, 128, True, generator=rng)]
+        apart = (drawn[:, ::2] - drawn[:, 1::2]).norm(dim=2).mean(1)
+        return ((drawn - self.truth[:, None]).norm(dim=2).mean(1) - apart / 2).sum().item()
 
 
 def fitted(prints: Fingerprints, tries: Sequence[Try]) -> Fingerprints:
-    """The likelihood with the least energy score of held-out values, and how far the true place is from the best.
+    """The likelihood with the least energy score of held-out values, and these values by that of the other folds."""
+    scores = torch.tensor([[one.score(*choice) for choice in CHOICES] for one in tries])
+    degrees, temper = CHOICES[int(scores.sum(0).argmin())]
+    held = []
+    for one, own in zip(tries, scores, strict=True):
+        choice = CHOICES[int((scores.sum(0) - own if len(tries) > 1 else own).argmin())]
+        likelihoods = torch.stack([log_likelihood(*part, *choice).float() for part in one.squares])
+        there = Candidates(one.prints.places, one.prints.prior, one.prints.density)
+        held.append(Held(there, likelihoods, one.truth))
+    return replace(prints, degrees=degrees, temper=temper, held=tuple(held))
 
-    Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation, 2007, section 4.3.
+
+def walk(places: Float[Tensor, "n 3"], step: float) -> Int[Tensor, " k"]:
+    """A walk through places, always to the nearest one that is left.
+
+    It stays for as many values as moves of ``step`` along each axis take to the next place: errors of values that are
+    received near each other have much in common.
     """
-    rng = torch.Generator()
+    apart, left = distances(places, places), torch.ones(len(places), dtype=torch.bool)
+    order, moves = [0], []
+    left[0] = False
+    while left.any():
+        move, following = apart[order[-1]].masked_fill(~left, math.inf).min(0)
+        left[following] = False
+        order.append(int(following))
+        moves.append(move)
+    stays = round(float(torch.stack(moves).median()) / (step * math.sqrt(3))) if moves else 1
+    return torch.tensor(order).repeat_interleave(min(max(1, stays), STAYS))
 
-    def score(degrees: float, temper: float) -> float:
-        total = []
-        for one in tries:
-            probabilities = torch.softmax(one.likelihood(degrees, temper) + one.prints.prior, 1)
-            drawn = one.prints.places[torch.multinomial(probabilities, 128, True, generator=rng.manual_seed(0))]
-            apart = (drawn[:, ::2] - drawn[:, 1::2]).norm(dim=2).mean(1)
-            total.append((drawn - one.truth[:, None]).norm(dim=2).mean(1) - apart / 2)
-        return torch.cat(total).mean().item()
 
-    degrees, temper = min(itertools.product(DEGREES, TEMPERS), key=lambda choice: score(*choice))
-    drops = []
-    for one in tries:
-        heights = one.likelihood(degrees, temper) + one.prints.density
-        near = distances(one.truth.double(), one.prints.places.double()).argmin(1)
-        drops.append(heights.amax(1) - heights.gather(1, near[:, None])[:, 0])
-    return replace(prints, degrees=degrees, temper=temper, drops=torch.cat(drops).sort().values)
+def track(
+    candidates: Candidates, logarithms: Float[Tensor, "n g"], step: float
+) -> tuple[Candidates, Float[Tensor, "n j"]]:
+    """An even part of the candidates, and the posterior of a track there.
+
+    Posteriors of single values, ``logarithms``, still spread over ``SPREAD`` of them, so that ``KEPT`` hold them.
+    """
+    spread = torch.softmax(logarithms, 1).square().sum(1).reciprocal().median()
+    some = torch.arange(0, len(candidates.places), max(1, int(spread / SPREAD)))
+    part = Candidates(*(each[some] for each in candidates))
+    return part, smoothed(logarithms[:, some], part.places.double(), step)
 
 
 def geometric_median(places: Float[Tensor, "g 3"], probabilities: Float[Tensor, "n g"]) -> Float[Tensor, "n 3"]:
@@ -570,16 +662,15 @@ def smoothed(logarithms: Float[Tensor, "n g"], places: Float[Tensor, "g 3"], ste
     spacing = distances(places[best.indices[0]], places[best.indices[0]]).fill_diagonal_(math.inf).amin(1).median()
     step = math.hypot(step, spacing.item())  # candidates are no finer
 
-    def moves(first: Tensor, second: Tensor) -> Tensor:
-        apart = distances(places[first], places[second])
-        return torch.logaddexp(-(apart / step).square() / 2, torch.tensor(math.log(JUMP), dtype=apart.dtype))
+    def moved(logarithm: Tensor, first: Tensor, second: Tensor) -> Tensor:
+        moves = (distances(places[second], places[first]) / step).square_().div_(-2).exp_().add_(JUMP)
+        return (moves @ (logarithm - logarithm.max()).exp()).log()  # above 0: each move may be a jump
 
-    links = [moves(a, b) for a, b in itertools.pairwise(best.indices)]
     forward, backward = [best.values[0]], [torch.zeros_like(best.values[0])]
-    for move, own in zip(links, best.values[1:], strict=True):
-        forward.append(own + torch.logsumexp(forward[-1][:, None] + move, 0).log_softmax(0))
-    for move, own in zip(links[::-1], best.values.flip(0)[:-1], strict=True):
-        backward.append(torch.logsumexp(move + own + backward[-1], 1).log_softmax(0))
+    for own, pair in zip(best.values[1:], itertools.pairwise(best.indices), strict=True):
+        forward.append(own + moved(forward[-1], *pair))
+    for own, pair in zip(best.values.flip(0), itertools.pairwise(best.indices.flip(0)), strict=False):
+        backward.append(moved(own + backward[-1], *pair))
     found = torch.stack(forward) + torch.stack(backward[::-1])
     return torch.full_like(logarithms, -math.inf).scatter(1, best.indices, found)
 
