@@ -38,7 +38,8 @@ ELSEWHERE = 0.1
 """Prior probability that a transmitter is not near a known place but anywhere in their box."""
 
 HELD_OUT, SCORED, ENOUGH = 500, 200, 300
-"""Most fingerprints of a fold whose errors give the axes, and most that are located; folds are made until enough are."""
+"""Most fingerprints of a fold whose errors give the axes, most that are located, and number after which no fold is
+added."""
 
 DEGREES = (0.25, 1.0, 4.0, 30.0)
 """Degrees of freedom of the likelihood to choose from."""
@@ -51,7 +52,7 @@ CHOICES = tuple(itertools.product(DEGREES, TEMPERS))
 JUMP = 1e-4
 """Density of a move to any place over that of a move to the same one: a track may jump."""
 
-KEPT, SPREAD = 1000, 100
+KEPT, SPREAD = 1500, 75
 """Candidates of each value of a track that are linked to those before and after, and those over which its own posterior
 spreads: regions of tracks reach far beyond the likeliest candidates."""
 
