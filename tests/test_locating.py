@@ -1,6 +1,7 @@
 import itertools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from gaigs.locating import (
     received,
     smoothed,
     squares,
+    walk,
 )
 from gaigs.task.csi import Csi
 
@@ -107,6 +109,24 @@ def test_transmitters_are_nearer_than_their_neighbours_and_in_their_regions():
     assert found.holds(truth).double().mean() >= 0.75
     assert posterior(prints, asked, False, None, 0.5).region.sum() < 0.7 * found.region.sum()
     torch.testing.assert_close(prints.prior.exp().sum(), torch.tensor(1.0))
+
+
+def test_walks_go_to_the_nearest_place_and_stay_while_steps_would_take_them_there():
+    line = torch.tensor([0.0, 2.0, 1.0, 3.0])[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    assert walk(line, 1.0).tolist() == [0, 2, 1, 3]
+    assert walk(line, 0.3).tolist() == [0, 0, 2, 2, 1, 1, 3, 3]
+    assert walk(line[:1], 0.3).tolist() == [0]
+
+
+def test_regions_of_tracks_hold_more_than_the_posterior_says(rssi):
+    links, model, _ = rssi
+    prints = gaigs.fingerprints(model, links, points=500)
+    asked, truth = received(links, links.split.test)
+    order = walk(truth, 0.5)
+    own, plain = (posterior(one, asked[order], False, 0.5, 0.9) for one in (prints, replace(prints, held=())))
+    assert own.calibrated
+    assert own.holds(truth[order]).double().mean() >= 0.75 > plain.holds(truth[order]).double().mean()
+    assert own.sizes.mean() < 0.5
 
 
 def test_prior_follows_the_known_places_and_a_region_replaces_it(rssi):
