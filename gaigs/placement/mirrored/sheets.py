@@ -35,7 +35,7 @@ LEAST_LOSS = 0.1
 SAMPLES = 192
 """Points of a leg at which the density is computed: 5 cm apart on a leg of 10 m."""
 
-PATHS = 5_000
+PATHS = 20_000
 """Largest number of paths to which sheets are fitted."""
 
 VOXELS = 500_000
