@@ -152,7 +152,7 @@ class Fingerprints:
     degrees: float = 4.0
     temper: float = 1.0
     held: tuple[Held, ...] = ()
-    _drops: dict = field(default_factory=dict, repr=False, compare=False)
+    _drops: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
         """Logarithm of the best candidate's density over that at the true place, of held-out fingerprints, ascending.
@@ -308,6 +308,7 @@ def posterior(
         raise ValueError(f"level must be a probability between 0 and 1 such as 0.9, got {level!r}")
     if step is not None and not 0 < step < math.inf:
         raise ValueError(f"step must be above 0 m, got {step!r}")
+    step = step if len(asked) > 1 else None  # one value is no track
     parts = squares(prints, asked @ prints.axes, unknown_power)
     logarithms = log_likelihood(*parts, prints.degrees, prints.temper) + prints.prior
     drops, count = prints.drops(unknown_power, step), sum(len(one.truth) for one in prints.held)

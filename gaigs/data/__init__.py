@@ -150,13 +150,17 @@ def median_spacing(places: Float[Tensor, "n 3"]) -> float:
 def floors_of(places: Float[Tensor, "n 3"]) -> Float[Tensor, " k"]:
     """Heights of separate floors [m], that with most places first; empty of one floor.
 
-    No place lies in the 2 m between two floors, nor in twice the range of heights of a floor's places.
+    A floor has 5 places or more. None lies in the 2 m between two floors, nor in twice the range of a floor's heights.
     """
     heights = places[:, 2].sort().values
     gaps = heights.diff()
     ends = (gaps > 2).nonzero()[:, 0]
     floors = heights.tensor_split(ends + 1)
-    if not len(ends) or gaps[ends].min() < 2 * max(floor[-1] - floor[0] for floor in floors):
+    if (
+        not len(ends)
+        or min(map(len, floors)) < 5
+        or gaps[ends].min() < 2 * max(floor[-1] - floor[0] for floor in floors)
+    ):
         return heights[:0]
     return torch.stack([floor.median() for floor in sorted(floors, key=len, reverse=True)])
 

@@ -4,6 +4,7 @@ import base64
 import cmath
 import json
 import math
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -53,8 +54,14 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     Raises:
         ValueError: The model has no planes, or a scene's carrier is unknown or impossible.
     """
-    own = mirrored_of("a learnt room", model)
-    suffix, found = file.suffix.lower(), export.survey(own.placement, own.surveyed)
+    own, suffix = mirrored_of("a learnt room", model), file.suffix.lower()
+    known = own.scene.frequencies
+    if suffix == ".xml":
+        if frequency is None and not len(known):
+            raise ValueError("materials depend on the carrier, which the data do not know; set frequency=... [Hz]")
+        frequency = float(known[len(known) // 2] if frequency is None else frequency)
+        check_carrier("frequency", frequency)
+    found = export.survey(own.placement, own.surveyed)
     planes = export.outlines(own.placement, found)
     corners = np.concatenate([found.ends, *(plane.corners for plane in planes)])
     sheets, rest = fit_sheets(own.placement, own.surveyed, corners.min(0), corners.max(0))
@@ -62,22 +69,18 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     if suffix == ".obj":
         write_text(file, export.wavefront_obj(own.placement, found, sheets))
         return [file]
-    if suffix != ".xml":
+    if frequency is None or suffix != ".xml":
         extras = [*({"share": plane.share} for plane in planes), *({"loss_db": sheet.loss_db} for sheet in sheets)]
         write_gltf(file, meshes, extras)
         return [file]
-    known = own.scene.frequencies
-    if frequency is None and not len(known):
-        raise ValueError("materials depend on the carrier, which the data do not know; set frequency=... [Hz]")
-    frequency = float(known[len(known) // 2] if frequency is None else frequency)
-    check_carrier("frequency", frequency)
     chosen = materials(own.placement, own.surveyed, frequency)
     bsdfs = [itu_bsdf(chosen[plane.number], frequency) for plane in planes] + [*map(sheet_bsdf, sheets)]
     comments = [f"Materials for {frequency:.7g} Hz."]
     if own.scene.task.dtype.is_complex:
         for receiver, gain in zip(own.scene.receivers, traced_gains(own, rest).tolist(), strict=True):
             turned = f"{abs(gain):.4g}, turned by {math.degrees(cmath.phase(gain)):.2f} degrees"
-            comments.append(f"Channels of {receiver.name} are those traced times {turned}.")
+            conjugated = ", then conjugated" if own.pooling.array_sign > 0 else ""
+            comments.append(f"Channels of {receiver.name} are those traced times {turned}{conjugated}.")
     return write_scene(file, meshes, bsdfs, comments)
 
 
@@ -142,7 +145,7 @@ def write_scene(file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comme
     """Writes a scene of Mitsuba for Sionna RT, and a mesh ``.ply`` of each surface beside it; gives the files."""
     scene = ElementTree.Element("scene", version="2.1.0")
     for comment in ("Learnt by gaigs; metres, z up.", *comments):
-        scene.append(ElementTree.Comment(f" {comment.replace('--', '-')} "))
+        scene.append(ElementTree.Comment(f" {re.sub('-+', '-', comment)} "))
     for bsdf in {bsdf.name: bsdf for bsdf in bsdfs}.values():
         element = ElementTree.SubElement(scene, "bsdf", id=bsdf.name, type=bsdf.kind)
         for name, value in bsdf.properties:
@@ -151,6 +154,8 @@ def write_scene(file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comme
     folder, files = file.with_name(f"{file.stem}_meshes"), [file]
     with atomic_write(file) as part:
         folder.mkdir(exist_ok=True)
+        for old in (*folder.glob("plane_*.ply"), *folder.glob("obstacle_*.ply")):
+            old.unlink()
         for mesh, bsdf in zip(meshes, bsdfs, strict=True):
             files.append(folder / f"{mesh.name}.ply")
             vertices = np.array([*mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"])

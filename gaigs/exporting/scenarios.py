@@ -55,7 +55,7 @@ def write_scenario(model: Model, folder: Path, places: object, frequency: float 
         gains = np.where(sizes > FAINT * sizes.max(1, keepdims=True), unit * gains, 0)
         bounces = export.survey(own.placement, query).bounces[:, :, ::-1].astype(float)  # from the receiver on
         stations.append((receiver.pose.position.double().numpy(), gains, bounces))
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     deepmimo.write(folder, carrier.item(), users.double().numpy(), stations)
     names = ", ".join(f"t000_tx{number:03} = {one.name}" for number, one in enumerate(own.scene.receivers))
     log.info("%s: base stations %s", folder, names)

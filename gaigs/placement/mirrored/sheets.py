@@ -192,6 +192,8 @@ def fit_sheets(
     matter = sample(obstacles, lower - middle.cpu().numpy(), upper - middle.cpu().numpy())
     crossings = [cross(obstacles, matter, density, legs) for density in options]
     wanted = (fields * left).square().sum(1)
+    if not (wanted > 0).any():
+        raise ValueError("obstacles absorb every path, so none tells their surfaces; train the model first")
 
     def error(chosen: Sequence[int], logs: Sequence[Tensor], gain: Tensor) -> Float[Tensor, ""]:
         losses = fields.new_zeros(count)
