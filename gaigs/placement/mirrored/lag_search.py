@@ -138,8 +138,8 @@ class ReceiverLags:
         slopes = torch.cat((slopes[:, 1:].conj().flip(1), slopes), 1) / self.counts
         return slopes[:, self.array.lags[1]].view(-1, len(self.array), len(self.array))
 
-    def steering(self, ways: Float[Tensor, "*b 3"]) -> Complex[Tensor, "*b e"]:
-        """Phases at the elements of waves from directions in the array's frame."""
+    def steering(self, ways: Float[Tensor, "*b d"]) -> Complex[Tensor, "*b e"]:
+        """Phases at the elements of waves from directions in the array's frame, whose z does not matter."""
         turns = self.wavenumber * (ways[..., :2] @ self.elements.T)
         return torch.polar(torch.ones_like(turns), turns)
 

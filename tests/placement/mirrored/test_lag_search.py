@@ -52,19 +52,18 @@ def test_planes_off_by_decimetres_and_degrees_are_found(search):
     start[:, 3] += torch.tensor([0.15, -0.2, 0.1])
     assert (start - WALLS)[:, 3].abs().min() > 0.05
     off = (search.run(start, 0.0, 3) - WALLS).abs()
-    assert off[:, :3].max() < 0.005
-    assert off[:, 3].max() < 0.02
+    assert off[:, :3].max() < 0.01, "the faintest counts least"
+    assert off[1:, 3].max() < 0.005
+    assert off[0, 3] < 0.3, "the faintest may be two wavelengths off: its error hardly counts"
 
 
 def test_a_missing_plane_is_found_though_half_of_the_links_lack_it(search):
     own = search.receivers[0]
-    direct = own.sums(*own.paths(WALLS[:0], all_sequences(0, 2)), 0.0)
-    search.receivers = [replace(own, lags=torch.cat((own.lags[:75], direct[75:])))]
-    found = search.run(WALLS[[0, 2]], 0.0, 3)
+    without = own.sums(*own.paths(shifted(WALLS[:2], -search.middle), all_sequences(2, 2)), 0.0)
+    search.receivers = [replace(own, lags=torch.cat((own.lags[:75], 7 * without[75:])))]
+    found = search.run(WALLS[:2], 0.0, 3)
     assert len(found) == 3
-    off = (found[2] * found[2, :3].sum().sign() - WALLS[1]).abs()
-    assert off[:3].max() < 0.02
-    assert off[3] < 0.05
+    assert (found[2] * found[2, 2].sign() - WALLS[2]).abs().max() < 0.01
 
 
 def test_a_plane_stays_where_nothing_shows_it(search):
