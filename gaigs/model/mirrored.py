@@ -67,7 +67,6 @@ class MirroredSplatting(GaussianSplatting):
         trend: str | Mapping | Model | None = None,
     ):
         super().__init__(scene, placement, tokenizer, deformation, projection, rasterizer, pooling, gaussians, trend)
-        self.search: LagSearch | None = None  # set by fit, for spectra with known carriers
 
     @staticmethod
     def own_pooling(scene: Scene) -> str:
