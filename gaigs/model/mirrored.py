@@ -1,7 +1,7 @@
 """Mirrored Gaussians: our own predictor, which learns the walls of the room."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from gaigs.placement.learnt_room import LearntPath, LearntRoom
 from gaigs.placement.mirrored import export
 from gaigs.placement.mirrored.channel_search import FEWEST, ChannelSearch
 from gaigs.placement.mirrored.lag_search import LagSearch
-from gaigs.placement.mirrored.search import WIDEST, Loss, choose_bandwidth, find_planes, move_planes, prune, thinned
+from gaigs.placement.mirrored.search import Loss, choose_bandwidth, find_planes, move_planes, prune, thinned
 from gaigs.pooling import Pooling
 from gaigs.pooling.channels import ChannelPooling
 from gaigs.pooling.path_spectrum import PathSpectrum
@@ -39,10 +39,10 @@ log = logging.getLogger(__name__)
 class MirroredSplatting(GaussianSplatting):
     """The splatting pipeline with Gaussians at mirror images, learnt from coarse to fine.
 
-    Powers come first: they locate planes to some centimetres. Then phases count too: each plane is turned square to the
-    others and moved along its normal, by steps of a fraction of the wavelength, to the least error, and descent goes
-    on. Of spectra at a carrier, ``LagSearch`` moves the planes then. ``ChannelSearch`` locates planes of channels
-    before the training; they stay there.
+    ``ChannelSearch`` locates planes of channels before the training, ``LagSearch`` those of spectra whose bandwidth is
+    known. Otherwise powers come first: they locate planes to some centimetres. Then phases count too: each plane is
+    turned square to the others and moved along its normal, by steps of a fraction of the wavelength, to the least
+    error, and descent goes on.
 
     Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that suits it.
 
@@ -67,7 +67,6 @@ class MirroredSplatting(GaussianSplatting):
         trend: str | Mapping | Model | None = None,
     ):
         super().__init__(scene, placement, tokenizer, deformation, projection, rasterizer, pooling, gaussians, trend)
-        self.search: LagSearch | None = None  # set by fit, for spectra with known carriers
 
     @staticmethod
     def own_pooling(scene: Scene) -> str:
@@ -79,9 +78,10 @@ class MirroredSplatting(GaussianSplatting):
     def fit(self, links: Links) -> None:
         """Fits the pipeline, and keeps some links for the report of the paths' powers.
 
-        Channels without a trend start from planes that ``ChannelSearch`` finds in them; those of fewer than ``FEWEST``
-        numbers from free space, and then the faces of the box. Each receiver's gain is that over its training links, as
-        of ``friis``, or 0.1 where phases say nothing: a louder start would be worse than nothing.
+        Spectra of a known bandwidth start from planes that ``LagSearch`` finds in them, channels without a trend from
+        those of ``ChannelSearch``; channels of fewer than ``FEWEST`` numbers from free space, and then the faces of the
+        box. Each receiver's gain is that over its training links, as of ``friis``, or 0.1 where phases say nothing: a
+        louder start would be worse than nothing.
         """
         super().fit(links)
         self.places = export.some(links.query[links.split.train])
@@ -89,11 +89,11 @@ class MirroredSplatting(GaussianSplatting):
         is_known = links.query.frequencies is not None or len(self.scene.frequencies) == 1
         if isinstance(self.pooling, PathSpectrum) and is_known and self.placement.order and not self.placement.fixed:
             frequencies, lags = carriers(self.scene, links.query), self.pooling.beamformer.lags
-            self.search = LagSearch(links, frequencies, lags, self.placement.order)
-            for doubt in self.search.doubts:
+            search = LagSearch(links, frequencies, lags, self.placement.order)
+            for doubt in search.doubts:
                 log.warning("%s", doubt)
-            if not self.search.receivers:
-                self.search = None
+            if self.scene.bandwidth is not None and search.receivers:
+                self._find_planes(search, self.scene.bandwidth)
         if not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling)) or self.trend is not None:
             return
         train, sign, frequencies = links.split.train, int(self.pooling.sign), task.frequencies
@@ -127,20 +127,22 @@ class MirroredSplatting(GaussianSplatting):
         return super().predicts_untrained or bool(self.placement.is_bare)
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Loss) -> str:
-        """Adds planes twice, then moves them by their phases; drops what does not help at the end."""
+        """Adds planes, then moves them by phases, unless a search has found them; drops what does not help."""
         placement = self.placement
         # The labels are sums of waves: powers say nothing alone, and phases count from the start.
         adds_waves = not isinstance(self.pooling, LagPooling)
         if placement.is_bare:
             placement.enable_reflections()
+        batches = [batch for batch in (train, validation) if batch is not None]
+        # Of spectra early, too: each path costs time in every step.
+        if number == len(self.revisions) - 1 or (number == 1 and placement.found and not adds_waves):
+            return prune(placement, batches, loss)
         if number < 2 and (placement.fixed or placement.found):
             return "planes stay where they were put"
         if number < 2 and not adds_waves:
             found = find_planes(self, train, validation, loss)
             placement.most.fill_(placement.kept.sum())
             return found
-        if number == len(self.revisions) - 1:
-            return prune(placement, [batch for batch in (train, validation) if batch is not None], loss)
         try:
             wavelength = speed_of_light / carriers(self.scene, train.query).mean().item()
         except ValueError:
@@ -152,28 +154,24 @@ class MirroredSplatting(GaussianSplatting):
         if placement.fixed or placement.found:
             return "phases count"
         before = loss(train)
-        bandwidth = 0.0 if placement.log_bandwidth is None else placement.log_bandwidth.exp().item()
-        if self.search is not None and bandwidth * placement.diagonal < speed_of_light:  # most paths interfere
-            return "phases count" if number > 2 else self._search_lags(bandwidth, before, lambda: loss(train))
         # Powers locate distant planes to some decimetres: the first search reaches farther.
         least = 0.03 * placement.diagonal if number == (0 if adds_waves else 2) else 0.0
         moves = ", ".join(f"{move:+.3f}" for move in move_planes(self, train, wavelength, least))
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
 
-    def _search_lags(self, bandwidth: float, before: float, loss: Callable[[], float]) -> str:
-        """Moves planes by ``LagSearch``, unless the loss rises."""
-        placement, used, origin = self.placement, self.placement.used, self.placement.origin.clone()
-        normals, middle = placement.normals[used], placement.middle.cpu().double()
-        start = torch.cat((normals, (placement.offsets[used] + normals @ placement.middle)[:, None]), 1).cpu().double()
-        reach = min(0.04 * placement.diagonal, WIDEST * self.search.wavelength)
-        planes = self.search.run(start, bandwidth, reach)
-        for number, plane in zip(used.tolist(), planes, strict=True):
-            placement.place(number, plane[:3].to(normals), float(plane[3] - plane[:3] @ middle))
-        if (after := loss()) > before:
-            placement.origin.copy_(origin)
-            return f"phases count; planes stay, as their search has a loss of {after:.4f}, not {before:.4f}"
-        moves = ", ".join(f"{move:+.3f}" for move in ((planes - start) @ torch.cat((-middle, torch.ones(1)))).tolist())
-        return f"phases count; planes moved by {moves} m at the middle of the room; loss {before:.4f} -> {after:.4f}"
+    def _find_planes(self, search: LagSearch, bandwidth: float) -> None:
+        """Puts planes where ``LagSearch`` finds them, from the user's walls or the faces of the box."""
+        placement, used = self.placement, self.placement.used
+        normals = placement.normals[used] if placement.walls else placement.normals[used].round()  # without their tilt
+        start = torch.cat((normals, (placement.offsets[used] + normals @ placement.middle)[:, None]), 1).cpu()
+        planes = search.run(start, bandwidth, len(placement.origin)).to(normals)
+        for number, plane in enumerate(planes):
+            placement.place(number, plane[:3], float(plane[3] - plane[:3] @ placement.middle))
+        placement.kept.copy_(placement.sequences_of(torch.arange(len(planes))))
+        placement.most.copy_(placement.kept.sum())
+        placement.enable_phases(search.wavelength)
+        placement.found.fill_(True)
+        log.info("%d planes found in spectra", len(planes))
 
     @property
     def has_margins(self) -> bool:

@@ -1,19 +1,21 @@
-"""Search for planes in spectra: interference in the covariances of the array's elements locates them."""
+"""Search for planes in spectra: a Hough transform, and interference in the covariances of the array's elements."""
 
 import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.constants import speed_of_light
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from gaigs.antenna import Array
 from gaigs.data import Links
-from gaigs.geometry import Pose
+from gaigs.gaussians import fibonacci_lattice
+from gaigs.geometry import Grid, Pose
 from gaigs.placement.mirrored.reflections import (
     all_sequences,
     fold,
@@ -31,13 +33,25 @@ MATERIAL = complex(4.0, -0.3)
 """Relative permittivity of all planes: between wood and concrete."""
 
 FLOOR = 0.01
-"""Share of a link's squared covariances below which an error hardly counts."""
+"""Share of a spectrum's variance below which an error hardly counts."""
 
 SURE = 2.0
 """Least fall of the mean log error by which a plane moves [standard errors]."""
 
+BLOCKED = 0.1
+"""Rise of a link's log error by which a path counts as blocked there: without it, any plane explains some links."""
+
+GAIN = 0.03
+"""Least fall of the mean log error by a further plane."""
+
+REACH = 0.08
+"""Distance over which a plane is moved on either side [diagonals of the room]."""
+
 FAINT = 1e-3
 """Share of the power below which paths of several reflections are left out."""
+
+WIDEST = 50.0
+"""Largest distance over which a plane is searched by phases [wavelengths]: a thousand errors for each normal."""
 
 STRANGE = 0.01
 """Share of a spectrum that its array cannot explain, from which on the search is left out. Measured spectra have 0.001,
@@ -49,56 +63,110 @@ TILE = 0.025
 TURN = 0.16
 """Step of a turn in the periodogram [wavelengths over the places' mean distance from the pivot]: about 2 rad."""
 
+DIRECTIONS = Grid.degrees(range(4, 90, 8), range(0, 360, 15)).flatten().vectors()
+"""Directions in which spectra are compared: 4 x 4 elements resolve no more."""
+
 
 @dataclass(frozen=True)
 class ReceiverLags:
-    """Covariances of one receiver's elements at some training links.
+    """Covariances of one receiver's elements at some training links of one carrier.
 
     Attributes:
         places: Transmitters (b, 3) [m].
         lags: At each of ``array.lags``, over the power (b, l).
-        frequencies: Of the carriers (b,) [Hz].
+        frequency: Of the carrier [Hz].
         pose, array: Of the receiver.
     """
 
     places: Float[Tensor, "b 3"]
     lags: Complex[Tensor, "b l"]
-    frequencies: Float[Tensor, " b"]
+    frequency: float
     pose: Pose
     array: Array
 
     def some(self, index: object) -> "ReceiverLags":
         """The same of some links."""
-        parts = {name: getattr(self, name)[index] for name in ("places", "lags", "frequencies")}
-        return replace(self, **parts)
+        return replace(self, places=self.places[index], lags=self.lags[index])
 
     @property
-    def wavenumbers(self) -> Float[Tensor, " b"]:
+    def wavenumber(self) -> float:
         """[rad/m]."""
-        return 2 * math.pi / speed_of_light * self.frequencies
+        return 2 * math.pi / speed_of_light * self.frequency
 
-    def steering(self, ways: Float[Tensor, "b n 3"]) -> Complex[Tensor, "b n e"]:
-        """Phases at the elements of waves from directions in the array's frame."""
-        turns = ways[..., :2] @ self.array.elements.to(ways)[:, :2].T * self.wavenumbers[:, None, None]
+    @cached_property
+    def elements(self) -> Float[Tensor, "e 2"]:
+        return self.array.elements[:, :2].to(self.places)
+
+    @cached_property
+    def counts(self) -> Float[Tensor, " l"]:
+        return self.array.lags[2].to(self.places)
+
+    @cached_property
+    def shapes(self) -> Float[Tensor, "b k"]:
+        return self.shape_of(self.lags)
+
+    @cached_property
+    def basis(self) -> Float[Tensor, "m k"]:
+        """Contribution of the real and the imaginary part of each lag from 0 on to the power in ``DIRECTIONS``."""
+        half = len(self.counts) // 2
+        weights = self.counts[half:] * torch.where(torch.arange(half + 1) > 0, 2, 1)
+        phases = self.wavenumber * (self.array.lags[0][half:].to(self.places) @ DIRECTIONS.to(self.places).T)
+        return torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None]))
+
+    def shape_of(self, lags: Complex[Tensor, "b l"]) -> Float[Tensor, "b k"]:
+        """Amplitudes in ``DIRECTIONS`` with a mean of 0 and a norm of 1: labels have lost their scale."""
+        later = lags[:, lags.shape[1] // 2 :]
+        later = later / later[:, :1].real.clamp_min(1e-12)
+        powers = torch.cat((later.real, later.imag), 1) @ self.basis
+        amplitudes = powers.clamp_min(1e-4).sqrt()  # of a mean power of e²
+        amplitudes = amplitudes - amplitudes.mean(1, keepdim=True)
+        return amplitudes / amplitudes.norm(dim=1, keepdim=True).clamp_min(1e-6)
+
+    def errors(self, lags: Complex[Tensor, "b l"]) -> Float[Tensor, " b"]:
+        """Log of the share of each spectrum's variance that a model's lags do not explain."""
+        alike = (self.shape_of(lags) * self.shapes).sum(1).clamp_min(0)
+        return (1 - alike.square() + FLOOR).log()
+
+    def slopes(self, lags: Complex[Tensor, "b l"]) -> Complex[Tensor, "b e e"]:
+        """Fall of the errors by the covariances of further waves x: x' M x, with waves y of the model 2 Re x' M y."""
+        with torch.enable_grad():
+            lags = lags.detach().requires_grad_()
+            self.errors(lags).sum().backward()
+        half = len(self.counts) // 2
+        slopes = -lags.grad[:, half:]
+        slopes[:, 1:] /= 2  # ``shape_of`` reads one of two opposite lags
+        slopes = torch.cat((slopes[:, 1:].conj().flip(1), slopes), 1) / self.counts
+        return slopes[:, self.array.lags[1]].view(-1, len(self.array), len(self.array))
+
+    def steering(self, ways: Float[Tensor, "*b d"]) -> Complex[Tensor, "*b e"]:
+        """Phases at the elements of waves from directions in the array's frame, whose z does not matter."""
+        turns = self.wavenumber * (ways[..., :2] @ self.elements.T)
         return torch.polar(torch.ones_like(turns), turns)
 
-    def seen(self, points: Float[Tensor, "b n 3"]) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b n"]]:
+    def seen(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
         """Directions to points in the array's frame, and distances [m]."""
-        ways = self.pose.local(points)
+        ways = (points - self.pose.position) @ self.pose.rotation
         lengths = ways.norm(dim=-1).clamp_min(NEAREST)
         return ways / lengths[..., None], lengths
 
-    def paths(self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Fields (b, n), steering (b, n, e) and lengths (b, n) [m] of all paths."""
+    def paths(
+        self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"], open_: Bool[Tensor, "b v"] | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Fields (b, n), steering (b, n, e) and lengths (b, n) [m] of all paths; open ones as in ``Room``."""
         normals, offsets = planes[:, :3], planes[:, 3]
         points = images(self.places, sequences, normals, offsets)
         folded = fold(points, self.pose.position.expand(len(self.places), 3), sequences, normals, offsets)
         ways, lengths = self.seen(points[-1])
         gains = folded.exists * self.array.gain(ways) / lengths
+        if open_ is not None:
+            own = torch.cat((open_[:, 1:], torch.ones_like(open_[:, :1])), 1)[:, sequences].all(2)  # -1 is the last one
+            own[:, 0] = open_[:, 0]
+            gains = gains * own
         gains = folded.reflected(
-            gains.to(torch.complex128), lambda bounce: reflection(normals[bounce.planes], bounce.cosines)
+            torch.complex(gains, torch.zeros_like(gains)),
+            lambda bounce: reflection(normals[bounce.planes], bounce.cosines),
         )
-        phases = -self.wavenumbers[:, None] * lengths
+        phases = -self.wavenumber * lengths
         return gains * torch.polar(torch.ones_like(phases), phases), self.steering(ways), lengths
 
     def sums(self, fields: Tensor, steering: Tensor, lengths: Tensor, bandwidth: float) -> Complex[Tensor, "b l"]:
@@ -110,20 +178,19 @@ class ReceiverLags:
         else:
             waves = (fields[:, None] @ steering).mT
             covariances = waves @ waves.mH
-        _, pairs, counts = self.array.lags
         flat = covariances.flatten(1)
-        return flat.new_zeros(len(flat), len(counts)).index_add(1, pairs, flat) / counts
+        return flat.new_zeros(len(flat), len(self.counts)).index_add(1, self.array.lags[1], flat) / self.counts
 
     def doubts(self, name: str) -> list[str]:
         """A sentence if the direct path shows in another direction than geometry says."""
         _, pairs, _ = self.array.lags
         matrices = self.lags[:, pairs].view(-1, len(self.array), len(self.array))
-        ways = self.seen(self.places[:, None])[0]
+        ways, _ = self.seen(self.places)
         shares = {}
         for turn, flip in itertools.product(range(4), (1, -1)):
-            turned = torch.view_as_real(torch.view_as_complex(ways[..., :2].contiguous()) * 1j**turn)
-            turned = torch.cat((turned[..., :1], flip * turned[..., 1:], ways[..., 2:]), -1)
-            steering = self.steering(turned)[:, 0]
+            turned = torch.view_as_real(torch.view_as_complex(ways[:, :2].contiguous()) * 1j**turn)
+            turned = torch.cat((turned[:, :1], flip * turned[:, 1:], ways[:, 2:]), -1)
+            steering = self.steering(turned)
             share = torch.einsum("bi,bij,bj->b", steering.conj(), matrices, steering).real / len(self.array) ** 2
             shares[turn, flip] = share.median().item()
         (turn, flip), best = max(shares.items(), key=lambda item: item[1])
@@ -136,23 +203,23 @@ class ReceiverLags:
             f"{best:.0%} if azimuths were {words}\ncheck the receiver's orientation and the azimuths of the data"
         ]
 
-    def left(self, model: Complex[Tensor, "b l"]) -> tuple[Complex[Tensor, "b l"], Float[Tensor, " b"]]:
-        """What a model of the covariances leaves, with the best scale of each link, and the model's square."""
-        counts = self.array.lags[2]
-        square = (counts * model.abs().square()).sum(1).clamp_min(1e-30)
-        scales = ((counts * (model.conj() * self.lags).real).sum(1) / square).clamp_min(1e-12 / square.sqrt())
-        return self.lags / scales[:, None] - model, square
-
     def one_more(self, paths: tuple[Tensor, Tensor, Tensor], bandwidth: float) -> tuple[Tensor, Tensor]:
         """The wave of one more path beside known ones: its interference with each (b, n, e), and their lengths.
 
         Without a bandwidth it is the same for a path of any length: one sum (b, 1, e).
         """
         fields, steering, lengths = paths
-        rest, square = self.left(self.sums(fields, steering, lengths, bandwidth))
-        matrices = rest[:, self.array.lags[1]].view(-1, len(self.array), len(self.array))
-        waves = (matrices @ steering.mT).mT * fields[..., None] / square[:, None, None]
+        waves = (self.slopes(self.sums(*paths, bandwidth)) @ steering.mT).mT * fields[..., None]
         return (waves, lengths) if bandwidth else (waves.sum(1, keepdim=True), lengths[:, :1])
+
+    def single(self, planes: Float[Tensor, "c 4"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Directions, lengths, fields without a phase and cosines of single reflections (b, c)."""
+        normals, offsets = planes[:, :3], planes[:, 3]
+        here, there = self.pose.position @ normals.T - offsets, self.places @ normals.T - offsets
+        ways, lengths = self.seen(self.places[:, None] - 2 * there[..., None] * normals)
+        cosines = -(here + there) / lengths
+        gains = self.array.gain(ways) / lengths * (here * there > 0)
+        return ways, lengths, gains * reflection(normals, cosines.abs()), cosines
 
     def periodogram(
         self,
@@ -169,42 +236,50 @@ class ReceiverLags:
 
         Planes are moved by ``moves`` [m] and turned about the pivot [m] towards two axes by ``turns`` [rad].
         """
-        normal, offset = plane[:3], plane[3]
-        here, there = self.pose.position @ normal - offset, self.places @ normal - offset
-        points = reflect(self.places, normal, offset)
-        ways, own = (part[:, 0] for part in self.seen(points[:, None]))
-        units = functional.normalize(points - self.pose.position, dim=1)
-        cosines = units @ normal
-        near = torch.minimum(here.abs(), there.abs()) < moves[-1]  # planes of the tile are on either side
-        gains = self.array.gain(ways) / own * ((here * there > 0) | near) * reflection(normal, cosines.abs())
+        ways, own, gains, cosines = (part[:, 0] for part in self.single(plane[None]))
         likeness = torch.sinc(bandwidth / speed_of_light * (lengths - own[:, None]))
         left = (waves * likeness[..., None]).sum(1)
-        heard = (self.steering(ways[:, None])[:, 0].conj() * left).sum(1) * gains.conj()
-        heard = heard * torch.polar(torch.ones_like(own), self.wavenumbers * own)
+        heard = (self.steering(ways).conj() * left).sum(1) * gains.conj()
+        heard = heard * torch.polar(torch.ones_like(own), self.wavenumber * own)
         sizes = heard.abs()
         loud = sizes[sizes > 0]
         heard = heard / (sizes + loud.median()) if len(loud) else heard  # so that no link rules
+        there = self.places @ plane[:3] - plane[3]
+        units = functional.normalize(reflect(self.places, plane[:3], plane[3]) - self.pose.position, dim=1)
         aside = self.places - pivot
         slopes = [2 * cosines] + [-2 * (aside @ axis) * cosines - 2 * there * (units @ axis) for axis in axes]
         phases = [
-            self.wavenumbers[:, None] * slope[:, None] * steps
-            for slope, steps in zip(slopes, (moves, turns, turns), strict=True)
+            self.wavenumber * slope[:, None] * steps for slope, steps in zip(slopes, (moves, turns, turns), strict=True)
         ]
         first, second, third = (torch.polar(torch.ones_like(phase), phase) for phase in phases)
         both = ((heard[:, None] * first)[:, :, None] * second[:, None]).flatten(1)
         return (both.T @ third).real.view(len(moves), len(turns), len(turns))
 
 
-class LagSearch(nn.Module):
-    """Moves planes to where reflections explain the interference that spectra show.
+@dataclass(frozen=True)
+class Found:
+    """Planes of the room, and which paths are open at each link.
 
-    A spectrum gives back the covariances of the array's elements (``Beamformer.lags``). Their largest part is the
-    direct path. Another path shows in its interference with those that are known: the residual covariances times their
-    fields are that path's wave, with a phase that follows from its length. So the sum of these waves over all links, a
-    periodogram over offset and two tilts, proposes planes. Lengths are linear within a tile of it. The error of the
-    covariances decides between proposals, after a descent on it. The strongest plane comes first.
+    Attributes:
+        planes: Normals and offsets (w, 4) [m].
+        open: For each link the direct path, then all paths at each plane (b, w + 1).
+        errors: Of each link, with ``BLOCKED`` where the last plane that was moved is not open (b,).
+    """
 
-    It is a module, as a part of its model whose calls ``gaigs.training.revision`` times: each error is one call.
+    planes: Float[Tensor, "w 4"]
+    open: Bool[Tensor, "b v"]
+    errors: Float[Tensor, " b"]
+
+
+class LagSearch:
+    """Planes whose reflections explain spectra.
+
+    A spectrum gives back the covariances of the array's elements (``Beamformer.lags``), so a model is compared with it
+    at once, with one material and without obstacles. A plane is moved to where a periodogram over offset and two tilts
+    is highest: the slope of the error by the covariances, times the waves of known paths, is the wave of one more path,
+    and its phase follows from its length. Lengths are linear within a tile. The error decides between the proposals.
+    At each link the paths at a plane may be blocked, for a price. Further planes come from a Hough transform over
+    normals and offsets, by their power alone.
 
     Args:
         links: Their training links count; of the task ``spectrum``.
@@ -212,9 +287,10 @@ class LagSearch(nn.Module):
         covariances: Function from labels and their query to lags, each label's up to a scale, and the share of each
             label that they do not explain.
         order: Largest number of reflections of a path; more than 2 count as 2, as longer paths hardly locate a plane.
-        most: Links that count, of all receivers together; of each at least 20.
+        most: Links that count, of all receivers and carriers together; of each at least 20.
 
-    Source: ours; Van Trees, Optimum Array Processing, 2002, section 2.4, for the covariances.
+    Source: ours; Van Trees, Optimum Array Processing, 2002, section 2.4, for the covariances; Hough, Method and means
+    for recognizing complex patterns, 1962.
     """
 
     def __init__(
@@ -223,56 +299,94 @@ class LagSearch(nn.Module):
         frequencies: Float[Tensor, " n"],
         covariances: Callable[[Tensor, Query], tuple[Tensor, Tensor]],
         order: int,
-        most: int = 300,
+        most: int = 150,
     ):
-        super().__init__()
         self.order, self.receivers, self.doubts = min(order, 2), [], []
+        self.generator = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
         self.wavelength = speed_of_light / frequencies.max().item()
         train, query = links.split.train, links.query
-        numbers = query.receivers[train].unique().tolist()
-        for number in numbers:
-            own = train[query.receivers[train] == number]
-            own = own[torch.linspace(0, len(own) - 1, min(len(own), max(20, most // len(numbers)))).round().long()]
+        used = query.receivers[train].unique()
+        points = torch.cat((query.transmitters[train], links.scene.positions(query.transmitters)[used]))
+        self.middle = (points.amin(0) + points.amax(0)) / 2  # about which single precision suffices
+        self.points = points - self.middle
+        self.diagonal = float((points.amax(0) - points.amin(0)).norm())
+        pairs = [(number, carrier) for number in used.tolist() for carrier in frequencies[train].unique().tolist()]
+        for number, carrier in pairs:
+            own = train[(query.receivers[train] == number) & (frequencies[train] == carrier)]
+            own = own[torch.linspace(0, len(own) - 1, min(len(own), max(20, most // len(pairs)))).round().long()]
             lags, left = covariances(links.labels[own], query[own])
             powers = lags[:, lags.shape[1] // 2].real
             heard, receiver = powers > 0, links.receivers[number]
-            pose = receiver.pose.to(torch.zeros((), dtype=torch.float64))
-            everything = ReceiverLags(
-                query.transmitters[own].double(),
-                lags / powers[:, None],
-                frequencies[own].double(),
-                pose,
-                receiver.array,
-            )
+            if not heard.any():
+                continue
+            pose = replace(receiver.pose, position=receiver.pose.position - self.middle).to(self.points)
+            places, lags = query.transmitters[own] - self.middle, (lags / powers[:, None]).to(torch.complex64)
             if left.median() > STRANGE:
                 self.doubts.append(
                     f"the array of {receiver.name} does not explain {left.median():.0%} of its spectra\n"
                     "check frequency, elements and directions, and that labels are amplitudes, not powers or dB"
                 )
-            elif heard.any():
-                self.receivers.append(everything.some(heard))
+            else:
+                self.receivers.append(ReceiverLags(places[heard], lags[heard], carrier, pose, receiver.array))
                 self.doubts += self.receivers[-1].doubts(receiver.name)
-        count = sum(len(receiver.places) for receiver in self.receivers)
-        self.few = [receiver.some(slice(None, None, max(1, round(count / 100)))) for receiver in self.receivers]
+        self.doubts = list(dict.fromkeys(self.doubts))
 
     @torch.no_grad()
-    def run(self, planes: Float[Tensor, "w 4"], bandwidth: float, reach: float) -> Float[Tensor, "w 4"]:
-        """The planes, each searched twice: up to ``reach`` [m] on either side of where it is, and 4 degrees.
+    def run(self, planes: Float[Tensor, "w 4"], bandwidth: float, most: int) -> Float[Tensor, "v 4"]:
+        """The planes, each moved twice by up to ``REACH`` and 18 degrees, and others, at most as many as ``most``.
 
-        Towards normals that are square to others it may turn by 18 degrees. ``bandwidth`` is that over which powers are
-        averaged [Hz].
+        ``bandwidth`` is that over which powers are averaged [Hz].
         """
-        planes, self.bandwidth = planes.double(), bandwidth
         if not len(planes) or not self.receivers:
             return planes
-        for _ in range(2):
-            for k in self.by_strength(planes):
-                planes = self.moved(planes, k, reach)
-            everything = torch.ones(len(planes), dtype=torch.bool)
-            polished = self.polish(planes, everything, 40, 3e-3)
-            gains = self(planes, self.receivers) - self(polished, self.receivers)
-            planes = polished if is_sure(gains) else planes
-        return planes
+        self.bandwidth = bandwidth
+        shift = lambda planes, by: torch.cat((planes[:, :3], (planes[:, 3] + planes[:, :3] @ by)[:, None]), 1)
+        count = sum(len(receiver.places) for receiver in self.receivers)
+        start = Found(
+            shift(planes.float(), -self.middle), torch.ones(count, len(planes) + 1).bool(), torch.zeros(count)
+        )
+        found = self.around(self.with_more(self.around(start), most))
+        return shift(found.planes, self.middle)
+
+    def around(self, found: Found) -> Found:
+        """Each plane moved, the strongest first; then all together."""
+        singles = all_sequences(len(found.planes), 1)[1:]
+        for k in self.powers(found.planes, singles).argsort(descending=True).tolist():
+            found = self.moved(found, k)
+        direct = [self.errors(found.planes, self.opened(found.open, 0, is_open)) for is_open in (True, False)]
+        found = replace(found, open=self.opened(found.open, 0, direct[0] <= direct[1] + BLOCKED))
+        planes = self.polish(found)
+        gains = self.errors(found.planes, found.open) - self.errors(planes, found.open)
+        return replace(found, planes=planes) if is_sure(gains) else found
+
+    def with_more(self, found: Found, most: int) -> Found:
+        """Further planes, one after the other, as long as the errors fall by ``GAIN``."""
+        normals = torch.cat((fibonacci_lattice(200, 0.0, math.pi / 2).float(), torch.eye(3)))
+        along = self.points @ normals.T
+        low, high = along.amin(0) - 0.15 * self.diagonal, along.amax(0) + 0.15 * self.diagonal
+        offsets = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, 60)
+        grid = torch.cat((normals.repeat_interleave(60, 0), offsets.flatten()[:, None]), 1)
+        while len(found.planes) < most:
+            before, trials = self.errors(found.planes, found.open), []
+            for plane in self.candidates(found, grid):
+                tried = torch.cat((found.planes, plane[None])), torch.cat((found.open, found.open[:, :1] | True), 1)
+                trials.append(self.moved(Found(*tried, before), len(found.planes)))
+            best = min(trials, key=lambda trial: trial.errors.mean().item(), default=found)
+            if not (before - best.errors).mean() >= GAIN or best is found:
+                break
+            found = best
+        return found
+
+    @staticmethod
+    def opened(open_: Bool[Tensor, "b v"], column: int, value: Tensor | bool) -> Bool[Tensor, "b v"]:
+        changed = open_.clone()
+        changed[:, column] = value
+        return changed
+
+    def each(self, open_: Bool[Tensor, "b v"]) -> list[tuple[ReceiverLags, Bool[Tensor, "c v"]]]:
+        """Receivers, and what is open at their links."""
+        parts = open_.split([len(receiver.places) for receiver in self.receivers])
+        return list(zip(self.receivers, parts, strict=True))
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
         """All sequences but those of several reflections that are faint."""
@@ -280,115 +394,151 @@ class LagSearch(nn.Module):
         powers = self.powers(planes, sequences)
         return sequences[((sequences >= 0).sum(1) <= 1) | (powers > FAINT * powers.sum())]
 
-    def by_strength(self, planes: Float[Tensor, "w 4"]) -> list[int]:
-        """Numbers of the planes, strongest single reflection first."""
-        return self.powers(planes, all_sequences(len(planes), 1)[1:]).argsort(descending=True).tolist()
-
     def powers(self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"]) -> Float[Tensor, " n"]:
-        return torch.cat([part.paths(planes, sequences)[0].abs().square() for part in self.few]).mean(0)
+        parts = [receiver.some(slice(None, None, 4)) for receiver in self.receivers]
+        return torch.cat([part.paths(planes, sequences)[0].abs().square() for part in parts]).mean(0)
 
-    def forward(
-        self, planes: Float[Tensor, "w 4"], receivers: list[ReceiverLags], sequences: Tensor | None = None
-    ) -> Float[Tensor, " b"]:
-        """Log of the share of each link's squared covariances that paths do not explain: none must rule."""
+    def errors(
+        self, planes: Float[Tensor, "w 4"], open_: Bool[Tensor, "b v"], sequences: Tensor | None = None, every: int = 1
+    ) -> Float[Tensor, " c"]:
+        """Log of what paths leave of each link, or of every second one: none must rule."""
         sequences = self.sequences(planes) if sequences is None else sequences
         logs = []
-        for receiver in receivers:
-            rest, square = receiver.left(receiver.sums(*receiver.paths(planes, sequences), self.bandwidth))
-            error = (receiver.array.lags[2] * rest.abs().square()).sum(1)
-            logs.append((error / (error + square) + FLOOR).log())
+        for receiver, own in self.each(open_):
+            part = receiver.some(slice(None, None, every))
+            logs.append(part.errors(part.sums(*part.paths(planes, sequences, own[::every]), self.bandwidth)))
         return torch.cat(logs)
 
-    def moved(self, planes: Float[Tensor, "w 4"], k: int, reach: float) -> Float[Tensor, "w 4"]:
-        """The planes with plane k where the error is least: near its own normal, or square to another plane."""
-        trials, (pivot,) = [planes], self.pivots(planes[k, None])
-        for number, normal in enumerate(square_normals(planes[:, :3], k)):
-            offset = float(planes[k, 3] + (normal - planes[k, :3]) @ pivot)
-            for plane in self.proposals(planes, k, normal, offset, reach, 0 if number else 1):
-                trials.append(torch.cat((planes[:k], plane[None], planes[k + 1 :])))
-        sequences = self.sequences(planes)
+    # --- Hough transform ---
 
-        def rated(tried: Float[Tensor, "w 4"]) -> tuple[float, Tensor, Tensor]:
-            errors = self(tried, self.receivers, sequences)
-            return errors.mean().item(), tried, errors
-
-        rates = [rated(tried) for tried in trials]
-        _, best, _ = min(rates, key=lambda rate: rate[0])
-        rates.append(rated(self.polish(best, torch.arange(len(planes)) == k, 10, 4e-3)))
-        _, best, errors = min(rates, key=lambda rate: rate[0])
-        return best if is_sure(rates[0][2] - errors) else planes
-
-    def pivots(self, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "w 3"]:
-        """Mean point at which each plane reflects [m]: turned about it, a plane changes the lengths least."""
-        ends = [(part.places, part.pose.position.expand_as(part.places)) for part in self.few]
-        return torch.cat([reflection_points(*pair, planes) for pair in ends]).mean(0)
-
-    def proposals(
-        self, planes: Float[Tensor, "w 4"], k: int, normal: Float[Tensor, "3"], offset: float, reach: float, tilts: int
-    ) -> list[Float[Tensor, "4"]]:
-        """Planes in place of plane k, near a normal and an offset [m]: at most eight maxima of the periodogram.
-
-        ``tilts`` is the number of tiles on either side of the normal, in both directions.
-        """
-        sequences = self.sequences(planes)
-        sequences = sequences[(sequences != k).all(1)]
-        half = min(self.wavelength, reach)  # of a tile [m]
-        (about,) = self.pivots(torch.cat((normal, normal.new_tensor([offset])))[None])
-        spread = torch.cat([part.places - about for part in self.few]).norm(dim=1).mean().item()
-        turns = 2 * math.ceil(TILE / min(TILE / 5, TURN * self.wavelength / spread)) + 1
-        steps = torch.linspace(-half, half, 19).double(), torch.linspace(-TILE, TILE, turns).double()
-        starts = torch.linspace(-reach, reach, 2 * math.ceil(reach / half / 2) + 1).double()
-        centres = 2 * TILE * torch.arange(-tilts, tilts + 1).double()
-        axes = torch.stack(tangents(normal))
-        waves = [receiver.one_more(receiver.paths(planes, sequences), self.bandwidth) for receiver in self.receivers]
-        found = []
-        for a, b, start in itertools.product(centres, centres, starts):
-            centre = functional.normalize(normal + a * axes[0] + b * axes[1], dim=0)
-            plane = torch.cat((centre, (centre @ about + start)[None]))
-            (pivot,) = self.pivots(plane[None])
-            own = axes - (axes @ centre)[:, None] * centre
-            tile = sum(
-                receiver.periodogram(*parts, self.bandwidth, plane, pivot, own, *steps)
-                for receiver, parts in zip(self.receivers, waves, strict=True)
-            )
-            best = tile.flatten().topk(2)
-            for score, *at in zip(best.values.tolist(), *torch.unravel_index(best.indices, tile.shape), strict=True):
-                move, first, second = steps[0][at[0]], steps[1][at[1]], steps[1][at[2]]
-                turned = functional.normalize(centre + first * own[0] + second * own[1], dim=0)
-                found.append((score, torch.cat((turned, (turned @ pivot + move)[None])), pivot))
-        found.sort(key=lambda trial: -trial[0])
+    def candidates(self, found: Found, grid: Float[Tensor, "k 4"]) -> list[Float[Tensor, "4"]]:
+        """Up to three planes whose reflections add power where it lacks: maxima of the grid, sharpened."""
+        side = torch.linspace(-1, 1, 33)
+        plane_waves = torch.cartesian_prod(side, side)
+        maps, sequences = [], self.sequences(found.planes)
+        for receiver, own in self.each(found.open):
+            slopes = receiver.slopes(receiver.sums(*receiver.paths(found.planes, sequences, own), self.bandwidth))
+            steering = receiver.steering(plane_waves)
+            maps.append(((steering.conj() @ slopes) * steering).sum(-1).real.view(-1, 1, 33, 33))
+        scores = torch.cat([self.scores(maps, part) for part in grid.split(4000)])
+        for plane in found.planes:
+            scores[self.alike(grid, plane)] = 0
+        chosen: list[Tensor] = []
+        while len(chosen) < 6 and scores.max() > 0:
+            chosen.append(grid[scores.argmax()])
+            scores[self.alike(grid, chosen[-1])] = 0
+        if not chosen:
+            return []
+        tried, turn, shift = torch.stack(chosen), 0.06, 0.02 * self.diagonal
+        for _ in range(4):
+            noise = torch.randn(len(tried), 24, 4, generator=self.generator)
+            noise[:, 0] = 0
+            turned = functional.normalize(tried[:, None, :3] + turn * noise[..., :3], dim=-1)
+            about = torch.cat((turned, tried[:, None, 3:] + shift * noise[..., 3:]), 2)
+            highest, at = self.scores(maps, about.flatten(0, 1)).view(about.shape[:2]).max(1)
+            tried = about[torch.arange(len(tried)), at]
+            turn, shift = turn / 2, shift / 2
         kept: list[Tensor] = []
-        for score, plane, pivot in found:
-            if score <= 0 or len(kept) == 8:
-                break
-            apart = [plane - other for other in kept]
-            if all(
-                gap[:3].norm() > TILE / 4 or (gap[3] - gap[:3] @ pivot).abs() > self.wavelength / 4 for gap in apart
-            ):
+        for plane in tried[highest.argsort(descending=True)]:
+            if len(kept) < 3 and not any(self.alike(plane[None], other) for other in (*found.planes, *kept)):
                 kept.append(plane)
         return kept
 
+    def scores(self, maps: list[Float[Tensor, "b 1 k k"]], planes: Float[Tensor, "c 4"]) -> Float[Tensor, " c"]:
+        """Fall of the errors by the power of one more reflection, over the norm of that power."""
+        total, square = planes.new_zeros(2, len(planes))
+        for receiver, lack in zip(self.receivers, maps, strict=True):
+            ways, _, gains, _ = receiver.single(planes)
+            powers = gains.abs().square()
+            at = ways[..., [1, 0]][:, None]  # ``grid_sample`` takes the column first
+            total += (powers * functional.grid_sample(lack, at, align_corners=True)[:, 0, 0]).sum(0)
+            _, direct = receiver.seen(receiver.places)
+            square += (powers * direct.square()[:, None]).square().sum(0)
+        return total / square.sqrt().clamp_min(1e-6)
+
+    def alike(self, flat: Float[Tensor, "k 4"], plane: Float[Tensor, "4"]) -> Bool[Tensor, " k"]:
+        """True for planes within 16 degrees and three hundredths of the room of a known one."""
+        cosines = flat[:, :3] @ plane[:3]
+        return (cosines.abs() > 0.96) & ((flat[:, 3] * cosines.sign() - plane[3]).abs() < 0.03 * self.diagonal)
+
+    # --- phases ---
+
+    def moved(self, found: Found, k: int) -> Found:
+        """Plane k where the error is least: near its own normal, or square to another plane; and where it is open."""
+        others = torch.arange(len(found.planes)) != k
+        known, own = found.planes[others], found.open[:, torch.cat((others.new_ones(1), others))]
+        sequences = self.sequences(known)
+        pairs = [(receiver, receiver.paths(known, sequences, part)) for receiver, part in self.each(own)]
+        waves = [receiver.one_more(paths, self.bandwidth) for receiver, paths in pairs]
+        blocked = self.errors(known, own, sequences) + BLOCKED
+        trials = [found.planes]
+        for normal in square_normals(found.planes[:, :3], k):
+            for plane in self.proposals(waves, normal, found.planes[k]):
+                trials.append(torch.cat((found.planes[:k], plane[None], found.planes[k + 1 :])))
+        everywhere, sequences = self.opened(found.open, k + 1, True), self.sequences(found.planes)
+        errors = torch.stack([self.errors(tried, everywhere, sequences) for tried in trials])
+        least = torch.minimum(errors, blocked)
+        best = int(least.mean(1).argmin())
+        best = best if is_sure(least[0] - least[best]) else 0
+        return Found(trials[best], self.opened(found.open, k + 1, errors[best] < blocked), least[best])
+
+    def pivot(self, plane: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
+        """Mean point at which a plane reflects [m]: turned about it, a plane changes the lengths least."""
+        ends = [(part.places, part.pose.position.expand_as(part.places)) for part in self.receivers]
+        return torch.cat([reflection_points(*pair, plane[None])[:, 0] for pair in ends]).mean(0)
+
+    def proposals(
+        self, waves: list[tuple[Tensor, Tensor]], normal: Float[Tensor, "3"], plane: Float[Tensor, "4"]
+    ) -> list[Float[Tensor, "4"]]:
+        """Planes near a normal in place of one: at most six maxima of the periodogram."""
+        about, reach = self.pivot(plane), min(REACH * self.diagonal, WIDEST * self.wavelength)
+        half = min(self.wavelength, reach)  # of a tile [m]
+        spread = torch.cat([part.places - about for part in self.receivers]).norm(dim=1).mean().item()
+        turns = 2 * math.ceil(TILE / max(min(TILE / 5, TURN * self.wavelength / spread), TILE / 20)) + 1
+        steps = torch.linspace(-half, half, 19), torch.linspace(-TILE, TILE, turns)
+        axes = torch.stack(tangents(normal))
+        found = []
+        for start in torch.linspace(-reach, reach, 2 * math.ceil(reach / half / 2) + 1):
+            centre = torch.cat((normal, (normal @ about + start)[None]))
+            pivot = self.pivot(centre)
+            pairs = zip(self.receivers, waves, strict=True)
+            tile = sum(part.periodogram(*own, self.bandwidth, centre, pivot, axes, *steps) for part, own in pairs)
+            best = tile.flatten().topk(2)
+            for score, *at in zip(best.values.tolist(), *torch.unravel_index(best.indices, tile.shape), strict=True):
+                move, first, second = steps[0][at[0]], steps[1][at[1]], steps[1][at[2]]
+                turned = functional.normalize(normal + first * axes[0] + second * axes[1], dim=0)
+                found.append((score, torch.cat((turned, (turned @ pivot + move)[None])), pivot))
+        found.sort(key=lambda trial: -trial[0])
+        kept: list[Tensor] = []
+        for score, tried, pivot in found:
+            if score <= 0 or len(kept) == 6:
+                break
+            apart = [tried - other for other in kept]
+            if all(
+                gap[:3].norm() > TILE / 4 or (gap[3] - gap[:3] @ pivot).abs() > self.wavelength / 4 for gap in apart
+            ):
+                kept.append(tried)
+        return kept
+
     @torch.enable_grad()
-    def polish(
-        self, planes: Float[Tensor, "w 4"], moves: Bool[Tensor, " w"], steps: int, rate: float
-    ) -> Float[Tensor, "w 4"]:
-        """Descends on the error with some planes, which turn about their pivots."""
-        pivots, sequences = self.pivots(planes), self.sequences(planes)
+    def polish(self, found: Found, steps: int = 40, rate: float = 3e-3) -> Float[Tensor, "w 4"]:
+        """Descends on the error at every second link with all planes, which turn about their pivots."""
+        planes, sequences = found.planes, self.sequences(found.planes)
+        pivots = torch.stack([self.pivot(plane) for plane in planes])
         heights = planes[:, 3] - (planes[:, :3] * pivots).sum(1)
         axes = torch.stack([torch.stack(tangents(normal)) for normal in planes[:, :3]])
-        shifts = torch.zeros(len(planes), 3, dtype=torch.float64, requires_grad=True)
+        shifts = torch.zeros(len(planes), 3, requires_grad=True)
 
         def now() -> Float[Tensor, "w 4"]:
-            some = shifts * moves[:, None]
             # Lengths change by about twice a shift [m], and by some metres times a turn [rad].
-            normals = functional.normalize(planes[:, :3] + 0.4 * (some[:, 1:, None] * axes).sum(1), dim=1)
-            return torch.cat((normals, ((normals * pivots).sum(1) + heights + some[:, 0])[:, None]), 1)
+            normals = functional.normalize(planes[:, :3] + 0.4 * (shifts[:, 1:, None] * axes).sum(1), dim=1)
+            return torch.cat((normals, ((normals * pivots).sum(1) + heights + shifts[:, 0])[:, None]), 1)
 
         optimizer = torch.optim.Adam([shifts])
         for step in range(steps):
             optimizer.param_groups[0]["lr"] = rate * 0.05 ** (step / steps)
             optimizer.zero_grad()
-            self(now(), self.few, sequences).mean().backward()
+            self.errors(now(), found.open, sequences, every=2).mean().backward()
             optimizer.step()
         return now().detach()
 

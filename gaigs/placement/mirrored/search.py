@@ -13,6 +13,7 @@ from torch.nn import functional
 from gaigs.gaussians import fibonacci_lattice
 from gaigs.geometry import FAINTEST, Grid
 from gaigs.placement.mirrored.channel_search import log_share
+from gaigs.placement.mirrored.lag_search import WIDEST
 from gaigs.placement.mirrored.paths import CONDUCTIVITY, PERMITTIVITY, Mirrored
 from gaigs.placement.mirrored.reflections import polarised, reflect, square_normals
 from gaigs.projection import Splats
@@ -20,9 +21,6 @@ from gaigs.propagation import NEAREST, fresnel
 from gaigs.query import Batch
 
 log = logging.getLogger(__name__)
-
-WIDEST = 50.0
-"""Largest distance over which a plane is searched by phases [wavelengths]: a thousand errors for each normal."""
 
 Loss = Callable[[Batch], float]
 """Loss of the model as it stands, on a batch."""

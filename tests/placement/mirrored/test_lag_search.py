@@ -7,19 +7,18 @@ import pytest
 import torch
 from torch.nn import functional
 
-import gaigs
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Split
 from gaigs.geometry import Pose
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.placement.mirrored.lag_search import MATERIAL, LagSearch
+from gaigs.placement.mirrored.lag_search import MATERIAL, Found, LagSearch
 from gaigs.placement.mirrored.reflections import all_sequences
 from gaigs.propagation import fresnel
 from gaigs.query import Query
 from gaigs.task.spectrum import Spectrum
 from gaigs.testing import example_links
 
-WALLS = torch.tensor([(1.0, 0, 0, 6.5), (0, 1.0, 0, -0.4), (0, 0, 1.0, -0.3)]).double()
+WALLS = torch.tensor([(1.0, 0, 0, 6.5), (0, 1.0, 0, -0.4), (0, 0, 1.0, -0.3)])
 
 
 @pytest.fixture
@@ -36,10 +35,14 @@ def search():
     ones = lambda labels, query: (torch.ones(len(labels), count, dtype=torch.complex128), torch.zeros(len(labels)))
     made = LagSearch(links, query.frequencies, ones, 2)
     own = made.receivers[0]
-    lags = own.sums(*own.paths(WALLS, all_sequences(3, 2)), 0.0)
+    lags = own.sums(*own.paths(shifted(WALLS, -made.middle), all_sequences(3, 2)), 0.0)
     made.receivers = [replace(own, lags=7 * lags)]
-    made.few = [made.receivers[0].some(slice(None, None, 2))]
+    made.bandwidth = 0.0
     return made
+
+
+def shifted(planes, by):
+    return torch.cat((planes[:, :3], (planes[:, 3] + planes[:, :3] @ by)[:, None]), 1)
 
 
 def test_planes_off_by_decimetres_and_degrees_are_found(search):
@@ -47,10 +50,19 @@ def test_planes_off_by_decimetres_and_degrees_are_found(search):
     start[:, :3] = functional.normalize(start[:, :3], dim=1)
     start[:, 3] += torch.tensor([0.15, -0.2, 0.1])
     assert (start - WALLS)[:, 3].abs().min() > 0.05
-    off = (search.run(start, 0.0, 0.4) - WALLS).abs()
-    assert off[:, :3].max() < 0.005
+    off = (search.run(start, 0.0, 3) - WALLS).abs()
+    assert off[:, :3].max() < 0.01, "the faintest counts least"
     assert off[1:, 3].max() < 0.005
-    assert off[0, 3] < 0.13, "the faintest may be a wavelength off: its error hardly counts"
+    assert off[0, 3] < 0.3, "the faintest may be two wavelengths off: its error hardly counts"
+
+
+def test_a_missing_plane_is_found_though_half_of_the_links_lack_it(search):
+    own = search.receivers[0]
+    without = own.sums(*own.paths(shifted(WALLS[:2], -search.middle), all_sequences(2, 2)), 0.0)
+    search.receivers = [replace(own, lags=torch.cat((own.lags[:75], 7 * without[75:])))]
+    found = search.run(WALLS[:2], 0.0, 3)
+    assert len(found) == 3
+    assert (found[2] * found[2, 2].sign() - WALLS[2]).abs().max() < 0.01
 
 
 def test_a_plane_stays_where_nothing_shows_it(search):
@@ -59,9 +71,8 @@ def test_a_plane_stays_where_nothing_shows_it(search):
     lags = own.sums(*own.paths(WALLS[:0], all_sequences(0, 2)), 0.0)
     noise = torch.randn(lags.shape, dtype=lags.dtype, generator=torch.Generator().manual_seed(0))
     search.receivers = [replace(own, lags=lags + 0.3 * lags.abs() * noise)]
-    search.bandwidth = 0.0
-    far = torch.tensor([[0.0, 0.0, 1.0, 40.0]]).double()
-    assert search.moved(far, 0, 0.3) is far
+    far, count = torch.tensor([[0.0, 0.0, 1.0, 40.0]]), len(own.places)
+    assert search.moved(Found(far, torch.ones(count, 2).bool(), torch.zeros(count)), 0).planes is far
 
 
 @pytest.mark.parametrize(
@@ -75,8 +86,8 @@ def test_a_plane_stays_where_nothing_shows_it(search):
 )
 def test_azimuths_that_the_direct_path_contradicts_are_named(search, turn, flip, words):
     own = search.receivers[0]
-    frame = torch.eye(3).double()
-    frame[:2, :2] = torch.linalg.matrix_power(torch.tensor([[0.0, -1.0], [1.0, 0.0]]).double(), turn)
+    frame = torch.eye(3)
+    frame[:2, :2] = torch.linalg.matrix_power(torch.tensor([[0.0, -1.0], [1.0, 0.0]]), turn)
     frame[1] *= flip
     fields, _, lengths = own.paths(WALLS[:0], all_sequences(0, 2))
     ways, _ = own.seen(own.places[:, None])
@@ -87,23 +98,9 @@ def test_azimuths_that_the_direct_path_contradicts_are_named(search, turn, flip,
 
 
 def test_no_plane_and_no_power_move_nothing(search):
-    assert len(search.run(WALLS[:0], 0.0, 0.4)) == 0
+    assert len(search.run(WALLS[:0], 0.0, 3)) == 0
     search.receivers = []
-    torch.testing.assert_close(search.run(WALLS, 0.0, 0.4), WALLS, rtol=0, atol=0)
-
-
-def test_a_look_at_the_clock_ends_the_search(search):
-    """As a revision of the training takes it, before each call of a part of the model."""
-    model = MirroredSplatting(gaigs.links("synthetic", transmitters=10, order=0).scene)
-    model.search = search
-
-    def look(*_):
-        raise TimeoutError
-
-    for part in model.modules():
-        part.register_forward_pre_hook(look)
-    with pytest.raises(TimeoutError):
-        search.run(WALLS, 0.0, 0.4)
+    torch.testing.assert_close(search.run(WALLS, 0.0, 3), WALLS, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("bandwidth", [0.0, 2e8])
@@ -112,11 +109,11 @@ def test_the_covariances_are_the_sums_of_waves_over_the_band(search, bandwidth):
     fields, _, lengths = (part.numpy() for part in own.paths(WALLS, all_sequences(3, 1)))
     found = own.sums(*own.paths(WALLS, all_sequences(3, 1)), bandwidth).numpy()
     position, rotation = own.pose.position.numpy(), own.pose.rotation.numpy()
-    places, elements, frequency = own.places.numpy(), own.array.elements.double().numpy(), own.frequencies[0].item()
+    places, elements, frequency = own.places.double().numpy(), own.array.elements.double().numpy(), own.frequency
     images = np.stack([places, *(places - 2 * ((places @ n) - d)[:, None] * n for *n, d in _rows())], 1)
     ways = (images - position) @ rotation
     distances = np.linalg.norm(ways, axis=-1)
-    np.testing.assert_allclose(lengths, distances)
+    np.testing.assert_allclose(lengths, distances, rtol=1e-6)
     te, tm = (part.numpy() for part in fresnel(MATERIAL, torch.tensor(_cosines(images, position))))
     level = np.array([0, 0, 0, 1.0])
     gains = np.where(np.arange(4) > 0, (1 - level) * te + level * tm, 1) * (np.abs(fields) > 0)
@@ -131,7 +128,7 @@ def test_the_covariances_are_the_sums_of_waves_over_the_band(search, bandwidth):
     _, pairs, counts = own.array.lags
     for lag in range(len(counts)):
         expected = total.reshape(4, -1)[:, (pairs == lag).numpy()].mean(1)
-        np.testing.assert_allclose(found[:, lag], expected, rtol=0, atol=1e-6 * np.abs(total).max())
+        np.testing.assert_allclose(found[:, lag], expected, rtol=0, atol=1e-4 * np.abs(total).max())
 
 
 def _rows():
