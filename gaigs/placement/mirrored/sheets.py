@@ -29,8 +29,8 @@ CANDIDATES = 6
 FAINTEST = 1e-4
 """Share of a link's power, obstacles apart, from which a path counts."""
 
-LEAST_LOSS = 0.1
-"""Loss of a sheet from which it is kept [dB]."""
+LEAST = 0.023
+"""Conductance from which a sheet is kept: 0.1 dB at normal incidence."""
 
 SAMPLES = 192
 """Points of a leg at which the density is computed: 5 cm apart on a leg of 10 m."""
@@ -122,7 +122,7 @@ def densities(obstacles: Obstacles, points: Float[Tensor, "k 3"]) -> Float[Tenso
 
 
 def sample(obstacles: Obstacles, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"]) -> MatterGrid:
-    """MatterGrid in a box, whose corners are from the middle of the room [m]."""
+    """Matter in a box, whose corners are from the middle of the room [m]."""
     pitch = float((np.prod(upper - lower) / VOXELS) ** (1 / 3))
     corner = lower - 2 * pitch
     shape = np.ceil((upper - corner) / pitch).astype(int) + 3
@@ -161,6 +161,9 @@ def fit_sheets(
     with one conductance. In the best set each surface gets a conductance of its own. The error is that of a link's
     fields in decibels, in the mean over links: neither deep shadow nor the best links decide. ``lower`` and ``upper``
     are corners of the room [m].
+
+    Raises:
+        ValueError: No path passes the obstacles.
     """
     obstacles, sequences, middle = placement.obstacles, placement.sequences[placement.kept], placement.middle
     if obstacles is None:
@@ -233,6 +236,8 @@ def fit_sheets(
     sheets = []
     for number, logs in zip(chosen, values[:-1].split(sizes), strict=True):
         for surface, conductance in enumerate(logs.exp().tolist(), 1):
+            if conductance < LEAST:
+                continue
             vertices, faces = matter.surface(options[number], surface)
             sheets.append(Sheet(conductance, vertices + middle.cpu().numpy(), faces))
-    return [sheet for sheet in sheets if sheet.loss_db >= LEAST_LOSS], values[-1].item()
+    return sheets, values[-1].item()
