@@ -54,7 +54,15 @@ class Obstacles(nn.Module):
 
     def forward(self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Optical depth along segments [Np]."""
-        return _Depth.apply(start, end, self.centres, self.log_widths, self.log_densities)
+        legs = start.reshape(-1, 3), end.reshape(-1, 3)
+        size = max(1, PAIRS // len(self)) if start.device.type == "cpu" else len(legs[0]) or 1
+        own = self.centres, self.log_widths, self.log_densities
+        parts = [_Depth.apply(*part, *own) for part in zip(*(ends.split(size) for ends in legs), strict=True)]
+        return torch.cat(parts).view(start.shape[:-1])
+
+
+PAIRS = 2**16
+"""Pairs of a segment and an obstacle at a time: a CPU keeps them in its cache, and asks for no fresh memory."""
 
 
 class _Depth(torch.autograd.Function):
@@ -66,18 +74,16 @@ class _Depth(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, start, end, centres, log_widths, log_densities):
-        ctx.shape = start.shape
-        start, end = start.reshape(-1, 3), end.reshape(-1, 3)
         parts = *_, r, near, inside, length = _parts(start, end, centres, log_widths)
         each = near * inside * r * (log_densities.exp() * math.sqrt(math.pi))
         ctx.save_for_backward(start, end, centres, log_widths, log_densities, *parts)
-        return (each.sum(-1) * length).view(ctx.shape[:-1])
+        return each.sum(-1) * length
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
         start, end, centres, log_widths, log_densities, a, b, r, near, inside, length = ctx.saved_tensors
-        gradient = gradient.reshape(-1, 1)
+        gradient = gradient[:, None]
         # In place where it can be: fresh memory costs more than the sums.
         rate = (near * r).mul_(gradient * length[:, None]).mul_(log_densities.exp() * math.sqrt(math.pi))  # of E
         each = rate * inside
@@ -107,7 +113,7 @@ class _Depth(torch.autograd.Function):
         squares = (ray.square().T @ d_a + (ray * start).T @ d_b + start.square().T @ d_c).T
         squares = squares - by_ray * centres - 2 * centres * by_start + centres.square() * ones
         d_densities = each.sum(0)
-        return d_start.view(ctx.shape), d_end.view(ctx.shape), d_centres, -2 * squares * widths, d_densities
+        return d_start, d_end, d_centres, -2 * squares * widths, d_densities
 
 
 SHORTEST = 1e-8
