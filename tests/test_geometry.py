@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from gaigs.geometry import Pose, quaternions_to_rotations, spherical_harmonics, to_spherical
+from gaigs.geometry import Pose, quaternions_to_rotations, sinc, spherical_harmonics, to_spherical
 
 
 @pytest.fixture
@@ -93,3 +93,13 @@ def test_spherical_harmonics_are_scipys():
 
 def test_spherical_harmonics_have_finite_gradients_at_the_poles():
     assert torch.autograd.gradcheck(lambda vectors: spherical_harmonics(vectors, 4), directions(5).requires_grad_())
+
+
+def test_sinc_is_that_of_torch_also_at_0():
+    values = torch.tensor([0.0, -0.0, 1e-40, -1e-3, 0.3, 1.0, -2.5, 40.0], dtype=torch.float64, requires_grad=True)
+    torch.testing.assert_close(sinc(values), torch.sinc(values))
+    assert torch.autograd.gradcheck(sinc, values)
+    zero = torch.zeros(1, requires_grad=True)
+    sinc(zero).backward()
+    assert sinc(zero).item() == 1
+    assert zero.grad.item() == 0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gaigs.placement.mirrored import obstacles as module
 from gaigs.placement.mirrored.obstacles import Obstacles
 
 LOWER, UPPER = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([6.0, 4.0, 3.0])
@@ -56,6 +57,17 @@ def test_pieces_of_a_segment_add_up_and_its_direction_does_not_matter(obstacles)
     torch.testing.assert_close(obstacles(ends, starts), whole)
     assert obstacles(starts[0], ends[0]).shape == ()
     torch.testing.assert_close(obstacles(starts.view(4, 5, 3), ends.view(4, 5, 3)), whole.view(4, 5))
+
+
+def test_segments_taken_in_parts_have_the_same_depths_and_gradients(obstacles, monkeypatch):
+    starts, ends = segments(9)
+    results = []
+    for pairs in (1000, 15, 1):
+        monkeypatch.setattr(module, "PAIRS", pairs)
+        depths = obstacles(starts, ends)
+        results.append((depths, *torch.autograd.grad(depths.square().sum(), [*obstacles.parameters()])))
+    for other in results[1:]:
+        torch.testing.assert_close(other, results[0])
 
 
 def test_gradients_are_the_derivatives(obstacles):
