@@ -41,10 +41,8 @@ def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, equations 4.16 and 4.17.
     """
-    if smoothness == 0.5:
-        return (-apart / length).exp()
-    steps = math.sqrt(3) * apart / length
-    return (1 + steps) * (-steps).exp()
+    steps = apart * (-math.sqrt(2 * smoothness) / length)  # a division has a slower gradient
+    return steps.exp() if smoothness == 0.5 else (1 - steps) * steps.exp()
 
 
 class Around(NamedTuple):
@@ -54,14 +52,14 @@ class Around(NamedTuple):
         rows: Of the readings (m, j).
         found: False for rows beyond a receiver's readings (m, j).
         receivers: Of the asked places (m,).
-        squares: Squared distances of places [m²] (m, j + 1, j + 1).
+        apart: Distances of places [m] (m, j + 1, j + 1), 1e15 for rows that are not found: nothing correlates.
         bands: Of carriers, see ``coordinates`` of scale 1 (m, j + 1, j + 1); None without a band.
     """
 
     rows: Int[Tensor, "m j"]
     found: Bool[Tensor, "m j"]
     receivers: Int[Tensor, " m"]
-    squares: Float[Tensor, "m i i"]
+    apart: Float[Tensor, "m i i"]
     bands: Float[Tensor, "m i i"] | None
 
 
@@ -333,9 +331,10 @@ class ScalarProcess(nn.Module):
     ) -> Around:
         rows, found = nearest
         points = torch.cat((self.places[rows], places[:, None]), 1)
-        squares = distances(points[..., :3], points[..., :3]).square()
+        known = torch.nn.functional.pad(found, (0, 1), value=True)
+        apart = distances(points[..., :3], points[..., :3]).where(known[:, :, None] & known[:, None], 1e15)
         bands = (points[..., 3:] - points[..., 3:].mT).square() if self.scene.has_band else None
-        return Around(rows, found, receivers, squares, bands)
+        return Around(rows, found, receivers, apart, bands)
 
     def _factors(self, values: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
         """Variances of the noise of all known readings over those of their receivers; 1 if it is normal."""
@@ -380,24 +379,29 @@ def scaled(places: Float[Tensor, "k d"], scale: float) -> Float[Tensor, "k d"]:
 
 
 def covariances(around: Around, hyperparameters: Float[Tensor, "r 3"], choice: Choice) -> Float[Tensor, "m i i"]:
-    """Covariances of z at the readings around each place, 0 for those that are not there, and at the place itself."""
+    """Covariances of z at the readings around each place, and at the place itself."""
     length, signal, _ = (part[:, None, None] for part in hyperparameters[around.receivers].unbind(1))
-    squares = around.squares
-    if around.bands is not None:
-        squares = squares + choice.scale**2 * around.bands
-    # Below 1e-12 m the root has no finite gradient.
-    found = signal.square() * matern(squares.clamp_min(1e-24).sqrt(), length, choice.smoothness)
-    known = torch.nn.functional.pad(around.found, (0, 1), value=True)
-    return found.where(known[:, :, None] & known[:, None], 0)
+    apart = around.apart
+    if around.bands is not None:  # below 1e-12 m the root has no finite gradient
+        apart = (apart.square() + choice.scale**2 * around.bands).clamp_min(1e-24).sqrt()
+    return signal.square() * matern(apart, length, choice.smoothness)
 
 
 def conditional(
     between: Float[Tensor, "m i i"], values: Float[Tensor, "m j"], variances: Float[Tensor, "m j"]
 ) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
-    """Means and variances of z at places, from ``covariances``, the readings around, and their noise's variances."""
-    factor = torch.linalg.cholesky(between + torch.diag_embed(torch.nn.functional.pad(variances, (0, 1))))
-    solved = torch.linalg.solve_triangular(factor[:, :-1, :-1], values[..., None], upper=False)[..., 0]
-    return (factor[:, -1, :-1] * solved).sum(1), factor[:, -1, -1].square()
+    """Means and variances of z at places, from ``covariances``, the readings around, and their noise's variances.
+
+    The weights minimise the variance: its gradient, and that of the mean, need no derivative of weights or factor.
+    """
+    noisy = between + torch.diag_embed(torch.nn.functional.pad(variances, (0, 1)))
+    with torch.no_grad():
+        factor = torch.linalg.cholesky(noisy[:, :-1, :-1])
+        solved = torch.cholesky_solve(torch.stack((-noisy[:, :-1, -1], values), 2), factor)
+        both = torch.nn.functional.pad(solved, (0, 0, 0, 1))
+        both[:, -1, 0] = 1
+    products = (both[:, None, :, 0] @ noisy @ both)[:, 0]
+    return products[:, 1] - (solved[..., 0] * values).sum(1), products[:, 0]
 
 
 def expected_factors(

@@ -113,6 +113,22 @@ def test_the_gradient_is_finite_where_places_coincide():
     assert scale.grad.isfinite()
 
 
+def test_gradients_are_those_of_finite_differences():
+    links = drawn(count=40)
+    process = ScalarProcess(links.scene)
+    process.places, process.receivers, values = known(links)
+    rows = torch.arange(3)
+    nearest = process._nearest(process.places[rows], process.receivers[rows], rows, torch.arange(len(values)))
+    around = process._around(process.places[rows], process.receivers[rows], nearest)
+
+    def both(logarithms, noises):
+        return conditional(covariances(around, logarithms.exp(), Choice(1.5)), values[around.rows], noises)
+
+    point = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
+    noises = torch.ones_like(around.found, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(both, (point, noises))
+
+
 def test_readings_of_the_own_fold_do_not_predict():
     links = drawn(count=60)
     links.query.transmitters[20:40] = links.query.transmitters[:20]
