@@ -1,12 +1,13 @@
 """Mirrored Gaussians: our own predictor, which learns the walls of the room."""
 
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor, nn
 
@@ -19,9 +20,11 @@ from gaigs.placement.learnt_room import LearntPath, LearntRoom
 from gaigs.placement.mirrored import export
 from gaigs.placement.mirrored.channel_search import FEWEST, ChannelSearch
 from gaigs.placement.mirrored.lag_search import LagSearch
-from gaigs.placement.mirrored.search import Loss, choose_bandwidth, find_planes, move_planes, prune, thinned
+from gaigs.placement.mirrored.level_search import LevelSearch
+from gaigs.placement.mirrored.search import Loss, move_planes, prune
 from gaigs.pooling import Pooling
 from gaigs.pooling.channels import ChannelPooling
+from gaigs.pooling.path_rssi import PathRssi
 from gaigs.pooling.path_spectrum import PathSpectrum
 from gaigs.pooling.paths import LagPooling
 from gaigs.projection import Projection
@@ -39,10 +42,10 @@ log = logging.getLogger(__name__)
 class MirroredSplatting(GaussianSplatting):
     """The splatting pipeline with Gaussians at mirror images, learnt from coarse to fine.
 
-    ``ChannelSearch`` locates planes of channels before the training, ``LagSearch`` those of spectra whose bandwidth is
-    known. Otherwise powers come first: they locate planes to some centimetres. Then phases count too: each plane is
-    turned square to the others and moved along its normal, by steps of a fraction of the wavelength, to the least
-    error, and descent goes on.
+    ``ChannelSearch`` locates planes of channels before the training, ``LagSearch`` those of spectra. Of signal strength
+    powers come first, which teach obstacles; then ``LevelSearch`` locates planes by phases. Where frequencies are
+    unknown, powers add to the end. Labels that none of them can read start from the faces of the box; each plane is
+    then turned square to the others and moved along its normal to the least error.
 
     Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that suits it.
 
@@ -53,6 +56,7 @@ class MirroredSplatting(GaussianSplatting):
     revisions = (0.0, 0.06, 0.25, 0.5, 0.75)
 
     places: Query | None = None  # set by fit
+    levels: LevelSearch | None = None
 
     def __init__(
         self,
@@ -78,7 +82,7 @@ class MirroredSplatting(GaussianSplatting):
     def fit(self, links: Links) -> None:
         """Fits the pipeline, and keeps some links for the report of the paths' powers.
 
-        Spectra of a known bandwidth start from planes that ``LagSearch`` finds in them, channels without a trend from
+        Spectra start from planes that ``LagSearch`` finds in them, channels without a trend from
         those of ``ChannelSearch``; channels of fewer than ``FEWEST`` numbers from free space, and then the faces of the
         box. Each receiver's gain is that over its training links, as of ``friis``, or 0.1 where phases say nothing: a
         louder start would be worse than nothing.
@@ -87,13 +91,17 @@ class MirroredSplatting(GaussianSplatting):
         self.places = export.some(links.query[links.split.train])
         task = self.scene.task
         is_known = links.query.frequencies is not None or len(self.scene.frequencies) == 1
-        if isinstance(self.pooling, PathSpectrum) and is_known and self.placement.order and not self.placement.fixed:
-            frequencies, lags = carriers(self.scene, links.query), self.pooling.beamformer.lags
-            search = LagSearch(links, frequencies, lags, self.placement.order)
+        searches = is_known and self.placement.order > 0 and not self.placement.fixed
+        if searches and isinstance(self.pooling, PathSpectrum):
+            search = LagSearch(
+                links, carriers(self.scene, links.query), self.pooling.beamformer.lags, self.placement.order
+            )
             for doubt in search.doubts:
                 log.warning("%s", doubt)
-            if self.scene.bandwidth is not None and search.receivers:
-                self._find_planes(search, self.scene.bandwidth)
+            if search.receivers:
+                self._find_planes(search)
+        if searches and isinstance(self.pooling, PathRssi):
+            self.levels = LevelSearch(links, carriers(self.scene, links.query), self._start(), self.scene.bandwidth)
         if not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling)) or self.trend is not None:
             return
         train, sign, frequencies = links.split.train, int(self.pooling.sign), task.frequencies
@@ -127,30 +135,29 @@ class MirroredSplatting(GaussianSplatting):
         return super().predicts_untrained or bool(self.placement.is_bare)
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Loss) -> str:
-        """Adds planes, then moves them by phases, unless a search has found them; drops what does not help."""
+        """Lets phases count, and locates planes by them, unless a search has found them; drops what does not help."""
         placement = self.placement
         # The labels are sums of waves: powers say nothing alone, and phases count from the start.
         adds_waves = not isinstance(self.pooling, LagPooling)
         if placement.is_bare:
             placement.enable_reflections()
-        batches = [batch for batch in (train, validation) if batch is not None]
         # Of spectra early, too: each path costs time in every step.
         if number == len(self.revisions) - 1 or (number == 1 and placement.found and not adds_waves):
-            return prune(placement, batches, loss)
-        if number < 2 and (placement.fixed or placement.found):
-            return "planes stay where they were put"
+            return prune(placement, [batch for batch in (train, validation) if batch is not None], loss)
         if number < 2 and not adds_waves:
-            found = find_planes(self, train, validation, loss)
-            placement.most.fill_(placement.kept.sum())
-            return found
+            return "planes stay where they are"
         try:
             wavelength = speed_of_light / carriers(self.scene, train.query).mean().item()
         except ValueError:
             return "frequencies are unknown, so powers add to the end"
         if not placement.coherent:
             placement.enable_phases(wavelength)
-            if self.scene.bandwidth is None and placement.log_bandwidth is not None:
-                choose_bandwidth(self, wavelength, thinned(train), loss)
+            if self.levels is not None:
+                placement.locate()
+        if self.levels is not None:
+            return (
+                f"{len(self.levels.locate(placement))} planes located by phases, {int(placement.located.sum())} in all"
+            )
         if placement.fixed or placement.found:
             return "phases count"
         before = loss(train)
@@ -159,17 +166,23 @@ class MirroredSplatting(GaussianSplatting):
         moves = ", ".join(f"{move:+.3f}" for move in move_planes(self, train, wavelength, least))
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
 
-    def _find_planes(self, search: LagSearch, bandwidth: float) -> None:
-        """Puts planes where ``LagSearch`` finds them, from the user's walls or the faces of the box."""
+    def _start(self) -> Float[Tensor, "w 4"]:
+        """The user's walls, or the faces of the box without their tilt."""
         placement, used = self.placement, self.placement.used
-        normals = placement.normals[used] if placement.walls else placement.normals[used].round()  # without their tilt
-        start = torch.cat((normals, (placement.offsets[used] + normals @ placement.middle)[:, None]), 1).cpu()
-        planes = search.run(start, bandwidth, len(placement.origin)).to(normals)
+        normals = placement.normals[used] if placement.walls else placement.normals[used].round()
+        return torch.cat((normals, (placement.offsets[used] + normals @ placement.middle)[:, None]), 1).cpu()
+
+    def _find_planes(self, search: LagSearch) -> None:
+        """Puts planes where ``LagSearch`` finds them."""
+        placement = self.placement
+        planes = search.run(self._start(), self.scene.bandwidth, len(placement.origin)).to(placement.origin)
         for number, plane in enumerate(planes):
             placement.place(number, plane[:3], float(plane[3] - plane[:3] @ placement.middle))
         placement.kept.copy_(placement.sequences_of(torch.arange(len(planes))))
         placement.most.copy_(placement.kept.sum())
         placement.enable_phases(search.wavelength)
+        if placement.log_bandwidth is not None and self.scene.bandwidth is None:
+            placement.log_bandwidth.fill_(math.log(search.bandwidth))
         placement.found.fill_(True)
         log.info("%d planes found in spectra", len(planes))
 

@@ -2,9 +2,10 @@
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
@@ -12,10 +13,10 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 from torch.nn import functional
 
-from gaigs.antenna import Array
+from gaigs.antenna import Array, Receiver
 from gaigs.data import Links
 from gaigs.gaussians import fibonacci_lattice
-from gaigs.geometry import Grid, Pose
+from gaigs.geometry import Grid, Pose, sinc
 from gaigs.placement.mirrored.reflections import (
     all_sequences,
     fold,
@@ -46,6 +47,9 @@ GAIN = 0.03
 
 REACH = 0.08
 """Distance over which a plane is moved on either side [diagonals of the room]."""
+
+BANDS = 0.01, 1.0, 3.0, 10.0, 30.0, 100.0
+"""Bandwidths that are tried, where it is unknown [speed of light over the room's diagonal]."""
 
 FAINT = 1e-3
 """Share of the power below which paths of several reflections are left out."""
@@ -150,17 +154,23 @@ class ReceiverLags:
         return ways / lengths[..., None], lengths
 
     def paths(
-        self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"], open_: Bool[Tensor, "b v"] | None = None
+        self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"], passing: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Fields (b, n), steering (b, n, e) and lengths (b, n) [m] of all paths; open ones as in ``Room``."""
+        """Fields (b, n), steering (b, n, e) and lengths (b, n) [m] of all paths.
+
+        ``passing`` (b, w + 1) is the share of the direct path's field that obstacles let through, then that at each
+        plane; true and false for all and nothing.
+        """
         normals, offsets = planes[:, :3], planes[:, 3]
         points = images(self.places, sequences, normals, offsets)
         folded = fold(points, self.pose.position.expand(len(self.places), 3), sequences, normals, offsets)
         ways, lengths = self.seen(points[-1])
         gains = folded.exists * self.array.gain(ways) / lengths
-        if open_ is not None:
-            own = torch.cat((open_[:, 1:], torch.ones_like(open_[:, :1])), 1)[:, sequences].all(2)  # -1 is the last one
-            own[:, 0] = open_[:, 0]
+        if passing is not None:
+            own = torch.cat((passing[:, 1:], torch.ones_like(passing[:, :1])), 1)[:, sequences].prod(
+                2
+            )  # -1 is the last
+            own[:, 0] = passing[:, 0]
             gains = gains * own
         gains = folded.reflected(
             torch.complex(gains, torch.zeros_like(gains)),
@@ -172,7 +182,7 @@ class ReceiverLags:
     def sums(self, fields: Tensor, steering: Tensor, lengths: Tensor, bandwidth: float) -> Complex[Tensor, "b l"]:
         """Covariances of interfering paths, as of ``LagPooling``."""
         if bandwidth:
-            likeness = torch.sinc(bandwidth / speed_of_light * (lengths[:, :, None] - lengths[:, None]))
+            likeness = sinc(bandwidth / speed_of_light * (lengths[:, :, None] - lengths[:, None]))
             together = fields[:, :, None] * fields[:, None].conj() * likeness
             covariances = steering.mT @ together @ steering.conj()
         else:
@@ -237,7 +247,7 @@ class ReceiverLags:
         Planes are moved by ``moves`` [m] and turned about the pivot [m] towards two axes by ``turns`` [rad].
         """
         ways, own, gains, cosines = (part[:, 0] for part in self.single(plane[None]))
-        likeness = torch.sinc(bandwidth / speed_of_light * (lengths - own[:, None]))
+        likeness = sinc(bandwidth / speed_of_light * (lengths - own[:, None]))
         left = (waves * likeness[..., None]).sum(1)
         heard = (self.steering(ways).conj() * left).sum(1) * gains.conj()
         heard = heard * torch.polar(torch.ones_like(own), self.wavenumber * own)
@@ -271,6 +281,19 @@ class Found:
     errors: Float[Tensor, " b"]
 
 
+class Peak(NamedTuple):
+    """Maximum of a periodogram: its height, a plane, and the point about which the plane was turned [m]."""
+
+    score: float
+    plane: Float[Tensor, "4"]
+    pivot: Float[Tensor, "3"]
+
+    def is_apart(self, other: "Peak", wavelength: float) -> bool:
+        """True unless one main lobe holds both."""
+        gap = self.plane - other.plane
+        return bool(gap[:3].norm() > TILE / 4 or (gap[3] - gap[:3] @ self.pivot).abs() > wavelength / 4)
+
+
 class LagSearch:
     """Planes whose reflections explain spectra.
 
@@ -301,26 +324,15 @@ class LagSearch:
         order: int,
         most: int = 150,
     ):
-        self.order, self.receivers, self.doubts = min(order, 2), [], []
+        self.order, self.doubts = min(order, 2), []
         self.generator = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
-        self.wavelength = speed_of_light / frequencies.max().item()
-        train, query = links.split.train, links.query
-        used = query.receivers[train].unique()
-        points = torch.cat((query.transmitters[train], links.scene.positions(query.transmitters)[used]))
-        self.middle = (points.amin(0) + points.amax(0)) / 2  # about which single precision suffices
-        self.points = points - self.middle
-        self.diagonal = float((points.amax(0) - points.amin(0)).norm())
-        pairs = [(number, carrier) for number in used.tolist() for carrier in frequencies[train].unique().tolist()]
-        for number, carrier in pairs:
-            own = train[(query.receivers[train] == number) & (frequencies[train] == carrier)]
-            own = own[torch.linspace(0, len(own) - 1, min(len(own), max(20, most // len(pairs)))).round().long()]
-            lags, left = covariances(links.labels[own], query[own])
+        for own, carrier, pose, receiver in self.parts(links, frequencies, most):
+            lags, left = covariances(links.labels[own], links.query[own])
             powers = lags[:, lags.shape[1] // 2].real
-            heard, receiver = powers > 0, links.receivers[number]
+            heard = powers > 0
             if not heard.any():
                 continue
-            pose = replace(receiver.pose, position=receiver.pose.position - self.middle).to(self.points)
-            places, lags = query.transmitters[own] - self.middle, (lags / powers[:, None]).to(torch.complex64)
+            places, lags = links.query.transmitters[own] - self.middle, (lags / powers[:, None]).to(torch.complex64)
             if left.median() > STRANGE:
                 self.doubts.append(
                     f"the array of {receiver.name} does not explain {left.median():.0%} of its spectra\n"
@@ -331,22 +343,56 @@ class LagSearch:
                 self.doubts += self.receivers[-1].doubts(receiver.name)
         self.doubts = list(dict.fromkeys(self.doubts))
 
+    def parts(
+        self, links: Links, frequencies: Float[Tensor, " n"], most: int
+    ) -> Iterator[tuple[Int[Tensor, " b"], float, Pose, Receiver]]:
+        """Training links, carrier, pose about the room's middle and receiver, of each receiver and carrier."""
+        self.receivers: list[ReceiverLags] = []
+        self.wavelength = speed_of_light / frequencies.max().item()
+        train, query = links.split.train, links.query
+        used = query.receivers[train].unique()
+        points = torch.cat((query.transmitters[train], links.scene.positions(query.transmitters)[used]))
+        self.middle = (points.amin(0) + points.amax(0)) / 2  # about which single precision suffices
+        self.points = points - self.middle
+        self.diagonal = float((points.amax(0) - points.amin(0)).norm())
+        pairs = [(number, carrier) for number in used.tolist() for carrier in frequencies[train].unique().tolist()]
+        for number, carrier in pairs:
+            own, receiver = (
+                train[(query.receivers[train] == number) & (frequencies[train] == carrier)],
+                links.receivers[number],
+            )
+            own = own[torch.linspace(0, len(own) - 1, min(len(own), max(20, most // len(pairs)))).round().long()]
+            pose = replace(receiver.pose, position=receiver.pose.position - self.middle).to(self.points)
+            yield own, carrier, pose, receiver
+
     @torch.no_grad()
-    def run(self, planes: Float[Tensor, "w 4"], bandwidth: float, most: int) -> Float[Tensor, "v 4"]:
+    def run(self, planes: Float[Tensor, "w 4"], bandwidth: float | None, most: int) -> Float[Tensor, "v 4"]:
         """The planes, each moved twice by up to ``REACH`` and 18 degrees, and others, at most as many as ``most``.
 
-        ``bandwidth`` is that over which powers are averaged [Hz].
+        ``bandwidth`` is that over which powers are averaged [Hz]. If it is unknown, it becomes that with which moving
+        the strongest plane leaves least.
         """
-        if not len(planes) or not self.receivers:
-            return planes
-        self.bandwidth = bandwidth
         shift = lambda planes, by: torch.cat((planes[:, :3], (planes[:, 3] + planes[:, :3] @ by)[:, None]), 1)
         count = sum(len(receiver.places) for receiver in self.receivers)
         start = Found(
             shift(planes.float(), -self.middle), torch.ones(count, len(planes) + 1).bool(), torch.zeros(count)
         )
+        if bandwidth is None:
+            strongest = int(self.powers(start.planes, all_sequences(len(planes), 1)[1:]).argmax())
+            left = lambda bandwidth: self.over(bandwidth).moved(start, strongest).errors.mean().item()
+            bandwidth = min(self.bandwidths(None), key=left)
+        self.over(bandwidth)
         found = self.around(self.with_more(self.around(start), most))
         return shift(found.planes, self.middle)
+
+    def over(self, bandwidth: float) -> "LagSearch":
+        """Sets the band over which powers are averaged [Hz]."""
+        self.bandwidth = bandwidth
+        return self
+
+    def bandwidths(self, known: float | None) -> list[float]:
+        """The bandwidth, or those to try [Hz]: from a carrier to a band in which hardly two paths interfere."""
+        return [rooms * speed_of_light / self.diagonal for rooms in BANDS] if known is None else [known]
 
     def around(self, found: Found) -> Found:
         """Each plane moved, the strongest first; then all together."""
@@ -473,8 +519,8 @@ class LagSearch:
         blocked = self.errors(known, own, sequences) + BLOCKED
         trials = [found.planes]
         for normal in square_normals(found.planes[:, :3], k):
-            for plane in self.proposals(waves, normal, found.planes[k]):
-                trials.append(torch.cat((found.planes[:k], plane[None], found.planes[k + 1 :])))
+            for peak in self.peaks(waves, normal, found.planes[k]):
+                trials.append(torch.cat((found.planes[:k], peak.plane[None], found.planes[k + 1 :])))
         everywhere, sequences = self.opened(found.open, k + 1, True), self.sequences(found.planes)
         errors = torch.stack([self.errors(tried, everywhere, sequences) for tried in trials])
         least = torch.minimum(errors, blocked)
@@ -487,9 +533,9 @@ class LagSearch:
         ends = [(part.places, part.pose.position.expand_as(part.places)) for part in self.receivers]
         return torch.cat([reflection_points(*pair, plane[None])[:, 0] for pair in ends]).mean(0)
 
-    def proposals(
+    def peaks(
         self, waves: list[tuple[Tensor, Tensor]], normal: Float[Tensor, "3"], plane: Float[Tensor, "4"]
-    ) -> list[Float[Tensor, "4"]]:
+    ) -> list[Peak]:
         """Planes near a normal in place of one: at most six maxima of the periodogram."""
         about, reach = self.pivot(plane), min(REACH * self.diagonal, WIDEST * self.wavelength)
         half = min(self.wavelength, reach)  # of a tile [m]
@@ -507,17 +553,14 @@ class LagSearch:
             for score, *at in zip(best.values.tolist(), *torch.unravel_index(best.indices, tile.shape), strict=True):
                 move, first, second = steps[0][at[0]], steps[1][at[1]], steps[1][at[2]]
                 turned = functional.normalize(normal + first * axes[0] + second * axes[1], dim=0)
-                found.append((score, torch.cat((turned, (turned @ pivot + move)[None])), pivot))
-        found.sort(key=lambda trial: -trial[0])
-        kept: list[Tensor] = []
-        for score, tried, pivot in found:
-            if score <= 0 or len(kept) == 6:
+                found.append(Peak(score, torch.cat((turned, (turned @ pivot + move)[None])), pivot))
+        found.sort(key=lambda peak: -peak.score)
+        kept: list[Peak] = []
+        for peak in found:
+            if peak.score <= 0 or len(kept) == 6:
                 break
-            apart = [tried - other for other in kept]
-            if all(
-                gap[:3].norm() > TILE / 4 or (gap[3] - gap[:3] @ pivot).abs() > self.wavelength / 4 for gap in apart
-            ):
-                kept.append(tried)
+            if all(peak.is_apart(other, self.wavelength) for other in kept):
+                kept.append(peak)
         return kept
 
     @torch.enable_grad()

@@ -38,6 +38,10 @@ PERMITTIVITY, CONDUCTIVITY = 4.0, 0.3
 MOST = 100_000
 """Largest number of sequences of planes: of 10 planes those of order 5."""
 
+KNOWN, UNKNOWN = math.log(0.3), math.log(3.0)
+"""Logarithm of the standard deviation of a path's phase [rad], of a known one at the start, and of one that adds as
+power."""
+
 FAINT = 1e-3
 """Largest share of a link's power, obstacles apart, of a path that skips the obstacles: two of three paths."""
 
@@ -157,7 +161,7 @@ class Mirrored(Placement):
         self.path_phases = None if is_complex else filled(0.0, paths)
         self.log_thicknesses = filled(0.0, planes) if is_complex else None  # [m]; a metre is a half-space
         self.log_spreads = filled(math.log(0.03), paths)  # [rad], far below the resolution of small arrays
-        self.log_blurs = filled(math.log(0.3), paths)  # standard deviation of a path's phase [rad]
+        self.log_blurs = filled(KNOWN, paths)
         self.receiver_gains, self.directivity = filled(0.0, antennas), filled(0.0)
         self.receiver_phases = filled(0.0, antennas) if is_complex else None
         self.log_bandwidth = None
@@ -226,6 +230,22 @@ class Mirrored(Placement):
         # 2.2 wavelengths: a usual step of 0.01 then turns a phase by a tenth of a radian.
         self.step.fill_(min(1.0, 2.2 * wavelength / (UNIT * self.diagonal)))
         self.coherent.fill_(True)
+
+    @property
+    def located(self) -> Bool[Tensor, " w"]:
+        """True for planes at which paths interfere."""
+        known = (self.sequences >= 0).sum(1) <= 1
+        known &= self.log_blurs < (KNOWN + UNKNOWN) / 2
+        return torch.isin(torch.arange(len(self.origin), device=known.device), self.sequences[known])
+
+    @torch.no_grad()
+    def locate(self, *planes: int) -> None:
+        """Lets paths at these planes and at others that are ``located`` interfere; all others add as powers."""
+        located = self.located if planes else self.located & False
+        located[list(planes)] = True
+        phased = self.sequences_of(located.nonzero()[:, 0])
+        self.path_phases[phased & (self.log_blurs > (KNOWN + UNKNOWN) / 2)] = 0
+        self.log_blurs.copy_(torch.where(phased, self.log_blurs.clamp_max(KNOWN), UNKNOWN))
 
     @torch.no_grad()
     def start_from_free_space(self, gains: Complex[Tensor, " receivers"]) -> None:
@@ -328,6 +348,17 @@ class Mirrored(Placement):
         count, n = strengths.shape
         paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
         return depths.flatten().index_add(0, paths.flatten()[legs], obstacles(*ends)).view(count, n)
+
+    def passing(self, query: Query, planes: int) -> Float[Tensor, "b v"]:
+        """Field over free space of the direct path, then of that at each of the first planes; 0 for no path."""
+        sequences = self.sequences[self.kept]
+        seen = images(query.transmitters - self.middle, sequences, self.normals, self.offsets)
+        receivers = (self.scene.positions(query.transmitters) - self.middle)[query.receivers]
+        strengths = self.strengths(query, fold(seen, receivers, sequences, self.normals, self.offsets)).abs()
+        few = (sequences >= 0).sum(1) <= 1
+        found = strengths.new_zeros(len(query), planes + 1)
+        found[:, (sequences[few].amax(1) if self.order else 0) + 1] = strengths[:, few]
+        return found / self.receiver_gains[query.receivers, None].exp()
 
     def margins(self, query: Query) -> Complex[Tensor, "b n"]:
         """Field over free space by which each kept path may deviate: its own, and a tenth of that without obstacles."""

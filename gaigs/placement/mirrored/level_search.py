@@ -1,0 +1,158 @@
+"""Search for planes in received levels: interference with known paths, one plane after the other."""
+
+import logging
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Complex, Float, Int
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.data import Links
+from gaigs.geometry import sinc
+from gaigs.placement.mirrored.lag_search import LagSearch, ReceiverLags, reflection
+from gaigs.placement.mirrored.paths import Mirrored
+from gaigs.placement.mirrored.reflections import square_normals
+from gaigs.query import Query
+
+log = logging.getLogger(__name__)
+
+SCALE = 3.0
+"""Error of a level beyond which it hardly counts [dB]."""
+
+CLEAR = 3.0
+"""Least fall of the errors by a plane whose phases count [standard errors]. Of false planes it is below 2."""
+
+TRIED = 4
+"""Maxima of the periodograms whose errors are compared."""
+
+
+@dataclass(frozen=True)
+class ReceiverLevels(ReceiverLags):
+    """Training levels of one receiver of one carrier; ``lags`` are powers (b, 1), ``query`` their links."""
+
+    query: Query
+
+    @cached_property
+    def levels(self) -> Float[Tensor, " b"]:
+        """[dB]."""
+        return 10 * self.lags[:, 0].real.log10()
+
+    def errors(self, lags: Complex[Tensor, "b 1"]) -> Float[Tensor, " b"]:
+        """Log of 1 + the squared error of each level over ``SCALE``; the receiver's gain does not count."""
+        errors = 10 * lags[:, 0].real.clamp_min(1e-12).log10() - self.levels
+        return ((errors - errors.detach().median()) / SCALE).square().log1p()
+
+
+class LevelSearch(LagSearch):
+    """Planes whose reflections interfere in received levels.
+
+    A level is one number, so phases say nothing before a model knows from powers what obstacles let through. Then
+    planes are located one after the other, the clearest first, by the periodogram of ``LagSearch``. Only paths at
+    located planes interfere; the others add as powers, because a wrong phase would be worse than none.
+
+    Args:
+        links: Their training links count; of the task ``rssi``.
+        frequencies: Carrier of each link [Hz].
+        planes: Normals and offsets at the start (w, 4) [m]. Each is searched near its start.
+        bandwidth: Over which powers are averaged [Hz]; None if unknown.
+        most: Links that count, of all receivers together.
+
+    Source: ours.
+    """
+
+    def __init__(
+        self,
+        links: Links,
+        frequencies: Float[Tensor, " n"],
+        planes: Float[Tensor, "w 4"],
+        bandwidth: float | None,
+        most: int = 1500,
+    ):
+        self.order, self.known = 2, bandwidth
+        for own, carrier, pose, receiver in self.parts(links, frequencies, most):
+            powers = 10 ** ((links.labels[own] - links.labels[own].median()) / 10)
+            query = links.query[own]
+            places = query.transmitters - self.middle
+            levels = ReceiverLevels(places, powers[:, None].to(torch.complex64), carrier, pose, receiver.array, query)
+            self.receivers.append(levels)
+        self.start = torch.cat((planes[:, :3], (planes[:, 3] - planes[:, :3] @ self.middle)[:, None]), 1)
+
+    @torch.no_grad()
+    def locate(self, placement: Mirrored) -> list[int]:
+        """Puts the placement's planes where they are clear, and lets paths at them interfere; the result are they."""
+        found: list[int] = []
+        shift = placement.middle.cpu() - self.middle
+        while left := [k for k in range(len(self.start)) if not placement.located[k]]:
+            located = placement.located[: len(self.start)].cpu()
+            own = torch.cat((placement.normals, placement.offsets[:, None]), 1)[: len(self.start)].cpu()
+            own[:, 3] += own[:, :3] @ shift
+            planes = torch.where(located[:, None], own, self.start)
+            passing = self.passing(placement, planes)
+            bandwidths = self.bandwidths(self.known) if not located.any() else [self.bandwidth]
+            trials = [
+                (*self.over(bandwidth).clearest(planes, passing, located, k), bandwidth, k)
+                for bandwidth in bandwidths
+                for k in left
+            ]
+            gain, plane, self.bandwidth, k = max(trials, key=lambda trial: trial[0])
+            if gain < CLEAR:
+                break
+            if placement.log_bandwidth is not None and self.known is None:
+                placement.log_bandwidth.fill_(self.bandwidth).log_()
+            plane = plane.to(placement.origin)
+            placement.place(k, plane[:3], float(plane[3] - plane[:3] @ shift.to(plane)))
+            placement.locate(k)
+            found.append(k)
+            world = float(plane[3] + plane[:3] @ self.middle.to(plane))
+            log.info("plane (%.2f, %.2f, %.2f) at %.2f m, by %.1f standard errors", *plane[:3].tolist(), world, gain)
+        return found
+
+    def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:
+        """Field of the direct path and of that at each plane in a model, over what this search expects."""
+        parts = []
+        for receiver in self.receivers:
+            expected = reflection(planes[:, :3], receiver.single(planes)[3].abs()).abs()
+            expected = torch.cat((torch.ones_like(expected[:, :1]), expected), 1)
+            own = placement.passing(receiver.query.to(placement.origin.device), len(planes)).cpu()
+            parts.append(torch.where((own > 0) & (expected > 0), own / expected, 1))
+        return torch.cat(parts)
+
+    def clearest(
+        self, planes: Float[Tensor, "w 4"], passing: Float[Tensor, "b v"], located: Bool[Tensor, " w"], k: int
+    ) -> tuple[float, Float[Tensor, "4"]]:
+        """Where plane k makes the errors fall most clearly if its phases count, and by how many standard errors."""
+        sequences = self.sequences(planes)
+        phased = self.phased(sequences, located)
+        known, before, waves = phased & ~(sequences == k).any(1), [], []
+        for receiver, own in self.each(passing):
+            fields, _, lengths = paths = receiver.paths(planes, sequences, own)
+            before.append(self.received(paths, phased))
+            slopes = receiver.slopes(before[-1])[:, 0]
+            waves.append(((slopes * fields * known * own[:, k + 1, None])[..., None], lengths))
+        peaks = [peak for normal in square_normals(planes[:, :3], k) for peak in self.peaks(waves, normal, planes[k])]
+        peaks.sort(key=lambda peak: -peak.score)
+        phased, found = self.phased(sequences, located.index_fill(0, torch.tensor(k), True)), [(0.0, planes[k])]
+        for peak in peaks[:TRIED]:
+            moved, gains = torch.cat((planes[:k], peak.plane[None], planes[k + 1 :])), []
+            for (receiver, own), old in zip(self.each(passing), before, strict=True):
+                new = self.received(receiver.paths(moved, sequences, own), phased)
+                # Half of the interference: errors then follow its phase more than its strength, which is uncertain.
+                gains.append(receiver.errors(old) - receiver.errors((old + new) / 2))
+            mean, deviation = (part.item() for part in reversed(torch.std_mean(torch.cat(gains))))
+            found.append((mean / max(deviation, 1e-12) * math.sqrt(len(passing)), peak.plane))
+        return max(found, key=lambda trial: trial[0])
+
+    def phased(self, sequences: Int[Tensor, "n order"], located: Bool[Tensor, " w"]) -> Bool[Tensor, " n"]:
+        """True for paths whose planes are all located."""
+        return torch.cat((located, located.new_ones(1)))[sequences].all(1)  # -1 is the last one
+
+    def received(self, paths: tuple[Tensor, Tensor, Tensor], phased: Bool[Tensor, " n"]) -> Complex[Tensor, "b 1"]:
+        """Powers of paths, of which some interfere."""
+        fields, _, lengths = paths
+        waves, ways = fields[:, phased], lengths[:, phased]
+        likeness = sinc(self.bandwidth / speed_of_light * (ways[:, :, None] - ways[:, None]))
+        powers = (fields[:, ~phased].abs().square()).sum(1) + ((likeness * waves[:, None]).sum(2) * waves.conj()).sum(1)
+        return powers[:, None]
