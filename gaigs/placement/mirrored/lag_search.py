@@ -372,6 +372,8 @@ class LagSearch:
         ``bandwidth`` is that over which powers are averaged [Hz]. If it is unknown, it becomes that with which moving
         the strongest plane leaves least.
         """
+        if not len(planes) or not self.receivers:
+            return planes
         shift = lambda planes, by: torch.cat((planes[:, :3], (planes[:, 3] + planes[:, :3] @ by)[:, None]), 1)
         count = sum(len(receiver.places) for receiver in self.receivers)
         start = Found(
@@ -429,9 +431,9 @@ class LagSearch:
         changed[:, column] = value
         return changed
 
-    def each(self, open_: Bool[Tensor, "b v"]) -> list[tuple[ReceiverLags, Bool[Tensor, "c v"]]]:
-        """Receivers, and what is open at their links."""
-        parts = open_.split([len(receiver.places) for receiver in self.receivers])
+    def each(self, passing: Tensor) -> list[tuple[ReceiverLags, Tensor]]:
+        """Receivers, and what passes at their links (c, v); see ``ReceiverLags.paths``."""
+        parts = passing.split([len(receiver.places) for receiver in self.receivers])
         return list(zip(self.receivers, parts, strict=True))
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:

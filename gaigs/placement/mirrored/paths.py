@@ -38,9 +38,9 @@ PERMITTIVITY, CONDUCTIVITY = 4.0, 0.3
 MOST = 100_000
 """Largest number of sequences of planes: of 10 planes those of order 5."""
 
-KNOWN, UNKNOWN = math.log(0.3), math.log(3.0)
-"""Logarithm of the standard deviation of a path's phase [rad], of a known one at the start, and of one that adds as
-power."""
+KNOWN, UNKNOWN = math.log(0.3), math.log(20.0)
+"""Logarithm of the standard deviation of a path's phase [rad]: of a known one at the start, and of a path that adds as
+power, whose coherence is 0 in single precision."""
 
 FAINT = 1e-3
 """Largest share of a link's power, obstacles apart, of a path that skips the obstacles: two of three paths."""
