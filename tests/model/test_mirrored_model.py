@@ -257,7 +257,7 @@ def test_half_precision_is_refused(dtype):
 
 
 @torch.no_grad()
-def test_phases_come_with_a_band_that_is_chosen_and_planes_that_move(monkeypatch):
+def test_phases_come_with_planes_that_move():
     receiver, offsets = Receiver("gateway1", POSE), torch.linspace(-BANDWIDTH / 2, BANDWIDTH / 2, 51).double()
     rss = rss_dbm(respond(EMPTY, place(12, 0), receiver, CARRIER, offsets, 1)).float()
     links = links_of(rss - 20 * math.log10(speed_of_light / CARRIER / (4 * math.pi)), Rssi(), receiver)
@@ -265,14 +265,9 @@ def test_phases_come_with_a_band_that_is_chosen_and_planes_that_move(monkeypatch
     model = walled(build(links, placement=MIRRORED | {"order": 1}, pooling=pooling))
     placement, batch = model.placement, links.batch(torch.arange(12))
     loss = lambda batch: (model(batch).value - batch.labels).abs().mean().item()
-    tried, move = [], search._move
-    monkeypatch.setattr(search, "_move", lambda *arguments: tried.append(arguments[1]) or 0.0)
-    assert model.revise(2, batch, None, loss).startswith("phases count; planes moved by +0.000, ")
+    assert model.revise(2, batch, None, loss).startswith("phases count; planes moved by ")
     assert placement.coherent
-    assert tried[:12] == search.by_strength(placement, batch)[:2] * 6, "the two strongest planes, with each bandwidth"
-    bandwidth = placement.log_bandwidth.exp() * placement.diagonal / speed_of_light
-    assert bandwidth.item() == pytest.approx(10), "of 0.01, 1, 3, 10, 30 and 100 the next to 500 MHz in this room"
-    monkeypatch.setattr(search, "_move", move)
+    placement.log_bandwidth.fill_(math.log(BANDWIDTH))
     placement.kept &= placement.sequences_of(torch.tensor([2]))
     batch = replace(batch, labels=model(batch).value)
     placement.origin[2, 3] += 0.02
@@ -330,7 +325,7 @@ def test_fixed_planes_do_not_move_and_unknown_carriers_have_no_phases():
     model, batch = build(links, placement=MIRRORED | {"fixed": True}), links.batch(torch.arange(4))
     before = model.placement.offsets
     lines = [model.revise(number, batch, None, lambda batch: 1.0) for number in (0, 2)]
-    assert lines == ["planes stay where they were put", "phases count"]
+    assert lines == ["planes stay where they are", "phases count"]
     torch.testing.assert_close(model.placement.offsets, before)
     links = example_links("rssi")
     pooling = {"name": "path_rssi", "floor_db": -60.0}

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
@@ -387,7 +387,7 @@ class LagSearch:
         found = self.around(self.with_more(self.around(start), most))
         return shift(found.planes, self.middle)
 
-    def over(self, bandwidth: float) -> "LagSearch":
+    def over(self, bandwidth: float) -> Self:
         """Sets the band over which powers are averaged [Hz]."""
         self.bandwidth = bandwidth
         return self

@@ -32,9 +32,7 @@ TRIED = 4
 
 @dataclass(frozen=True)
 class ReceiverLevels(ReceiverLags):
-    """Training levels of one receiver of one carrier; ``lags`` are powers (b, 1), ``query`` their links."""
-
-    query: Query
+    """Training levels of one receiver of one carrier; ``lags`` are powers (b, 1)."""
 
     @cached_property
     def levels(self) -> Float[Tensor, " b"]:
@@ -73,36 +71,38 @@ class LevelSearch(LagSearch):
         most: int = 1500,
     ):
         self.order, self.known = 2, bandwidth
+        self.queries: list[Query] = []
         for own, carrier, pose, receiver in self.parts(links, frequencies, most):
             powers = 10 ** ((links.labels[own] - links.labels[own].median()) / 10)
-            query = links.query[own]
-            places = query.transmitters - self.middle
-            levels = ReceiverLevels(places, powers[:, None].to(torch.complex64), carrier, pose, receiver.array, query)
-            self.receivers.append(levels)
+            places, lags = links.query.transmitters[own] - self.middle, powers[:, None].to(torch.complex64)
+            self.receivers.append(ReceiverLevels(places, lags, carrier, pose, receiver.array))
+            self.queries.append(links.query[own])
         self.start = torch.cat((planes[:, :3], (planes[:, 3] - planes[:, :3] @ self.middle)[:, None]), 1)
 
     @torch.no_grad()
     def locate(self, placement: Mirrored) -> list[int]:
-        """Puts the placement's planes where they are clear, and lets paths at them interfere; the result are they."""
+        """Puts planes where they are clear, and lets paths at them interfere; the result are their numbers."""
         found: list[int] = []
         shift = placement.middle.cpu() - self.middle
         while left := [k for k in range(len(self.start)) if not placement.located[k]]:
             located = placement.located[: len(self.start)].cpu()
-            own = torch.cat((placement.normals, placement.offsets[:, None]), 1)[: len(self.start)].cpu()
+            own = torch.cat((placement.normals, placement.offsets[:, None]), 1)[: len(self.start)].cpu().float()
             own[:, 3] += own[:, :3] @ shift
             planes = torch.where(located[:, None], own, self.start)
             passing = self.passing(placement, planes)
-            bandwidths = self.bandwidths(self.known) if not located.any() else [self.bandwidth]
+            is_unknown = self.known is None and not located.any()
+            learnt = 0.0 if placement.log_bandwidth is None else placement.log_bandwidth.exp().item()
+            bandwidths = self.bandwidths(None if is_unknown else learnt)
             trials = [
                 (*self.over(bandwidth).clearest(planes, passing, located, k), bandwidth, k)
                 for bandwidth in bandwidths
                 for k in left
             ]
-            gain, plane, self.bandwidth, k = max(trials, key=lambda trial: trial[0])
+            gain, plane, bandwidth, k = max(trials, key=lambda trial: trial[0])
             if gain < CLEAR:
                 break
-            if placement.log_bandwidth is not None and self.known is None:
-                placement.log_bandwidth.fill_(self.bandwidth).log_()
+            if is_unknown:
+                placement.log_bandwidth.fill_(math.log(bandwidth))
             plane = plane.to(placement.origin)
             placement.place(k, plane[:3], float(plane[3] - plane[:3] @ shift.to(plane)))
             placement.locate(k)
@@ -114,10 +114,10 @@ class LevelSearch(LagSearch):
     def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:
         """Field of the direct path and of that at each plane in a model, over what this search expects."""
         parts = []
-        for receiver in self.receivers:
+        for receiver, query in zip(self.receivers, self.queries, strict=True):
             expected = reflection(planes[:, :3], receiver.single(planes)[3].abs()).abs()
             expected = torch.cat((torch.ones_like(expected[:, :1]), expected), 1)
-            own = placement.passing(receiver.query.to(placement.origin.device), len(planes)).cpu()
+            own = placement.passing(query.to(placement.origin.device), len(planes)).cpu().float()
             parts.append(torch.where((own > 0) & (expected > 0), own / expected, 1))
         return torch.cat(parts)
 

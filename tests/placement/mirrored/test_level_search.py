@@ -100,7 +100,7 @@ def test_no_plane_is_located_in_noise():
 def test_waves_interfere_at_located_planes_alone():
     search, placement = room(BANDWIDTH)
     assert not placement.located.any()
-    query = search.receivers[0].query
+    query = search.queries[0]
     unknown = placement(None, query)
     placement.locate(1)
     placement.locate(2)
