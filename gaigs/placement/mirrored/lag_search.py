@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
@@ -379,18 +379,13 @@ class LagSearch:
         start = Found(
             shift(planes.float(), -self.middle), torch.ones(count, len(planes) + 1).bool(), torch.zeros(count)
         )
-        if bandwidth is None:
-            strongest = int(self.powers(start.planes, all_sequences(len(planes), 1)[1:]).argmax())
-            left = lambda bandwidth: self.over(bandwidth).moved(start, strongest).errors.mean().item()
-            bandwidth = min(self.bandwidths(None), key=left)
-        self.over(bandwidth)
+        trials, strongest = [], int(self.powers(start.planes, all_sequences(len(planes), 1)[1:]).argmax())
+        for self.bandwidth in (choices := self.bandwidths(bandwidth)):
+            left = self.moved(start, strongest).errors.mean().item() if len(choices) > 1 else 0.0
+            trials.append((left, self.bandwidth))
+        _, self.bandwidth = min(trials)
         found = self.around(self.with_more(self.around(start), most))
         return shift(found.planes, self.middle)
-
-    def over(self, bandwidth: float) -> Self:
-        """Sets the band over which powers are averaged [Hz]."""
-        self.bandwidth = bandwidth
-        return self
 
     def bandwidths(self, known: float | None) -> list[float]:
         """The bandwidth, or those to try [Hz]: from a carrier to a band in which hardly two paths interfere."""

@@ -93,16 +93,14 @@ class LevelSearch(LagSearch):
             is_unknown = self.known is None and not located.any()
             learnt = 0.0 if placement.log_bandwidth is None else placement.log_bandwidth.exp().item()
             bandwidths = self.bandwidths(None if is_unknown else learnt)
-            trials = [
-                (*self.over(bandwidth).clearest(planes, passing, located, k), bandwidth, k)
-                for bandwidth in bandwidths
-                for k in left
-            ]
-            gain, plane, bandwidth, k = max(trials, key=lambda trial: trial[0])
+            trials = []
+            for self.bandwidth in bandwidths:
+                trials += [(*self.clearest(planes, passing, located, k), self.bandwidth, k) for k in left]
+            gain, plane, self.bandwidth, k = max(trials, key=lambda trial: trial[0])
             if gain < CLEAR:
                 break
             if is_unknown:
-                placement.log_bandwidth.fill_(math.log(bandwidth))
+                placement.log_bandwidth.fill_(math.log(self.bandwidth))
             plane = plane.to(placement.origin)
             placement.place(k, plane[:3], float(plane[3] - plane[:3] @ shift.to(plane)))
             placement.locate(k)
