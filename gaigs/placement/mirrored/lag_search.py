@@ -380,7 +380,8 @@ class LagSearch:
             shift(planes.float(), -self.middle), torch.ones(count, len(planes) + 1).bool(), torch.zeros(count)
         )
         trials, strongest = [], int(self.powers(start.planes, all_sequences(len(planes), 1)[1:]).argmax())
-        for self.bandwidth in (choices := self.bandwidths(bandwidth)):
+        choices = self.bandwidths(bandwidth)
+        for self.bandwidth in choices:
             left = self.moved(start, strongest).errors.mean().item() if len(choices) > 1 else 0.0
             trials.append((left, self.bandwidth))
         _, self.bandwidth = min(trials)
