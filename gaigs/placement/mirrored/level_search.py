@@ -2,7 +2,7 @@
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -22,9 +22,12 @@ log = logging.getLogger(__name__)
 SCALE = 3.0
 """Error of a level beyond which it hardly counts [dB]."""
 
-CLEAR = 3.2
-"""Least fall of the errors by a plane whose phases count [standard errors]. With errors of the built-in room's levels
-permuted among their links, one of 48 searches reached it."""
+CLEAR = 3.0
+"""Least fall of the errors by a plane whose phases count [standard errors]."""
+
+CHANCE, SHUFFLES = 1.1, 4
+"""Least ratio of this fall to the largest one by chance, and how often that is tried: with errors that have changed
+their links. Of few links some plane always explains much."""
 
 TRIED = 4
 """Maxima of the periodograms whose errors are compared."""
@@ -83,6 +86,7 @@ class LevelSearch(LagSearch):
     def locate(self, placement: Mirrored) -> list[int]:
         """Puts planes where they are clear, and lets paths at them interfere; the result are their numbers."""
         found: list[int] = []
+        least = 0.0
         shift = placement.middle.cpu() - self.middle
         while left := [k for k in range(len(self.start)) if not placement.located[k]]:
             located = placement.located[: len(self.start)].cpu()
@@ -97,7 +101,9 @@ class LevelSearch(LagSearch):
             for self.bandwidth in bandwidths:
                 trials += [(*self.clearest(planes, passing, located, k), self.bandwidth, k) for k in left]
             gain, plane, self.bandwidth, k = max(trials, key=lambda trial: trial[0])
-            if gain < CLEAR:
+            if gain >= CLEAR and not least:
+                least = CHANCE * self.by_chance(planes, passing, located, left)
+            if gain < max(CLEAR, least):
                 break
             if is_unknown:
                 placement.log_bandwidth.fill_(math.log(self.bandwidth))
@@ -118,6 +124,24 @@ class LevelSearch(LagSearch):
             own = placement.passing(query.to(placement.origin.device), len(planes)).cpu().float()
             parts.append(torch.where((own > 0) & (expected > 0), own / expected, 1))
         return torch.cat(parts)
+
+    def by_chance(
+        self, planes: Float[Tensor, "w 4"], passing: Float[Tensor, "b v"], located: Bool[Tensor, " w"], left: list[int]
+    ) -> float:
+        """Largest gain of ``clearest`` where the errors of each receiver's links are shuffled."""
+        real, sequences, gains = self.receivers, self.sequences(planes), [0.0]
+        generator = torch.Generator().manual_seed(0)
+        for _ in range(SHUFFLES):
+            shuffled = []
+            for receiver, own in self.each(passing):
+                powers = self.received(receiver.paths(planes, sequences, own), self.phased(sequences, located))
+                errors = receiver.lags / powers.real.clamp_min(1e-12)
+                errors = errors[torch.randperm(len(errors), generator=generator)]
+                shuffled.append(replace(receiver, lags=powers * errors))
+            self.receivers = shuffled
+            gains += [self.clearest(planes, passing, located, k)[0] for k in left]
+            self.receivers = real
+        return max(gains)
 
     def clearest(
         self, planes: Float[Tensor, "w 4"], passing: Float[Tensor, "b v"], located: Bool[Tensor, " w"], k: int
