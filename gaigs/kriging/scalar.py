@@ -159,7 +159,6 @@ class ScalarProcess(nn.Module):
         receivers: Int[Tensor, " k"],
         candidates: Sequence[Float[Tensor, " k"]],
         folds: Int[Tensor, " k"],
-        held: Int[Tensor, " h"],
         most: int = 600,
     ) -> int:
         """Chooses the residuals, the kernel and the noise with which held-out readings are most likely.
@@ -168,15 +167,13 @@ class ScalarProcess(nn.Module):
             places, receivers: Of the known readings.
             candidates: Residuals of the known readings about one trend or another.
             folds: Readings are held out with all of their fold.
-            held: Rows that may be held out.
             most: Held-out readings to which the hyperparameters of single receivers are fitted; half as many choose.
 
         Returns:
             Index of the chosen residuals; ``solve`` takes them.
         """
-        self.places, self.receivers = places, receivers
-
-        few = self._held_out(held, folds, most // 2)
+        self.places, self.receivers, every = places, receivers, torch.arange(len(places))
+        few = self._held_out(every, folds, most // 2)
         tried = [(*self._maximise(values, *few, Choice()), index) for index, values in enumerate(candidates)]
         best = min(tried, key=lambda found: found[0])
         values = candidates[best[-1]]
@@ -185,7 +182,7 @@ class ScalarProcess(nn.Module):
             best = min(best, (*self._maximise(values, *few, choice, best[1]), best[-1]), key=lambda found: found[0])
         _, logarithms, choice, index = best
         _, self.logarithms, choice = self._maximise(
-            values, *self._held_out(held, folds, most), choice, logarithms, has_deviations=True
+            values, *self._held_out(every, folds, most), choice, logarithms, has_deviations=True
         )
         self.choice = torch.tensor(choice, dtype=torch.float64)
         return index
@@ -196,14 +193,27 @@ class ScalarProcess(nn.Module):
         receivers: Int[Tensor, " k"],
         values: Float[Tensor, " k"],
         folds: Int[Tensor, " k"],
+        held: Int[Tensor, " h"] | None = None,
         most: int = 300,
-    ) -> None:
-        """Fits the hyperparameters to other readings, from those that it has; kernel and noise stay."""
+    ) -> float:
+        """Fits the hyperparameters to other readings, from those that it has; kernel and noise stay.
+
+        With ``held``, to readings of these rows given all others too. The fit before is their prior, with
+        ``DEVIATIONS``, since few readings alone would overfit.
+
+        Returns:
+            Least negative log posterior of the last of these fits.
+        """
         self.places, self.receivers = places, receivers
-        asked, around = self._held_out(torch.arange(len(values)), folds, most)
-        choice = Choice(*self.choice.tolist())
-        _, self.logarithms, choice = self._maximise(values, asked, around, choice, self.logarithms, has_deviations=True)
-        self.choice = torch.tensor(choice, dtype=torch.float64)
+        rows, prior, cost = torch.arange(len(values)), None, 0.0
+        parts = [(rows, folds)] if held is None else [(rows, folds), (held, torch.isin(rows, held).long())]
+        for asked, apart in parts:
+            choice = Choice(*self.choice.tolist())
+            cost, self.logarithms, choice = self._maximise(
+                values, *self._held_out(asked, apart, most), choice, self.logarithms, has_deviations=True, prior=prior
+            )
+            self.choice, prior = torch.tensor(choice, dtype=torch.float64), self.logarithms.mean(0)
+        return cost
 
     def solve(self, places: Float[Tensor, "k d"], receivers: Int[Tensor, " k"], values: Float[Tensor, " k"]) -> None:
         """Takes known residuals, whose process ``fit`` has found."""
@@ -226,6 +236,7 @@ class ScalarProcess(nn.Module):
         choice: Choice,
         start: Float[Tensor, "r 3"] | None = None,
         has_deviations: bool = False,
+        prior: Float[Tensor, " 3"] | None = None,
     ) -> tuple[float, Float[Tensor, "r 3"], Choice]:
         """Least negative log likelihood of the held-out readings, and the hyperparameters that have it."""
         count, scene, size = len(self.logarithms), self.scene, values.square().mean().sqrt().item()
@@ -252,6 +263,8 @@ class ScalarProcess(nn.Module):
                 means, variances = conditional(between, heard, noises[:, None] * factors)
                 total = -log_density(values[asked] - means, variances, noises, made.degrees).sum()
                 total = total + leaf[shared:].square().sum() / 2
+                if prior is not None:
+                    total = total + ((leaf[:3] - prior) / spread).square().sum() / 2
                 (gradient,) = torch.autograd.grad(total, leaf)
             return total.item(), gradient.numpy()
 

@@ -109,7 +109,7 @@ class GaussianProcess(Model):
         residuals = [(links.labels[index] - trend(Batch(query)).value).double() for trend in self.trends]
         known, folds = (coordinates(self.scene, query, 1.0), query.receivers), folds_of(links, index)
         if chooses:
-            self.chosen = process.fit(*known, residuals, folds, torch.arange(len(index)))
+            self.chosen = process.fit(*known, residuals, folds)
         else:
             process.refit(*known, residuals[self.chosen], folds)
         process.solve(*known, residuals[self.chosen])

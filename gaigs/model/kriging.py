@@ -4,7 +4,6 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,13 +44,15 @@ class Kriging(Model):
 
     The trend is a trained model. The fallback is a model that is fitted at once. z is the mean of a Gaussian process
     over places, as in ``gaigs.model.gaussian_process``, and 0 far from all known links. With a trend weight of 0 and a
-    weight of 1 this is that process.
+    weight of 1 this is that process, but for the hyperparameters of labels of one real number.
 
     Trend weight, length and nugget maximise the likelihood of the validation links given the training links around
     them. The weight is the one with which the validation links, predicted from the training links, score best: the
     likelihood alone would trust kriging too far where cubes of space are held out.
 
     Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` as z, with hyperparameters of each receiver.
+    Their trend weight is the mean of the candidates, each as likely as it makes the validation links, with all readings
+    of a place as one: without such links a half. Their weight is 1.
 
     Of a trend whose paths have ``margins``, strengths are kriged path by path, and phases stay those of the geometry.
 
@@ -123,12 +124,13 @@ class Kriging(Model):
         validation_model.to(self.weight.device)
         if len(split.validation):
             labels, trend = links.labels[split.validation], values[len(split.train) :]
-            kriged = predicted(validation_model, links, split.validation)
-            task, sign = links.task, 1 if links.task.higher_is_better else -1
-            score = lambda weight: task.scores(labels, blend(task, kriged, trend, weight))[task.monitor].mean().item()
-            best = max(WEIGHTS, key=lambda weight: sign * score(weight))
-            self.weight.fill_(best)
-            validation_model.weight.fill_(best)
+            if not self.is_scalar:
+                kriged = predicted(validation_model, links, split.validation)
+                task, sign = links.task, 1 if links.task.higher_is_better else -1
+                score = lambda weight: task.scores(labels, blend(task, kriged, trend, weight))[task.monitor].mean()
+                best = max(WEIGHTS, key=lambda weight: sign * score(weight).item())
+                self.weight.fill_(best)
+                validation_model.weight.fill_(best)
             if is_final:
                 self._is_learnt(links, trend, validation_model.fallback)
         if is_final:
@@ -256,15 +258,24 @@ class Kriging(Model):
         if self.is_scalar:
             query = links.query[index]
             left = [torch.cat(residuals[trend_weight]).flatten().double() for trend_weight in WEIGHTS]
-            fit = partial(self.process.cpu().fit, coordinates(self.scene, query, 1.0), query.receivers)
-            every = folds_of(links, index), torch.arange(len(index))
+            readings, folds = (coordinates(self.scene, query, 1.0), query.receivers), folds_of(links, index)
+            self.process.cpu().fit(*readings, left[-1:], folds)
             # Training links' own residuals are too small, as the trend was trained on them: validation links decide.
-            is_held = every[1] >= len(links.split.train)
-            enough = is_held.sum() >= FEWEST
-            best = WEIGHTS[fit(left, *((is_held.long(), every[1][is_held]) if enough else every))]
-            if enough and best == 0:
-                fit(left[-1:], *every)
-            self.trend_weight.fill_(best)
+            held = torch.arange(len(links.split.train), len(index)) if len(links.split.validation) else None
+            start = self.process.logarithms, self.process.choice
+
+            def refit(values: Tensor) -> float:
+                self.process.logarithms, self.process.choice = start
+                return self.process.refit(*readings, values, folds, held)
+
+            shares = torch.full((len(WEIGHTS),), 1 / len(WEIGHTS), dtype=torch.float64)
+            if held is not None:
+                # Readings at one place err together: they count as one.
+                each = len(held) / len(query.transmitters[held].unique(dim=0))
+                costs = torch.tensor([refit(values) for values in left], dtype=torch.float64)
+                shares = torch.softmax(-costs.clamp_min(-1e300) / each, 0)  # -inf if a trend explains all
+            refit(shares @ torch.stack(left))
+            self.trend_weight.fill_(shares @ torch.tensor(WEIGHTS, dtype=torch.float64))
             return
 
         def fitted(trend_weight: float, **options: int) -> tuple[Hyperparameters, float]:
