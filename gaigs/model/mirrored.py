@@ -101,7 +101,9 @@ class MirroredSplatting(GaussianSplatting):
             if search.receivers:
                 self._find_planes(search)
         if searches and isinstance(self.pooling, PathRssi):
-            self.levels = LevelSearch(links, carriers(self.scene, links.query), self._start(), self.scene.bandwidth)
+            trend = 0 * links.labels if self.trend is None else self.trend(Batch(links.query)).value
+            own = trend, self._start(), self.placement.used.tolist(), self.placement.order
+            self.levels = LevelSearch(links, carriers(self.scene, links.query), *own)
         if not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling)) or self.trend is not None:
             return
         train, sign, frequencies = links.split.train, int(self.pooling.sign), task.frequencies

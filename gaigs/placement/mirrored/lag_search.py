@@ -61,6 +61,9 @@ STRANGE = 0.01
 """Share of a spectrum that its array cannot explain, from which on the search is left out. Measured spectra have 0.001,
 powers in place of amplitudes 0.05."""
 
+PAIRS = 16
+"""Most pairs of a receiver and a carrier: each costs a periodogram."""
+
 TILE = 0.025
 """Half the width of a tile of the periodogram [rad]: over some metres, lengths are linear within it."""
 
@@ -355,8 +358,10 @@ class LagSearch:
         self.middle = (points.amin(0) + points.amax(0)) / 2  # about which single precision suffices
         self.points = points - self.middle
         self.diagonal = float((points.amax(0) - points.amin(0)).norm())
-        pairs = [(number, carrier) for number in used.tolist() for carrier in frequencies[train].unique().tolist()]
+        heard = torch.stack((query.receivers[train].double(), frequencies[train].double()), 1).unique(dim=0)
+        pairs = heard[torch.linspace(0, len(heard) - 1, min(len(heard), PAIRS)).round().long()].tolist()
         for number, carrier in pairs:
+            number = int(number)
             own, receiver = (
                 train[(query.receivers[train] == number) & (frequencies[train] == carrier)],
                 links.receivers[number],

@@ -56,10 +56,12 @@ class LevelSearch(LagSearch):
     located planes interfere; the others add as powers, because a wrong phase would be worse than none.
 
     Args:
-        links: Their training links count; of the task ``rssi``.
+        links: Their training links count; of the task ``rssi``. Readings at one place count as one.
         frequencies: Carrier of each link [Hz].
+        trend: Levels on which the paths' powers stand [dB].
         planes: Normals and offsets at the start (w, 4) [m]. Each is searched near its start.
-        bandwidth: Over which powers are averaged [Hz]; None if unknown.
+        numbers: Of these planes in the placement.
+        order: As of ``LagSearch``.
         most: Links that count, of all receivers together.
 
     Source: ours.
@@ -69,17 +71,24 @@ class LevelSearch(LagSearch):
         self,
         links: Links,
         frequencies: Float[Tensor, " n"],
+        trend: Float[Tensor, " n"],
         planes: Float[Tensor, "w 4"],
-        bandwidth: float | None,
+        numbers: list[int],
+        order: int,
         most: int = 1500,
     ):
-        self.order, self.known = 2, bandwidth
+        self.order, self.numbers, self.known = min(order, 2), numbers, links.scene.bandwidth
         self.queries: list[Query] = []
         for own, carrier, pose, receiver in self.parts(links, frequencies, most):
-            powers = 10 ** ((links.labels[own] - links.labels[own].median()) / 10)
-            places, lags = links.query.transmitters[own] - self.middle, powers[:, None].to(torch.complex64)
-            self.receivers.append(ReceiverLevels(places, lags, carrier, pose, receiver.array))
-            self.queries.append(links.query[own])
+            places, which = links.query.transmitters[own].unique(dim=0, return_inverse=True)
+            values = (links.labels - trend)[own]
+            levels = values.new_zeros(len(places)).index_add(0, which, values) / which.bincount()
+            powers = 10 ** ((levels - levels.median()) / 10)
+            point = replace(receiver.array, elements=receiver.array.elements.new_zeros(1, 3))
+            lags = powers[:, None].to(torch.complex64)
+            self.receivers.append(ReceiverLevels(places - self.middle, lags, carrier, pose, point))
+            first = own.new_zeros(len(places)).index_copy(0, which.flip(0), own.flip(0))
+            self.queries.append(links.query[first])
         self.start = torch.cat((planes[:, :3], (planes[:, 3] - planes[:, :3] @ self.middle)[:, None]), 1)
 
     @torch.no_grad()
@@ -87,10 +96,10 @@ class LevelSearch(LagSearch):
         """Puts planes where they are clear, and lets paths at them interfere; the result are their numbers."""
         found: list[int] = []
         least = 0.0
-        shift = placement.middle.cpu() - self.middle
-        while left := [k for k in range(len(self.start)) if not placement.located[k]]:
-            located = placement.located[: len(self.start)].cpu()
-            own = torch.cat((placement.normals, placement.offsets[:, None]), 1)[: len(self.start)].cpu().float()
+        shift = placement.middle.cpu().float() - self.middle
+        while left := [k for k, number in enumerate(self.numbers) if not placement.located[number]]:
+            located = placement.located[self.numbers].cpu()
+            own = torch.cat((placement.normals, placement.offsets[:, None]), 1)[self.numbers].cpu().float()
             own[:, 3] += own[:, :3] @ shift
             planes = torch.where(located[:, None], own, self.start)
             passing = self.passing(placement, planes)
@@ -108,21 +117,25 @@ class LevelSearch(LagSearch):
             if is_unknown:
                 placement.log_bandwidth.fill_(math.log(self.bandwidth))
             plane = plane.to(placement.origin)
-            placement.place(k, plane[:3], float(plane[3] - plane[:3] @ shift.to(plane)))
-            placement.locate(k)
-            found.append(k)
+            placement.place(self.numbers[k], plane[:3], float(plane[3] - plane[:3] @ shift.to(plane)))
+            placement.locate(self.numbers[k])
+            found.append(self.numbers[k])
             world = float(plane[3] + plane[:3] @ self.middle.to(plane))
             log.info("plane (%.2f, %.2f, %.2f) at %.2f m, by %.1f standard errors", *plane[:3].tolist(), world, gain)
         return found
 
     def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:
-        """Field of the direct path and of that at each plane in a model, over what this search expects."""
+        """Field of the direct path and of that at each plane in a model, over what this search expects; at most 1.
+
+        Near Brewster's angle the search expects next to nothing, which another plane would multiply.
+        """
         parts = []
         for receiver, query in zip(self.receivers, self.queries, strict=True):
             expected = reflection(planes[:, :3], receiver.single(planes)[3].abs()).abs()
             expected = torch.cat((torch.ones_like(expected[:, :1]), expected), 1)
-            own = placement.passing(query.to(placement.origin.device), len(planes)).cpu().float()
-            parts.append(torch.where((own > 0) & (expected > 0), own / expected, 1))
+            own = placement.passing(query.to(placement.origin.device)).cpu().float()
+            own = own[:, [0, *(number + 1 for number in self.numbers)]]
+            parts.append(torch.where(own > 0, own / expected.clamp_min(1e-6), 1).clamp_max(1))
         return torch.cat(parts)
 
     def by_chance(

@@ -38,9 +38,9 @@ PERMITTIVITY, CONDUCTIVITY = 4.0, 0.3
 MOST = 100_000
 """Largest number of sequences of planes: of 10 planes those of order 5."""
 
-KNOWN, UNKNOWN = math.log(0.3), math.log(20.0)
+KNOWN, UNKNOWN = math.log(0.3), math.log(50.0)
 """Logarithm of the standard deviation of a path's phase [rad]: of a known one at the start, and of a path that adds as
-power, whose coherence is 0 in single precision."""
+power, whose coherence is 0."""
 
 FAINT = 1e-3
 """Largest share of a link's power, obstacles apart, of a path that skips the obstacles: two of three paths."""
@@ -73,7 +73,7 @@ class Mirrored(Placement):
     Args:
         scene: Its box and receivers give the first planes.
         channels: Of the signal, 1 (amplitude) or 2 (complex).
-        planes: Largest number of planes; six at the start, the search finds the others, and all planes of channels.
+        planes: Largest number of planes; six at the start; the searches of spectra and channels find others.
         order: Largest number of reflections of a path; at most ``MOST`` sequences of planes.
         obstacles: Number of Gaussians of matter in the room; 0 for none.
         walls: File whose largest planes are the first ones: a floor plan ``.csv`` of consecutive vertices x,y [m], or a
@@ -187,6 +187,7 @@ class Mirrored(Placement):
         for plane, (*normal, offset) in enumerate(planes):
             self.place(plane, torch.stack(normal), (offset - torch.stack(normal) @ self.middle).item())
         self.kept.copy_(self.sequences_of(torch.arange(len(planes), device=self.kept.device)))
+        self.most.copy_(self.kept.sum())
 
     @property
     def normals(self) -> Float[Tensor, "w 3"]:
@@ -349,15 +350,15 @@ class Mirrored(Placement):
         paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
         return depths.flatten().index_add(0, paths.flatten()[legs], obstacles(*ends)).view(count, n)
 
-    def passing(self, query: Query, planes: int) -> Float[Tensor, "b v"]:
-        """Field over free space of the direct path, then of that at each of the first planes; 0 for no path."""
+    def passing(self, query: Query) -> Float[Tensor, "b v"]:
+        """Field over free space of the direct path, then of that at each plane; 0 for no path."""
         sequences = self.sequences[self.kept]
         seen = images(query.transmitters - self.middle, sequences, self.normals, self.offsets)
         receivers = (self.scene.positions(query.transmitters) - self.middle)[query.receivers]
         strengths = self.strengths(query, fold(seen, receivers, sequences, self.normals, self.offsets)).abs()
         few = (sequences >= 0).sum(1) <= 1
-        found = strengths.new_zeros(len(query), planes + 1)
-        found[:, (sequences[few].amax(1) if self.order else 0) + 1] = strengths[:, few]
+        found = strengths.new_zeros(len(query), len(self.origin) + 1)
+        found[:, sequences[few].amax(1) + 1] = strengths[:, few]
         return found / self.receiver_gains[query.receivers, None].exp()
 
     def margins(self, query: Query) -> Complex[Tensor, "b n"]:

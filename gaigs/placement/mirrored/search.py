@@ -20,7 +20,7 @@ Loss = Callable[[Batch], float]
 """Loss of the model as it stands, on a batch."""
 
 
-def thinned(batch: Batch, rows: int = 12) -> Batch:
+def thinned(batch: Batch, rows: int) -> Batch:
     """A batch with about ``rows`` of its labels' rows, and columns in proportion."""
     labels, directions = batch.labels, batch.directions
     if isinstance(directions, Grid):
@@ -38,14 +38,14 @@ def move_planes(model, batch: Batch, wavelength: float, least: float) -> list[fl
     """
     placement: Mirrored = model.placement
     placement.enable_phases(wavelength)  # adds the steps so far to the planes
-    some, reach = thinned(batch), max(4.0 * wavelength, min(least, WIDEST * wavelength))
+    some, reach = thinned(batch, 12), max(4.0 * wavelength, min(least, WIDEST * wavelength))
     if least > reach:  # steps cannot be coarser than a fraction of the wavelength
         log.info("planes are searched within %.3g m, not %.3g m; placement.walls can start nearer", reach, least)
     planes = by_strength(placement, batch)
     return [_move(model, plane, reach, wavelength, some, model.takes_paths) for plane in planes]
 
 
-def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, square: bool = False) -> float:
+def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, square: bool) -> float:
     """Moves a plane along its normal, or along one of ``square_normals``, to the least error; returns the move [m]."""
     placement: Mirrored = model.placement
     origin = placement.origin[plane]
@@ -96,7 +96,6 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss) -> str:
 
     def is_good(kept: Bool[Tensor, " n"]) -> bool:
         placement.kept.copy_(kept)
-        # A tenth of the gain that adds a plane.
         return all(loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True))
 
     best = placement.kept.clone()
