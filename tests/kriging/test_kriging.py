@@ -263,9 +263,9 @@ def test_links_that_the_trend_overfits_do_not_choose_the_trend_weight(monkeypatc
 
 
 def test_where_kriging_does_harm_its_weight_is_zero(half):
-    links = make("rssi", smooth=3.0, trained=1.0)
+    links = make("spectrum", smooth=3.0, trained=1.0)
     train = links.split.train
-    links.labels[train] += 100 * torch.randn(len(train), generator=torch.Generator().manual_seed(3))
+    links.labels[train] += 100 * torch.randn(links.labels[train].shape, generator=torch.Generator().manual_seed(3))
     model = Kriging(links.scene, Trained(links.scene))
     validation_model = model.krige(links)
     assert model.weight == validation_model.weight == 0

@@ -19,7 +19,7 @@ from gaigs.query import Query
 from gaigs.testing import example_links
 
 WALLS = torch.tensor([(1.0, 0, 0, 6.5), (0, 1.0, 0, -0.4), (-1.0, 0, 0, 0.5)])
-PLACES, CARRIER, BANDWIDTH = 200, 2.4e9, 8e7
+PLACES, CARRIER, BANDWIDTH = 300, 2.4e9, 8e7
 
 
 def levels(places, position):
