@@ -36,7 +36,6 @@ SMALL = (
     "trainer.max_steps=40",
     "trainer.val_check_interval=15",
     "trainer.log_every_n_steps=2",
-    "save_every=0",
     "baselines=[{name: mean}, {name: knn, k: 3, power: 2.0}]",
 )
 
@@ -87,7 +86,7 @@ def test_a_run_folder(uninterrupted):
 
 
 def test_a_killed_run_ends_as_if_it_had_not_been(uninterrupted, run, tmp_path):
-    process, last = start(tmp_path, "hydra.run.dir=run"), tmp_path / "run/last.ckpt"
+    process, last = start(tmp_path, "save_every=0", "hydra.run.dir=run"), tmp_path / "run/last.ckpt"
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline and process.poll() is None:
         if last.exists() and torch.load(last, weights_only=True)["global_step"] >= 6:

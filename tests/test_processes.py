@@ -46,8 +46,8 @@ def wait_for(process, found):
 def test_two_processes_train_as_one_though_they_are_stopped(tmp_path, monkeypatch):
     """40 steps in float64, with batches of odd sizes; SIGTERM to the first process alone."""
     folder = tmp_path / "two"
-    command = (folder, "trainer.devices=2", "trainer.strategy=ddp", "save_every=0", f"hydra.run.dir={folder}")
-    process = start(*command)
+    command = (folder, "trainer.devices=2", "trainer.strategy=ddp", f"hydra.run.dir={folder}")
+    process = start(*command, "save_every=0")
     wait_for(process, (folder / "last.ckpt").is_file)
     with pytest.raises(ValueError, match=r"another run is at work in .*two"), processes.only_run(folder):
         pass
