@@ -485,8 +485,8 @@ def test_rssi_from_end_to_end(tmp_path):
 
 
 def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path, monkeypatch):
-    """Whatever the steps do: here they drive all apart. The start, all faces, is looked at before the first revision."""
-    faces = torch.tensor([[*normal, offset] for normal, far in zip(torch.eye(3), (7, 5, 3)) for offset in (0, far)])
+    """Whatever the steps do: here they drive all apart. The start is looked at before the first revision."""
+    faces = torch.cat([torch.cat((torch.eye(3), torch.tensor(at)[:, None]), 1) for at in ([0.0] * 3, [7.0, 5.0, 3.0])])
     monkeypatch.setattr("gaigs.model.mirrored.ChannelSearch.run", lambda _: (faces.double(), SLABS[:6]))
     options = (
         "+experiment=mirrored_csi", "data.transmitters=30", "data.order=1", "split.validation=0.5", "kriging=false",
