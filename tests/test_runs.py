@@ -21,7 +21,6 @@ from gaigs import configuration, runs
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.geometry import Pose
-from gaigs.placement.mirrored.channel_search import SLABS
 from gaigs.processes import Stopped, stopping
 from gaigs.radio_maps import RadioMap
 from gaigs.report.curves import read_curves
@@ -484,10 +483,8 @@ def test_rssi_from_end_to_end(tmp_path):
     assert floor.values[1, 2, 3] == pytest.approx(model.predict(point, "south").item(), abs=1e-3)
 
 
-def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path, monkeypatch):
+def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path):
     """Whatever the steps do: here they drive all apart. The start is looked at before the first revision."""
-    faces = torch.cat([torch.cat((torch.eye(3), torch.tensor(at)[:, None]), 1) for at in ([0.0] * 3, [7.0, 5.0, 3.0])])
-    monkeypatch.setattr("gaigs.model.mirrored.ChannelSearch.run", lambda _: (faces.double(), SLABS[:6]))
     options = (
         "+experiment=mirrored_csi", "data.transmitters=30", "data.order=1", "split.validation=0.5", "kriging=false",
         "baselines=[{name: friis}]", "trainer.max_steps=6", "trainer.val_check_interval=3", *SMALL[9:11],
