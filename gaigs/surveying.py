@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gaigs.geometry import even_places
 from gaigs.io.files import write_text
-from gaigs.kriging.kernel import LIMIT, Process
+from gaigs.kriging.kernel import LIMIT, Process, kernel
 from gaigs.kriging.links import coordinates, distances, evenly
 from gaigs.kriging.scalar import is_scalar
 from gaigs.model import Model, call_optional
@@ -39,6 +39,9 @@ COMPARED = 1500
 TOLERATED = 1.05
 """Largest rise of the mean error for which known places count as superfluous together."""
 
+LENGTH, NUGGET = 0.25, 0.6
+"""Correlation length over the region's diagonal and nugget of the process that stands in for a model."""
+
 
 @dataclass(frozen=True)
 class SurveyPlan:
@@ -47,7 +50,7 @@ class SurveyPlan:
     Attributes:
         places: To measure, the most useful first (n, 3) [m].
         errors: Expected mean absolute error of a label over the region and all receivers, before and after each place,
-            in the label's unit (n + 1,).
+            in the label's unit (n + 1,); None without a model.
         known: Places that were measured (k, 3) [m].
         losses: Rise of the mean error if one of them had been left out (k,).
         superfluous: Known places that together raise the error by at most 5 % if left out (k,).
@@ -60,13 +63,15 @@ class SurveyPlan:
     """
 
     places: Float[Tensor, "n 3"]
-    errors: Float[Tensor, " n1"]
+    errors: Float[Tensor, " n1"] | None
     known: Float[Tensor, "k 3"]
     losses: Float[Tensor, " k"]
     superfluous: Bool[Tensor, " k"]
     unit: str = ""
 
     def __str__(self) -> str:
+        if self.errors is None:
+            return f"{len(self.places)} places to measure first; their error is unknown without labels"
         first, last = (f"{error:.3g}" for error in (self.errors[0], self.errors[-1]))
         few = int(self.superfluous.sum())
         words = (
@@ -75,12 +80,18 @@ class SurveyPlan:
         return f"{words}; {few} of {len(self.known)} measured places could have been left out for 5 % more"
 
     def save(self, path: str | Path) -> None:
-        """Writes a CSV table: places to measure, each with the error after it, then measured ones to leave out."""
+        """Writes a CSV table: places to measure, each with the error after it, then measured ones to leave out.
+
+        Without a model errors are empty.
+        """
         table = io.StringIO()
         rows = csv.writer(table, lineterminator="\n")
         rows.writerow(["use", "x", "y", "z", "mean_error"])
-        for place, error in zip(self.places.tolist(), self.errors[1:].tolist(), strict=True):
-            rows.writerow(["measure", *(f"{x:.3f}" for x in place), f"{error:.4g}"])
+        words = [""] * len(self.places)
+        if self.errors is not None:
+            words = [f"{error:.4g}" for error in self.errors[1:].tolist()]
+        for place, word in zip(self.places.tolist(), words, strict=True):
+            rows.writerow(["measure", *(f"{x:.3f}" for x in place), word])
         for place, loss in zip(
             self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist(), strict=True
         ):
@@ -90,7 +101,7 @@ class SurveyPlan:
 
 @torch.no_grad()
 def survey(
-    model: Model,
+    model: Model | None = None,
     region: object = None,
     count: int = 20,
     candidates: object = None,
@@ -99,20 +110,26 @@ def survey(
     """The next places to measure: each lowers the mean variance over a region most, at all receivers together.
 
     Labels do not enter beyond the fitted process, so a plan is made before anything is measured. The largest variance
-    would be a poor guide: it is in the corners.
+    would be a poor guide: it is in the corners. The first places of a longer plan are those of a shorter one.
 
     Args:
-        model: ``gaussian_process``, or a trained model with kriging.
+        model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet, and a default
+            process takes its place.
         region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the error is stated; None: the
             candidates or, without these, the box of the training transmitters.
         count: Number of places; at most as many as there are candidates.
         candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
-        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
+        frequency: Carrier [Hz]; None: that of the training links, of several the middle one. Without a model it has no
+            effect.
 
     Raises:
-        ValueError: The model has no process over places, the count is less than 1, or a place is impossible.
+        ValueError: The model has no process over places, the count is less than 1, a place is impossible, or there is
+            neither model nor region nor candidates.
 
     Example:
+        >>> first = gaigs.survey(region=[[0, 0, 1], [6, 4, 1]], count=15)  # nothing is measured yet
+        >>> first.places.shape, first.errors
+        (torch.Size([15, 3]), None)
         >>> model = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=60))
         >>> plan = gaigs.survey(model, count=5)
         >>> plan.places.shape, bool(plan.errors[-1] < plan.errors[0])
@@ -122,36 +139,44 @@ def survey(
     Source: Krause, Singh and Guestrin, Near-optimal sensor placements in Gaussian processes, 2008; the criterion is the
     A-optimal one of Cohn, Neural network exploration using optimal experiment design, 1996.
     """
-    check_type("model", model, Model)
+    check_type("model", model, Model | None)
     check_type("count", count, int)
-    scene = model.scene
-    found = [call_optional(model, "process_at", receiver) for receiver in range(len(scene.receivers))]
-    processes: list[Process] = [process for process in found if process is not None]
-    if not processes:
-        raise ValueError(
-            "a survey takes a process over places; take model=gaussian_process, or kriging=true for RSSI or spectra"
-        )
     if count < 1:
         raise ValueError(f"count must be at least 1 place, got {count}")
-    box = torch.stack((scene.lower, scene.upper)) if region is None else as_positions("region", region).reshape(-1, 3)
-    if len(box) != 2:
-        raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points")
-    even = even_places(box[0], box[1], POINTS)
-    places = even if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
-    beside = even[:0] if candidates is None or region is None else even
-    most = int((MEMORY / 8 / len(processes)) ** 0.5)
+    places = None if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
+    beside = torch.zeros(0, 3)
+    if region is not None or places is None:
+        if region is not None:
+            box = as_positions("region", region).reshape(-1, 3)
+        elif model is not None:
+            box = torch.stack((model.scene.lower, model.scene.upper))
+        else:
+            raise ValueError(
+                "a survey without a model takes a region or candidates, got neither\n"
+                "give one (survey.region=...), or a trained model (folder=runs/...)"
+            )
+        if len(box) != 2:
+            raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points")
+        even = even_places(box[0], box[1], POINTS)
+        places, beside = (even, beside) if places is None else (places, even)
+    points, stated = torch.cat((places, beside)), slice(len(places) if len(beside) else 0, None)
+    processes = [] if model is None else processes_of(model)
+    most = int((MEMORY / 8 / max(1, len(processes))) ** 0.5)
     if not 0 < len(places) <= most:
         raise ValueError(f"a survey takes 1 to {most} candidates, got {len(places)}; leave some out")
-    if frequency is None and len(scene.frequencies):
-        frequency = float(scene.frequencies[len(scene.frequencies) // 2])
-    points, names = torch.cat((places, beside)), [receiver.name for receiver in scene.receivers]
-    query, _ = Query.from_positions(points, 0, frequency, names, scene.frequencies)
-    asked = coordinates(scene, query, 1.0)
-    asked = asked.to(processes[0].places)
-    centres = scene.positions(asked) if is_scalar(scene) else [None] * len(processes)
-    processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
-    stated = slice(len(places) if len(beside) else 0, None)
-    factor = 1.0 if model.calibration is None else model.calibration.sizes.square().mean().sqrt().item()
+    if model is None:
+        asked, factor = points.double(), 1.0
+        processes = [default_process(asked[stated])]
+    else:
+        scene = model.scene
+        if frequency is None and len(scene.frequencies):
+            frequency = float(scene.frequencies[len(scene.frequencies) // 2])
+        names = [receiver.name for receiver in scene.receivers]
+        query, _ = Query.from_positions(points, 0, frequency, names, scene.frequencies)
+        asked = coordinates(scene, query, 1.0).to(processes[0].places)
+        centres = scene.positions(asked) if is_scalar(scene) else [None] * len(processes)
+        processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
+        factor = 1.0 if model.calibration is None else model.calibration.sizes.square().mean().sqrt().item()
     posteriors = [posterior(process, asked) for process in processes]
     noises = [process.noise for process in processes]
 
@@ -172,16 +197,17 @@ def survey(
         for part, noise in zip(posteriors, noises, strict=True):
             part -= torch.outer(part[best], part[best]) / (part[best, best] + noise)
         errors.append(error(posteriors))
+    if model is None:
+        return SurveyPlan(places[chosen], None, places[:0], places[:0, 0], torch.zeros(0, dtype=torch.bool))
     known, losses, superfluous = without(processes, asked[stated], MEAN * factor)
-    unit = getattr(scene.task, "error_unit", scene.task.unit)
+    unit = getattr(model.scene.task, "error_unit", model.scene.task.unit)
     return SurveyPlan(places[chosen], torch.tensor(errors), known, losses, superfluous, unit)
 
 
 def run(config: dict, folder: Path) -> None:
-    """Plans a survey by the model of a finished run; writes ``survey.csv`` and ``survey.png`` into a folder."""
-    if config["folder"] is None:
-        raise ValueError("command=survey needs the folder of a finished run; add folder=runs/...")
-    plan = call("survey", survey, config["survey"], model=model_of(config["folder"]))
+    """Plans a survey, by the model of a finished run if given; writes ``survey.csv`` and ``survey.png``."""
+    model = None if config["folder"] is None else model_of(config["folder"])
+    plan = call("survey", survey, config["survey"], model=model)
     folder.mkdir(parents=True, exist_ok=True)
     plan.save(folder / "survey.csv")
     style.save(figure(plan), folder / "survey.png")
@@ -190,15 +216,16 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(plan: SurveyPlan) -> Figure:
-    """Places from above, and the expected error after each new one."""
+    """Places from above and, with a model, the expected error after each new one."""
     with rc_context(style.STYLE):
         drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
-        left, right = drawn.subplots(1, 2)
+        (left, *right) = drawn.subplots(1, 1 if plan.errors is None else 2, squeeze=False)[0]
         for rows, look, words in (
             (~plan.superfluous, {"color": style.GREY}, "measured"),
             (plan.superfluous, {"markeredgecolor": style.GREY, "color": "none"}, "measured, could be left out"),
         ):
-            left.plot(*plan.known[rows, :2].T.numpy(), "o", markersize=3, label=words, **look)
+            if len(plan.known):
+                left.plot(*plan.known[rows, :2].T.numpy(), "o", markersize=3, label=words, **look)
         left.plot(
             *plan.places[:, :2].T.numpy(), "o", markersize=8, color=style.ORANGE, label="to measure, in this order"
         )
@@ -206,14 +233,31 @@ def figure(plan: SurveyPlan) -> Figure:
             left.annotate(str(number), place[:2], ha="center", va="center", color="white", size=5)
         left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         drawn.legend(loc="outside lower left", ncols=3)
-        right.plot(range(len(plan.errors)), plan.errors.numpy(), color=style.BLUE)
-        right.set(
-            xlabel="new places", ylabel=f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
-        )
-        right.xaxis.get_major_locator().set_params(integer=True)
-        right.grid()
-        right.set_axisbelow(True)
+        label = f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
+        for axis in right:
+            axis.plot(plan.errors.numpy(), color=style.BLUE)
+            axis.set(xlabel="new places", ylabel=label)
+            axis.xaxis.get_major_locator().set_params(integer=True)
+            axis.grid()
+            axis.set_axisbelow(True)
     return drawn
+
+
+def processes_of(model: Model) -> list[Process]:
+    """The processes of a model's receivers; raises a ``ValueError`` for a model without."""
+    found = [call_optional(model, "process_at", receiver) for receiver in range(len(model.scene.receivers))]
+    processes = [process for process in found if process is not None]
+    if not processes:
+        raise ValueError(
+            "a survey takes a process over places; take model=gaussian_process, or kriging=true for RSSI or spectra"
+        )
+    return processes
+
+
+def default_process(region: Float[Tensor, "g 3"]) -> Process:
+    """A process without readings and with an unknown constant: its places spread evenly over the region."""
+    length = LENGTH * (region.amax(0) - region.amin(0)).norm()
+    return Process(lambda a, b: 100 + kernel(a, b, length), region[:0], region[:0, 0], NUGGET)
 
 
 def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process:

@@ -102,6 +102,14 @@ def test_planned_places_are_worth_more_than_random_ones():
     assert planned > random + 0.01
 
 
+def test_first_places_lie_nearer_to_the_region_than_random_ones():
+    candidates = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([8.0, 5.0, 0.5])
+    apart = lambda places: torch.cdist(candidates, places).amin(1).mean()
+    plan = gaigs.survey(candidates=candidates, count=20)
+    assert apart(plan.places) < 0.9 * min(apart(candidates[20 * k : 20 * k + 20]) for k in range(20))
+    assert torch.equal(gaigs.survey(candidates=candidates, count=8).places, plan.places[:8])
+
+
 def test_places_that_the_trend_needs_are_not_superfluous():
     rng = torch.Generator().manual_seed(0)
     places, gateway = 8 * torch.rand(50, 3, generator=rng), torch.tensor([0.0, 0.0, 2.0])
@@ -143,5 +151,14 @@ def test_the_command_plans_by_a_finished_run(tmp_path, capsys):
     assert "2 more places bring" in capsys.readouterr().out
     with pytest.raises(FileNotFoundError, match="holds no run"):
         gaigs.run(gaigs.compose("command=survey", f"folder={tmp_path}"), tmp_path / "plan")
-    with pytest.raises(ValueError, match="needs the folder of a finished run"):
+    with pytest.raises(ValueError, match="takes a region or candidates, got neither"):
         gaigs.run(gaigs.compose("command=survey"), tmp_path / "plan")
+
+
+def test_the_command_plans_before_anything_is_measured(tmp_path, capsys):
+    gaigs.run(gaigs.compose("command=survey", "survey.region=[[0,0,1],[6,4,1]]", "survey.count=3"), tmp_path)
+    assert (tmp_path / "survey.png").is_file()
+    lines = (tmp_path / "survey.csv").read_text().splitlines()
+    assert len(lines) == 4
+    assert all(line.startswith("measure,") and line.endswith(",") for line in lines[1:])
+    assert "their error is unknown without labels" in capsys.readouterr().out
