@@ -108,7 +108,7 @@ def fit_hyperparameters(
         axes = [low + (high - low) * np.array([1, 3, 5]) / 6 for low, high in bounds]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(bounds))
         start = min(grid, key=lambda point: value(torch.from_numpy(point)).item())
-        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds)
+        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-6})
         best, least = found.x, float(found.fun)
     return Hyperparameters(*np.exp(best).tolist()), least
 
