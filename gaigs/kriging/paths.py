@@ -14,14 +14,18 @@ from gaigs.kriging.kernel import kernel
 JITTER = 1e-6
 """Variance of the processes that is not shared by places, over their variance: for places that are measured twice."""
 
+LEAST = 1e-4
+"""Power of a link's noise over the link's, where the fit leaves nothing."""
+
 
 @dataclass(frozen=True)
 class Equations:
     """Knowledge of k links about the processes u of their n paths.
 
     The channel of a link is predicted as h + sum_i u_i m_i, with the field m_i of path i per unit of its process. With
-    the residual r, and noise of ``nugget`` times the mean power p of the label's numbers, the log likelihood is
-    -|r - sum_i u_i m_i|² / (nugget p): a quadratic form.
+    the residual r, and noise of ``nugget`` times p, the log likelihood is -|r - sum_i u_i m_i|² / (nugget p): a
+    quadratic form. p is the mean power of the residual's numbers, plus ``LEAST`` times that of the label's: links in
+    shadow have far larger residuals than others.
 
     Attributes:
         places: (k, 3) [m].
@@ -47,7 +51,8 @@ class Equations:
         for start in range(0, len(places), size):
             part = slice(start, start + size)
             fields = margins(part).flatten(2).to(torch.complex128)
-            powers = labels[part].abs().double().square().mean((1, 2))[:, None, None]
+            left, whole = (channels[part].abs().double().square().mean((1, 2)) for channels in (residuals, labels))
+            powers = (left + LEAST * whole)[:, None, None]
             grams.append(fields.conj() @ fields.mT / powers)
             sides.append((fields.conj() @ residuals[part].flatten(1)[..., None].to(fields) / powers)[..., 0])
         return cls(places.double(), torch.cat(grams), torch.cat(sides))
@@ -115,8 +120,8 @@ class PathField(nn.Module):
 
 def candidates(spacing: float) -> Iterator[Hyperparameters]:
     """Hyperparameters to choose from; strengths of paths change within a few distances of neighbouring places [m]."""
-    for reach, nugget, scale in itertools.product((0.5, 1.0, 2.0), (0.03, 0.3), (0.2, 0.6)):
-        yield Hyperparameters(reach * spacing, nugget, scale)
+    for reach, scale in itertools.product((0.5, 1.0, 2.0), (0.2, 0.6)):
+        yield Hyperparameters(reach * spacing, 1.0, scale)
 
 
 def conjugate_gradients(

@@ -140,8 +140,8 @@ class Kriging(Model):
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` for a trend of paths; hyperparameters are those with the largest sure gain on the validation links.
 
-        It is the rise of the mean score less its standard error. One with which the median falls does not count; if
-        none is left, or with fewer than ``FEWEST`` validation links, the weight is 0.
+        It is the rise of the mean score less 1.5 standard errors. If none is positive, or with fewer than ``FEWEST``
+        validation links, the weight is 0.
         """
         split, task, index = links.split, links.task, known(links)
         query, labels = links.query[index], links.labels[index]
@@ -168,8 +168,8 @@ class Kriging(Model):
                     kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), fields[row], 1)
             after = task.scores(labels[held], kriged)[task.monitor]
             gain = after - before if task.higher_is_better else before - after
-            sure = (gain.mean() - gain.std() / math.sqrt(len(gain))).item()
-            if sure > max(0, best[0]) and after.median() >= before.median():
+            sure = (gain.mean() - 1.5 * gain.std() / math.sqrt(len(gain))).item()
+            if sure > max(0, best[0]):
                 best = sure, process
         self.trend_weight.fill_(0)
         if len(held) == 0 or self._is_learnt(links, plain, validation_model.fallback, is_final):
@@ -203,24 +203,21 @@ class Kriging(Model):
     def deviations(self, batch: Batch) -> Tensor:
         """Standard deviations of the labels; of spectra means over their pixels.
 
-        Those of kriged paths are bounds below, of the default hyperparameters if validation chose no kriging.
+        Those of kriged paths are bounds below, without noise, of the default hyperparameters if validation chose no
+        kriging.
         """
         query, process = batch.query, Hyperparameters(*self.hyperparameters.tolist())
         if self.is_scalar:
             return self.process.deviations(coordinates(self.scene, query, 1.0), query.receivers)
         places = query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
-        if self.by_paths:
-            value = self(batch).value
-            found = process.nugget * value.abs().square().mean((1, 2), keepdim=True).expand(value.shape).clone()
-        else:
-            found = places.new_zeros(len(query))
+        found = places.new_zeros(len(query), *(self.scene.task.shape if self.by_paths else ()))
         trend: Any = self.trend
         for receiver in query.receivers.unique().tolist():
             own, field = query.receivers == receiver, self.fields[receiver]
             if self.by_paths:
                 variances = field.variances(places[own].double(), process)
                 squares = trend.margins(query[own]).abs().square()
-                found[own] = found[own] + (variances.to(squares)[..., None, None] * squares).sum(1)
+                found[own] = (variances.to(squares)[..., None, None] * squares).sum(1)
             else:
                 found[own] = field.deviations(places[own], process).square()
         return found.sqrt()

@@ -1,5 +1,6 @@
 """Kriged strengths of paths against dense solutions in numpy, and in a model of mirrored paths."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -32,9 +33,9 @@ def solved(places, fields, labels, residuals):
     return found
 
 
-def dense(places, asked, fields, labels):
+def dense(places, asked, fields, labels, residuals):
     """Covariances of the processes with the residuals, and of the residuals."""
-    n, powers = fields.shape[1], (np.abs(labels) ** 2).mean(1)
+    n, powers = fields.shape[1], (np.abs(residuals) ** 2).mean(1) + 1e-4 * (np.abs(labels) ** 2).mean(1)
     each = lambda a, b: np.kron(PROCESS.scale**2 * np.exp(-cdist(a, b) / PROCESS.length), np.eye(n))
     matrix = block_diag(*(part.T for part in fields))
     noise = np.diag(np.repeat(PROCESS.nugget * powers, labels.shape[1]))
@@ -45,9 +46,10 @@ def test_strengths_are_the_dense_solution():
     """Of more links than one part; two of them at one place."""
     places, asked = np.random.default_rng(0).uniform(0, 5, (70, 3)), np.random.default_rng(1).uniform(0, 5, (4, 3))
     places[1] = places[0]
-    fields, labels, residuals = draw(70, 3, 8), draw(70, 8, seed=1), draw(70, 8, seed=2)
+    fields, labels = draw(70, 3, 8), draw(70, 8, seed=1)
+    residuals = draw(70, 8, seed=2) * 10.0 ** np.random.default_rng(3).uniform(-3, 0, (70, 1))  # some in shadow
     found = solved(places, fields, labels, residuals)(torch.from_numpy(asked), PROCESS)
-    towards, covariances = dense(places, asked, fields, labels)
+    towards, covariances = dense(places, asked, fields, labels, residuals)
     expected = (towards @ np.linalg.solve(covariances, residuals.flatten())).reshape(4, 3)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4 * np.abs(expected).max())
 
@@ -57,7 +59,7 @@ def test_variances_of_resolved_paths_are_the_dense_ones():
     fields = np.linalg.qr(draw(20, 8, 3))[0].swapaxes(1, 2) * np.array([2, 1, 0.3])[:, None]
     labels = draw(20, 8, seed=1)
     found = solved(places, fields, labels, labels).variances(torch.from_numpy(asked), PROCESS)
-    towards, covariances = dense(places, asked, fields, labels)
+    towards, covariances = dense(places, asked, fields, labels, labels)
     known = np.einsum("ij,ji->i", towards, np.linalg.solve(covariances, towards.conj().T)).real
     np.testing.assert_allclose(found, (PROCESS.scale**2 - known).reshape(4, 3), rtol=1e-4)
 
@@ -104,9 +106,14 @@ def errors(model, links):
 
 
 @torch.no_grad()
-def test_margins_sum_up_to_a_tenth_more_than_the_prediction():
+@pytest.mark.parametrize("passing", [1.0, 0.5, 0.01])
+def test_margins_are_largest_where_obstacles_block_a_part(passing, monkeypatch):
     links, model = made()
-    torch.testing.assert_close(model.margins(links.query).sum(1), 1.1 * model.predict(links.query))
+    clear = model.predict(links.query)
+    model.placement.obstacles = torch.nn.Identity()
+    depths = lambda obstacles, folded, strengths: torch.full_like(strengths.real, -math.log(passing))
+    monkeypatch.setattr(model.placement, "_depths", depths)
+    torch.testing.assert_close(model.margins(links.query).sum(1), (passing * (1 - passing) + 0.1) * clear)
 
 
 @pytest.mark.parametrize("phase", ["known", "per_link"])

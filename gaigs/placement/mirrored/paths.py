@@ -362,13 +362,17 @@ class Mirrored(Placement):
         return found / self.receiver_gains[query.receivers, None].exp()
 
     def margins(self, query: Query) -> Complex[Tensor, "b n"]:
-        """Field over free space by which each kept path may deviate: its own, and a tenth of that without obstacles."""
+        """Field over free space by which each kept path may deviate.
+
+        It is the path's own times the share that obstacles block, and a tenth of that without obstacles.
+        """
         sequences, normals, offsets = self.sequences[self.kept], self.normals, self.offsets
         seen = images(query.transmitters - self.middle, sequences, normals, offsets)
         receivers = (self.scene.positions(normals) - self.middle)[query.receivers]
         folded = fold(seen, receivers, sequences, normals, offsets)
-        free = self.strengths(query, folded, blocked=False)
-        return (self.strengths(query, folded) + 0.1 * free) * self._patterns(query, seen[-1] - receivers[:, None])
+        own, free = self.strengths(query, folded), self.strengths(query, folded, blocked=False)
+        blocked = 1 - own.abs() / free.abs().clamp_min(torch.finfo(own.real.dtype).tiny)
+        return (blocked * own + 0.1 * free) * self._patterns(query, seen[-1] - receivers[:, None])
 
     def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Field gain of a receiver's elements in its frame; of arrays times the learnt cos^q."""
