@@ -23,7 +23,7 @@ from gaigs.kriging.fit import (
 )
 from gaigs.kriging.kernel import LIMIT, Process, kernel
 from gaigs.kriging.links import PART, coordinates, folds_of, thinned
-from gaigs.kriging.paths import Equations, PathField, candidates
+from gaigs.kriging.paths import Equations, PathField, usual_process
 from gaigs.kriging.scalar import ScalarProcess, is_scalar
 from gaigs.model import Model, Prediction, call_optional
 from gaigs.placement.learnt_room import LearntPath, LearntRoom
@@ -138,10 +138,10 @@ class Kriging(Model):
         return validation_model
 
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
-        """``krige`` for a trend of paths; hyperparameters are those with the largest sure gain on the validation links.
+        """``krige`` for a trend of paths.
 
-        It is the rise of the mean score less 1.5 standard errors. If none is positive, or with fewer than ``FEWEST``
-        validation links, the weight is 0.
+        The weight is 1 if ``FEWEST`` validation links or more have a mean score that rises by more than 1.5 standard
+        errors, else 0.
         """
         split, task, index = links.split, links.task, known(links)
         query, labels = links.query[index], links.labels[index]
@@ -156,30 +156,27 @@ class Kriging(Model):
         training = replace(links, split=split.validating())
         validation_model.fallback.fit(training)
         held = torch.arange(len(split.train), len(index))
-        fields = {int(row): trend.margins(query[row : row + 1].to(device)).cpu()[0] for row in held}
-        plain, best = values[held], (-math.inf, next(candidates(self.scene.spacing)))
-        before = task.scores(labels[held], plain)[task.monitor] if len(held) else plain.real
-        for process in candidates(self.scene.spacing) if len(held) >= FEWEST else ():
-            kriged = plain.clone()
-            for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
-                field.solve(known_ones[rows < len(split.train)], process)
-                for row in rows[rows >= len(split.train)].tolist():
-                    strengths = field(query.transmitters[row : row + 1].double(), process)[0]
-                    kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), fields[row], 1)
-            after = task.scores(labels[held], kriged)[task.monitor]
+        plain, kriged, process = values[held], values[held].clone(), usual_process(self.scene.spacing)
+        for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
+            field.solve(known_ones[rows < len(split.train)], process)
+            for row in rows[rows >= len(split.train)].tolist():
+                strengths = field(query.transmitters[row : row + 1].double(), process)[0]
+                margins = trend.margins(query[row : row + 1].to(device)).cpu()[0]
+                kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), margins, 1)
+        helps = False
+        if len(held) >= FEWEST:
+            before, after = (task.scores(labels[held], part)[task.monitor] for part in (plain, kriged))
             gain = after - before if task.higher_is_better else before - after
-            sure = (gain.mean() - 1.5 * gain.std() / math.sqrt(len(gain))).item()
-            if sure > max(0, best[0]):
-                best = sure, process
+            helps = bool(gain.mean() > 1.5 * gain.std() / math.sqrt(len(gain)))
         self.trend_weight.fill_(0)
         if len(held) == 0 or self._is_learnt(links, plain, validation_model.fallback, is_final):
             self.trend_weight.fill_(1)
         for model in (self, validation_model) if is_final else (validation_model,):
             model.trend_weight.copy_(self.trend_weight)
-            model.weight.fill_(float(best[0] > 0) if self.trend_weight else 1.0)
-            model.hyperparameters.copy_(torch.tensor(best[1], dtype=torch.float64))
-            for rows, field, known_ones in zip(own, model.fields, equations, strict=True):
-                field.solve(known_ones if model is self else known_ones[rows < len(split.train)], best[1])
+            model.weight.fill_(float(helps) if self.trend_weight else 1.0)
+            model.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
+        for field, known_ones in zip(self.fields, equations, strict=True) if is_final else ():
+            field.solve(known_ones, process)
         if is_final:
             self._log()
         self.fields.to(device)
