@@ -289,10 +289,13 @@ Directions = Grid | Rays
 
 
 def even_places(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], count: int) -> Float[Tensor, "g 3"]:
-    """About so many evenly spaced places in a box; an edge far shorter than the others has one."""
+    """About so many evenly spaced places in a box; an edge shorter than their distance has one."""
     lower, edges = torch.minimum(lower, upper), (upper - lower).abs()
-    long = edges[edges > 0.2 * edges.max()]
-    pitch = float(long.prod() / count) ** (1 / max(len(long), 1)) or 1.0
-    counts = [max(1, round(edge / pitch)) for edge in edges.tolist()]
+    longest, pitch = edges.double().sort(descending=True).values, 0.0
+    for dimensions in (3, 2, 1):  # an edge below the pitch has no part in it
+        pitch = float(longest[:dimensions].prod() / count) ** (1 / dimensions)
+        if 0 < pitch <= longest[dimensions - 1]:
+            break
+    counts = [max(1, round(edge / (pitch or 1.0))) for edge in edges.tolist()]
     axes = [low + edge * (torch.arange(n) + 0.5) / n for low, edge, n in zip(lower, edges, counts, strict=True)]
     return torch.cartesian_prod(*axes)

@@ -40,7 +40,7 @@ TOLERATED = 1.05
 """Largest rise of the mean error for which known places count as superfluous together."""
 
 LENGTH, NUGGET = 0.25, 0.6
-"""Correlation length over the region's diagonal and nugget of the process that stands in for a model."""
+"""Correlation length over the diagonal of all points and nugget of the process that stands in for a model."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class SurveyPlan:
 
     def __str__(self) -> str:
         if self.errors is None:
-            return f"{len(self.places)} places to measure first; their error is unknown without labels"
+            return f"{len(self.places)} places to measure first; without a trained model their error is unknown"
         first, last = (f"{error:.3g}" for error in (self.errors[0], self.errors[-1]))
         few = int(self.superfluous.sum())
         words = (
@@ -139,7 +139,10 @@ def survey(
     Source: Krause, Singh and Guestrin, Near-optimal sensor placements in Gaussian processes, 2008; the criterion is the
     A-optimal one of Cohn, Neural network exploration using optimal experiment design, 1996.
     """
-    check_type("model", model, Model | None)
+    if not isinstance(model, Model | None):
+        raise TypeError(
+            f"model must be a trained model, got {model!r}\nload one with gaigs.load(...), or give region=..."
+        )
     check_type("count", count, int)
     if count < 1:
         raise ValueError(f"count must be at least 1 place, got {count}")
@@ -163,10 +166,12 @@ def survey(
     processes = [] if model is None else processes_of(model)
     most = int((MEMORY / 8 / max(1, len(processes))) ** 0.5)
     if not 0 < len(places) <= most:
-        raise ValueError(f"a survey takes 1 to {most} candidates, got {len(places)}; leave some out")
+        raise ValueError(
+            f"a survey takes 1 to {most} candidates, got {len(places)}\nchange candidates, or leave them out"
+        )
     if model is None:
         asked, factor = points.double(), 1.0
-        processes = [default_process(asked[stated])]
+        processes = [default_process(asked)]
     else:
         scene = model.scene
         if frequency is None and len(scene.frequencies):
@@ -227,7 +232,12 @@ def figure(plan: SurveyPlan) -> Figure:
             if len(plan.known):
                 left.plot(*plan.known[rows, :2].T.numpy(), "o", markersize=3, label=words, **look)
         left.plot(
-            *plan.places[:, :2].T.numpy(), "o", markersize=8, color=style.ORANGE, label="to measure, in this order"
+            *plan.places[:, :2].T.numpy(),
+            "o",
+            markersize=8,
+            color=style.ORANGE,
+            clip_on=False,
+            label="to measure, in this order",
         )
         for number, place in enumerate(plan.places.tolist(), 1):
             left.annotate(str(number), place[:2], ha="center", va="center", color="white", size=5)
@@ -254,10 +264,10 @@ def processes_of(model: Model) -> list[Process]:
     return processes
 
 
-def default_process(region: Float[Tensor, "g 3"]) -> Process:
-    """A process without readings and with an unknown constant: its places spread evenly over the region."""
-    length = LENGTH * (region.amax(0) - region.amin(0)).norm()
-    return Process(lambda a, b: 100 + kernel(a, b, length), region[:0], region[:0, 0], NUGGET)
+def default_process(points: Float[Tensor, "g 3"]) -> Process:
+    """A process without readings and with an unknown constant: its places spread evenly over the points' box."""
+    length = LENGTH * (points.amax(0) - points.amin(0)).norm().item() or 1.0
+    return Process(lambda a, b: 100 + kernel(a, b, length), points[:0], points[:0, 0], NUGGET)
 
 
 def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process:

@@ -1,4 +1,4 @@
-"""Rotations, poses and spherical harmonics against scipy, angles against the conventions."""
+"""Rotations, poses, spherical harmonics and places, against scipy, angles against the conventions."""
 
 import math
 
@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from gaigs.geometry import Pose, quaternions_to_rotations, sinc, spherical_harmonics, to_spherical
+from gaigs.geometry import Pose, even_places, quaternions_to_rotations, sinc, spherical_harmonics, to_spherical
 
 
 @pytest.fixture
@@ -93,6 +93,27 @@ def test_spherical_harmonics_are_scipys():
 
 def test_spherical_harmonics_have_finite_gradients_at_the_poles():
     assert torch.autograd.gradcheck(lambda vectors: spherical_harmonics(vectors, 4), directions(5).requires_grad_())
+
+
+@pytest.mark.parametrize(
+    ("edges", "axes"),
+    [
+        ((6, 4, 0), 2),
+        ((30, 2, 0), 2),
+        ((60, 11, 3), 3),
+        ((8, 5, 0.5), 3),
+        ((8, 5, 0.2), 2),
+        ((9, 1e-3, 0), 1),
+        ((0, 0, 0), 0),
+    ],
+)
+def test_places_in_a_box_are_about_as_many_as_asked_for_and_evenly_apart(edges, axes):
+    places = even_places(torch.tensor(edges).float(), torch.zeros(3), 1000)
+    counts = [len(places[:, axis].unique()) for axis in range(3)]
+    assert len(places) == (1 if axes == 0 else pytest.approx(1000, rel=0.35))
+    assert sum(count > 1 for count in counts) == axes
+    pitches = [edge / count for edge, count in zip(edges, counts, strict=True) if count > 1]
+    assert max(pitches, default=1) <= 2 * min(pitches, default=1)
 
 
 def test_sinc_is_that_of_torch_also_at_0():

@@ -161,4 +161,4 @@ def test_the_command_plans_before_anything_is_measured(tmp_path, capsys):
     lines = (tmp_path / "survey.csv").read_text().splitlines()
     assert len(lines) == 4
     assert all(line.startswith("measure,") and line.endswith(",") for line in lines[1:])
-    assert "their error is unknown without labels" in capsys.readouterr().out
+    assert "without a trained model their error is unknown" in capsys.readouterr().out

@@ -114,7 +114,7 @@ def fit_hyperparameters(
 
 
 FEWEST = 10
-"""Fewest validation links that choose hyperparameters: fewer ones overfit."""
+"""Fewest validation links that choose hyperparameters, or whether paths are kriged: fewer ones overfit."""
 
 AROUND = 64
 """Training links that predict each held-out link while hyperparameters are fitted."""

@@ -23,8 +23,8 @@ class Equations:
 
     The channel of a link is predicted as h + sum_i u_i m_i, with the field m_i of path i per unit of its process. With
     the residual r, and noise of ``nugget`` times p, the log likelihood is -|r - sum_i u_i m_i|² / (nugget p): a
-    quadratic form. p is the mean power of the residual's numbers, plus ``LEAST`` times that of the label's: links in
-    shadow have far larger residuals than others.
+    quadratic form. p is the mean power of the residual's numbers, plus ``LEAST`` times that of the label's, which has
+    the gain of the prediction: links in shadow have far larger residuals than others.
 
     Attributes:
         places: (k, 3) [m].
@@ -120,7 +120,7 @@ class PathField(nn.Module):
 def usual_process(spacing: float) -> Hyperparameters:
     """The process of path strengths, where neighbouring places are ``spacing`` apart [m].
 
-    A length of half of it helps links in shadow. Longer ones help them more, but may lower the median score.
+    A longer length raises the mean score further, but may lower the median.
     """
     return Hyperparameters(spacing / 2, 1.0, 0.2)
 

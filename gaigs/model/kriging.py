@@ -55,6 +55,7 @@ class Kriging(Model):
     of a place as one: without such links a half. Their weight is 1.
 
     Of a trend whose paths have ``margins``, strengths are kriged path by path, and phases stay those of the geometry.
+    The process is always the same, and the weight 1 or 0.
 
     A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal components. Of a receiver
     with more than ``LIMIT`` known links an even part is used.
@@ -145,13 +146,14 @@ class Kriging(Model):
         """
         split, task, index = links.split, links.task, known(links)
         query, labels = links.query[index], links.labels[index]
-        residuals = task.align(labels, values) - values
+        aligned = task.align(labels, values)
+        residuals = aligned - values
         trend: Any = self.trend
         device = self.weight.device
         equations, own = [], [(query.receivers == receiver).nonzero()[:, 0] for receiver in range(len(self.fields))]
         for rows in own:
             margins = lambda part, rows=rows: trend.margins(query[rows[part]].to(device)).cpu()
-            equations.append(Equations.of(query.transmitters[rows], margins, labels[rows], residuals[rows]))
+            equations.append(Equations.of(query.transmitters[rows], margins, aligned[rows], residuals[rows]))
         validation_model = Kriging(self.scene, self.trend, self.fallback_options)
         training = replace(links, split=split.validating())
         validation_model.fallback.fit(training)
@@ -200,8 +202,7 @@ class Kriging(Model):
     def deviations(self, batch: Batch) -> Tensor:
         """Standard deviations of the labels; of spectra means over their pixels.
 
-        Those of kriged paths are bounds below, without noise, of the default hyperparameters if validation chose no
-        kriging.
+        Those of kriged paths are bounds below, without noise.
         """
         query, process = batch.query, Hyperparameters(*self.hyperparameters.tolist())
         if self.is_scalar:

@@ -95,7 +95,8 @@ def made(smooth=0.0, noise=0.0, phase="known", validation=20):
     waves = (places @ torch.randn(3, margins.shape[1], generator=generator) / 3).cos()
     labels = labels + smooth * (waves[..., None, None] * margins).sum(1)
     labels = labels + noise * labels.abs().mean() * torch.randn(labels.shape, dtype=labels.dtype, generator=generator)
-    if phase == "per_link":
+    if phase != "known":
+        labels = 1e4 ** (phase == "per_link_and_delay") * labels  # whose gain is unknown
         labels = labels * torch.polar(torch.ones(120), 6 * torch.rand(120, generator=generator))[:, None, None]
     return replace(links, labels=labels), model
 
@@ -116,7 +117,7 @@ def test_margins_are_largest_where_obstacles_block_a_part(passing, monkeypatch):
     torch.testing.assert_close(model.margins(links.query).sum(1), (passing * (1 - passing) + 0.1) * clear)
 
 
-@pytest.mark.parametrize("phase", ["known", "per_link"])
+@pytest.mark.parametrize("phase", ["known", "per_link", "per_link_and_delay"])
 def test_smooth_strengths_are_kriged(phase):
     links, trend = made(smooth=0.4, phase=phase)
     model = Kriging(links.scene, trend)

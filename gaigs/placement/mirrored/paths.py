@@ -371,8 +371,8 @@ class Mirrored(Placement):
         receivers = (self.scene.positions(normals) - self.middle)[query.receivers]
         folded = fold(seen, receivers, sequences, normals, offsets)
         own, free = self.strengths(query, folded), self.strengths(query, folded, blocked=False)
-        blocked = 1 - own.abs() / free.abs().clamp_min(torch.finfo(own.real.dtype).tiny)
-        return (blocked * own + 0.1 * free) * self._patterns(query, seen[-1] - receivers[:, None])
+        share = 1 - own.abs() / free.abs().clamp_min(torch.finfo(own.real.dtype).tiny)
+        return (share * own + 0.1 * free) * self._patterns(query, seen[-1] - receivers[:, None])
 
     def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Field gain of a receiver's elements in its frame; of arrays times the learnt cos^q."""
