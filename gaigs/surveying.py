@@ -146,22 +146,21 @@ def survey(
     check_type("count", count, int)
     if count < 1:
         raise ValueError(f"count must be at least 1 place, got {count}")
-    places = None if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
-    beside = torch.zeros(0, 3)
-    if region is not None or places is None:
-        if region is not None:
-            box = as_positions("region", region).reshape(-1, 3)
-        elif model is not None:
-            box = torch.stack((model.scene.lower, model.scene.upper))
-        else:
+    if region is None and candidates is None:
+        if model is None:
             raise ValueError(
                 "a survey without a model takes a region or candidates, got neither\n"
                 "give one (survey.region=...), or a trained model (folder=runs/...)"
             )
+        region = torch.stack((model.scene.lower, model.scene.upper))
+    even = torch.zeros(0, 3)
+    if region is not None:
+        box = as_positions("region", region).reshape(-1, 3)
         if len(box) != 2:
             raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points")
         even = even_places(box[0], box[1], POINTS)
-        places, beside = (even, beside) if places is None else (places, even)
+    places = even if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
+    beside = even[:0] if candidates is None else even
     points, stated = torch.cat((places, beside)), slice(len(places) if len(beside) else 0, None)
     processes = [] if model is None else processes_of(model)
     most = int((MEMORY / 8 / max(1, len(processes))) ** 0.5)
