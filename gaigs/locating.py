@@ -17,13 +17,14 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from gaigs.data import Links
+from gaigs.data.matching import check_fit
 from gaigs.geometry import ExtrapolationWarning, even_places
 from gaigs.io.files import write_text
 from gaigs.kriging.intervals import fewest
 from gaigs.kriging.links import distances, evenly, folds_of
 from gaigs.model import Model
 from gaigs.model.knn import COUNTS
-from gaigs.query import ROUNDING, as_positions
+from gaigs.query import ROUNDING, as_positions, as_tensor
 from gaigs.registry import call, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, model_of
@@ -204,7 +205,11 @@ def fingerprints(
         torch.Size([1, 3])
     """
     check_type("model", model, Model)
+    check_type("points", points, int | None)
     scene = model.scene
+    if links is not None:
+        check_type("links", links, Links)
+        check_fit(links, scene)
     if points is not None and points < 2:
         raise ValueError(f"points must be at least 2 candidates, got {points}")
     box = torch.stack((scene.lower, scene.upper)) if region is None else as_positions("region", region).reshape(-1, 3)
@@ -235,6 +240,8 @@ def fingerprints(
         some = evenly(torch.arange(len(truth)), HELD_OUT)
         if len(some):
             errors = asked[some] - predicted(one, truth[some], frequency)[0]
+            if region is not None:  # a value from elsewhere is not like those that will be asked
+                some = some[((truth[some] >= box.amin(0)) & (truth[some] <= box.amax(0))).all(1)]
             tries.append((mapped(one, others[torch.isin(others, known)]), asked[some], truth[some], errors))
         if sum(min(len(places), SCORED) for _, _, places, _ in tries) >= ENOUGH:
             break
@@ -247,7 +254,8 @@ def fingerprints(
         one = along(one, [errors for other, (*_, errors) in enumerate(tries) if other != number])
         some = evenly(torch.arange(len(truth)), SCORED)
         both = [squares(one, asked[some] @ one.axes, unknown) for unknown in (False, True)]
-        held.append(Try(one, both, truth[some]))
+        if len(some):
+            held.append(Try(one, both, truth[some]))
     made = along(made, [errors for *_, errors in tries])
     return fitted(made, held) if held else made
 
@@ -304,6 +312,8 @@ def posterior(
     prints: Fingerprints, asked: Float[Tensor, "n r m"], unknown_power: bool, step: float | None, level: float
 ) -> Location:
     """``locate`` for the fingerprints of values."""
+    check_type("level", level, float)
+    check_type("step", step, float | None)
     if not 0 < level < 1:
         raise ValueError(f"level must be a probability between 0 and 1 such as 0.9, got {level!r}")
     if step is not None and not 0 < step < math.inf:
@@ -494,13 +504,10 @@ def received(links: Links, index: Int[Tensor, " k"]) -> tuple[Float[Tensor, "n r
 def as_fingerprints(value: object, prints: Fingerprints) -> Float[Tensor, "n r m"]:
     """The fingerprints of values that a user gives; raises a ``ValueError`` for other shapes."""
     shape, count = tuple(prints.task.shape), prints.values.shape[1]
-    try:
-        given = torch.as_tensor(value).detach().cpu().to(prints.task.dtype)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"value must be numbers, got {error}") from None
+    given = as_tensor("value", value, f"labels of {count} receivers").detach().cpu().to(prints.task.dtype)
     values = given.reshape(-1, 1, *shape) if count == 1 and given.ndim - len(shape) in (0, 1) else given
     values = values[None] if values.ndim == 1 + len(shape) else values
-    if values.ndim != 2 + len(shape) or values.shape[1:] != (count, *shape):
+    if values.ndim != 2 + len(shape) or values.shape[1:] != (count, *shape) or not len(values):
         need = f"{(count, *shape)} or {('n', count, *shape)}, a label of each receiver"
         raise ValueError(f"value must be {need}, got {tuple(given.shape)}")
     flat = values.reshape(*values.shape[:2], -1)
@@ -536,28 +543,33 @@ def squares(
     prints: Fingerprints, asked: Float[Tensor, "n r k"], unknown_power: bool = False
 ) -> tuple[Float[Tensor, "n g"], Float[Tensor, "n g"], Float[Tensor, " n"]]:
     """Squared distances of values from the candidates' over the deviations, sums of the deviations' logarithms, and
-    numbers of receivers; with ``unknown_power`` the least distance with any offset or factor of the value."""
+    numbers of receivers; with ``unknown_power`` the least distance with any offset of the value, or any factor of the
+    prediction, which a factor of the value leaves as it is."""
     shape = len(asked), len(prints.places)
     total, logarithms, count = torch.zeros(shape), torch.zeros(shape), torch.zeros(len(asked))
-    with_all, alone = torch.zeros(shape), torch.zeros(shape)
+    with_all, alone, powers = torch.zeros(shape), torch.zeros(shape), torch.zeros(len(asked), 1)
     for receiver in range(asked.shape[1]):
         heard = ~asked[:, receiver, 0].isnan()
         own, values, deviations = asked[heard, receiver], prints.values[:, receiver], prints.deviations[:, receiver]
         count[heard] += 1
         if not prints.task.shape:
+            deviations = deviations.clamp_min(ROUNDING * values.abs().max())  # of labels without any error
             errors = (own - values[:, 0]) / deviations
             total[heard] += errors.square()
             with_all[heard] += errors / deviations
             alone[heard] += deviations.square().reciprocal()
             logarithms[heard] += deviations.log()
             continue
-        sizes, products, powers = values.square().sum(1), own @ values.mT, own.square().sum(1, keepdim=True)
-        with_all[heard] += products
-        alone[heard] += powers
-        total[heard] += sizes if unknown_power else sizes - 2 * products + powers
-    if unknown_power:
-        total -= with_all.square() / alone.clamp_min(torch.finfo(torch.float32).tiny)
-        count = count - 1 if not prints.task.shape else count
+        with_all[heard] += own @ values.mT
+        alone[heard] += values.square().sum(1)
+        powers[heard] += own.square().sum(1, keepdim=True)
+    tiny = torch.finfo(torch.float32).tiny
+    if prints.task.shape and unknown_power:  # the part of the value that no factor of the prediction gives
+        total = alone.mean(1, keepdim=True) * (1 - with_all.clamp_min(0).square() / (alone * powers).clamp_min(tiny))
+    elif prints.task.shape:
+        total = alone - 2 * with_all + powers
+    elif unknown_power:
+        total, count = total - with_all.square() / alone.clamp_min(tiny), count - 1
     return total.clamp_min(0), logarithms, count
 
 
@@ -666,8 +678,13 @@ def smoothed(logarithms: Float[Tensor, "n g"], places: Float[Tensor, "g 3"], ste
     spacing = distances(places[best.indices[0]], places[best.indices[0]]).fill_diagonal_(math.inf).amin(1).median()
     step = math.hypot(step, spacing.item())  # candidates are no finer
 
+    known: list[Tensor] = []
+
     def moved(logarithm: Tensor, first: Tensor, second: Tensor) -> Tensor:
-        moves = (distances(places[second], places[first]) / step).square_().div_(-2).exp_().add_(JUMP)
+        if not known or not all(map(torch.equal, known, (first, second))):  # a walk may stay
+            moves = (distances(places[second], places[first]) / step).square_().div_(-2).exp_().add_(JUMP)
+            known[:] = first, second, moves
+        moves = known[2]
         return (moves @ (logarithm - logarithm.max()).exp()).log()  # above 0: each move may be a jump
 
     forward, backward = [best.values[0]], [torch.zeros_like(best.values[0])]

@@ -329,9 +329,13 @@ def without(
         left, root = whitened(process, own, asked)
         deviations = ((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt()
         weights = torch.linalg.solve_triangular(root.mT, left, upper=True)
-        # Without reading i variances rise by w_i² over the inverse's diagonal; roots by half of it over themselves.
-        rises = (weights.square() / (2 * deviations)).mean(1) / torch.cholesky_inverse(root).diagonal()
-        losses.index_add_(0, place, rises / len(processes))
+        inverse = torch.cholesky_inverse(root)
+        for number in place.unique().tolist():  # all readings of a place go together
+            there = (place == number).nonzero()[:, 0]
+            gone = weights[there]
+            # Variances rise by w' (inverse of these rows)^-1 w; roots by half of it over themselves.
+            rises = (gone * torch.linalg.solve(inverse[there[:, None], there], gone)).sum(0)
+            losses[number] += (rises / (2 * deviations)).mean() / len(processes)
     order, before = losses.argsort(), error(torch.ones(len(known), dtype=torch.bool, device=known.device))
     fewest, most = 0, len(known) - 1  # places that may, and may not be left out together
     superfluous = torch.zeros(len(known), dtype=torch.bool)

@@ -77,6 +77,13 @@ def test_spectra_of_unknown_power_may_have_any_factor():
     label = links.labels[links.split.test[:1]]
     with_power, without = (gaigs.locate(prints, 0.3 * label, unknown_power=unknown) for unknown in (False, True))
     same = gaigs.locate(prints, label, unknown_power=True)
+    asked = torch.rand(1, 1, prints.values.shape[2])
+    total, *_ = squares(prints, asked, unknown_power=True)
+    factors = torch.linspace(0, 3, 3001)[:, None] * asked.norm() / prints.values[:, 0].norm(dim=1)
+    left = (asked - factors[..., None] * prints.values[:, 0]).square().sum(2).amin(0) / asked.square().sum()
+    torch.testing.assert_close(
+        total[0], left * prints.values.square().sum((1, 2)).mean(), rtol=1e-3, atol=1e-3 * total.max().item()
+    )
     torch.testing.assert_close(without.probabilities, same.probabilities, rtol=1e-3, atol=1e-6)
     assert not torch.allclose(with_power.probabilities, without.probabilities, atol=1e-3)
 
@@ -224,8 +231,9 @@ def test_wrong_values_are_refused(rssi):
     for value, words in (
         ([-50.0, -60.0], "a label of each receiver"),
         ([math.nan] * 4, "heard by no receiver"),
+        (np.zeros((0, 4)), "a label of each receiver"),
         ([-50.0, math.inf, -60.0, -70.0], "must be finite"),
-        ("loud", "value must be numbers"),
+        ("loud", "value must be labels of 4 receivers"),
     ):
         with pytest.raises(ValueError, match=words):
             gaigs.locate(prints, value)
@@ -241,6 +249,20 @@ def test_wrong_values_are_refused(rssi):
         gaigs.fingerprints(model, points=1)
     with pytest.raises(ValueError, match="two corners"):
         gaigs.fingerprints(model, region=[[0.0, 0.0, 0.0]])
+    alone = {"transmitters": torch.rand(20, 3), "receivers": [0.0, 0.0, 1.0], "labels": torch.rand(20) - 50}
+    others = gaigs.links(task="rssi", split="random", **alone)
+    with pytest.raises(ValueError, match="the model's receivers"):
+        gaigs.fingerprints(model, others)
+
+
+def test_places_outside_the_region_do_not_calibrate_it(rssi):
+    links, model, _ = rssi
+    lower, upper = model.scene.lower.clone(), model.scene.upper.clone()
+    upper[0] = lower[0] + 0.4 * (upper[0] - lower[0])
+    prints = gaigs.fingerprints(model, links, region=torch.stack((lower, upper)), points=500)
+    held = torch.cat([one.truth for one in prints.held])
+    assert len(held)
+    assert (held <= upper).all()
 
 
 def test_the_command_locates_the_test_transmitters_of_a_run(tmp_path, capsys):

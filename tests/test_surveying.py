@@ -162,3 +162,14 @@ def test_the_command_plans_before_anything_is_measured(tmp_path, capsys):
     assert len(lines) == 4
     assert all(line.startswith("measure,") and line.endswith(",") for line in lines[1:])
     assert "without a trained model their error is unknown" in capsys.readouterr().out
+
+
+def test_losses_are_those_of_leaving_all_readings_of_a_place_out():
+    own, asked = process(noise=1.0), torch.rand(60, 3, dtype=torch.float64) * 4
+    often = torch.tensor([0] * 8 + [1] * 3 + list(range(2, 12)))
+    own = replace(own, places=own.places[often], noises=own.noises[often])
+    known, losses, _ = without([own], asked, MEAN)
+    error = lambda rows: MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
+    for place, loss in zip(known, losses, strict=True):
+        rows = [row for row, there in enumerate(own.places.float()) if not torch.allclose(there[:3], place)]
+        assert float(loss) == pytest.approx(error(rows) - error(range(len(often))), rel=0.1)

@@ -158,7 +158,12 @@ class Calibration:
         bins = (
             torch.bucketize(numbers.double(), amplitudes) if len(amplitudes) else torch.zeros_like(numbers.abs()).long()
         )
-        ranks = (level * (counts + 1) / counts * STEPS).ceil().long().clamp_max(STEPS)
+        needed = (level * (counts + 1) - 1e-9).ceil()  # links whose errors the interval holds
+        if numbers.shape[1] == 1:  # the middle of this link's steps where each link has several
+            steps = torch.where(counts < STEPS, ((needed - 0.5) * STEPS / counts).round(), needed * STEPS / counts)
+        else:
+            steps = level * (counts + 1) / counts * STEPS
+        ranks = (steps - 1e-9).ceil().long().clamp_max(STEPS)
         scale = _shaped(deviations, value)
         factors = lambda table: table.reshape(value.shape).to(scale)
         half = scale * factors(self.quantiles.to(value.device)[own[:, None], bins, ranks[:, None]])

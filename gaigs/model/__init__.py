@@ -197,8 +197,8 @@ class Model(nn.Module):
             raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
         if self.calibration is None:
             raise ValueError(
-                "the model has no intervals: no validation links have measured its errors\n"
-                "train it by gaigs.train or a run, on links with split.validation above 0"
+                "the model has no intervals: no held-out links have measured its errors\n"
+                "train it with split.validation above 0, on two places, runs or blocks or more, without data.band_train"
             )
         estimates, shape = self._values(*arguments, float(interval))
         parts = (None if part[0] is None else torch.cat(part) for part in zip(*estimates, strict=True))

@@ -1,5 +1,6 @@
 """Ensembles: models that differ by their seed alone, whose differences show how certain they are."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -80,6 +81,8 @@ class Ensemble(Model):
 
     def _squares(self, batch: Batch) -> Tensor:
         """Variances of the members' labels, means over a label's numbers (b,)."""
+        batch = replace(batch, directions=self.scene.task.directions)  # whichever are asked
+        batch = batch.to(self.typical.device)
         return self._each(batch)[..., None].flatten(2).var(0).mean(1)
 
     def _each(self, batch: Batch) -> Tensor:

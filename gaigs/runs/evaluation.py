@@ -138,28 +138,32 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
     """Models like a model, links that they have not seen, and the links that they know; each when it is asked for.
 
     A look-up is fitted anew without each fold of the known links. A trained model has the validation links; the step of
-    its training stays the one chosen on all of them. ``model`` of kriging is its validation model. It chose weights and
-    hyperparameters on these links: for each half of them they are chosen anew on the other half.
+    its training stays the one chosen on all of them. Kriging knows them, and has chosen weights and hyperparameters by
+    them: for each half of them it is fitted and chosen anew on the other links.
     """
-    split, validation = links.split, links.split.validation
+    split, validation, receivers = links.split, links.split.validation, links.query.receivers
     if not (is_trained(model) or isinstance(model, Kriging)):
         index = torch.cat((split.train, validation))
         folds, asked = folds_of(links, index) % CALIBRATION_FOLDS, evenly(index, MOST)
         for fold in range(CALIBRATION_FOLDS):
-            part, known = index[folds == fold], index[folds != fold]
-            part, rest = part[torch.isin(part, asked)], replace(links, split=split.only(known))
-            if len(part) and all(len(rest.known(receiver)) for receiver in range(len(links.receivers))):
+            is_known = folds != fold
+            # A receiver that a fold alone has heard keeps its links there.
+            is_known |= torch.isin(receivers[index], receivers[index[is_known]], invert=True)
+            known, part = index[is_known], index[~is_known & torch.isin(index, asked)]
+            if len(part):
+                rest = replace(links, split=split.only(known))
                 copied = copy.deepcopy(model)
                 (copied.refit if hasattr(copied, "refit") else copied.fit)(rest)
                 yield copied, part, known
         return
     halves = folds_of(links, validation) % 2
     parts = validation[halves == 0], validation[halves == 1]
-    if not isinstance(model, Kriging) or not all(map(len, parts)):
+    if not isinstance(model, Kriging):
         if len(validation):
             yield model, validation, split.train
         return
-    for own, other in (parts, parts[::-1]):
+    pairs = (parts, parts[::-1]) if all(map(len, parts)) else [(validation, validation)] * bool(len(validation))
+    for own, other in pairs:
         kriged = Kriging(links.scene, model.trend, model.fallback_options).to(device_of(model))
         yield kriged.krige(replace(links, split=split.choosing(own)), is_final=False), other, split.train
 

@@ -209,7 +209,7 @@ def test_intervals_that_the_links_cannot_give_are_refused():
     none = replace(links, split=replace(links.split, validation=links.split.validation[:0]))
     few = {"enable_progress_bar": False, "max_steps": 1, "count": 10, "accelerator": "cpu"}
     model = gaigs.train("gaigs", none, **few)
-    with pytest.raises(ValueError, match="no validation links have measured its errors"):
+    with pytest.raises(ValueError, match="no held-out links have measured its errors"):
         model.predict([1.0, 1.0, 1.0], interval=0.9)
     model = gaigs.train("knn", links)
     with pytest.raises(ValueError, match=r"99.9 % needs 999 links to calibrate it, the model has \d+"):
@@ -239,3 +239,26 @@ def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch
         assert not torch.isin(own, other).any()
         places = links.query.transmitters
         assert not (places[own][:, None] == places[other]).all(-1).any(), "halves share no place"
+
+
+@pytest.mark.parametrize(("count", "level", "held"), [(9, 0.5, 5), (19, 0.9, 18), (19, 0.8, 16), (37, 0.9, 35)])
+def test_an_interval_of_few_links_ends_at_the_error_of_its_rank(count, level, held):
+    kind = example_links("rssi").task
+    query, ones = Query(torch.zeros(count, 3), torch.zeros(count, dtype=torch.long)), torch.ones(count)
+    errors = torch.arange(1.0, count + 1)
+    calibration = Calibration.of(kind, errors, torch.zeros(count), ones, query, None, query[:1])
+    assert calibration.estimate(torch.zeros(1), ones[:1], query[:1], level).upper.item() == held
+
+
+def test_a_receiver_that_one_place_hears_leaves_the_others_their_intervals():
+    full = gaigs.links("synthetic_rssi", transmitters=40, order=0)
+    stand = torch.stack([receiver.pose.position for receiver in full.receivers])
+    labels = torch.full((40, len(stand)), math.nan)
+    places, which = full.query.transmitters.unique(dim=0, return_inverse=True)
+    labels = labels[: len(places)].index_put((which, full.query.receivers), full.labels[torch.arange(len(full))])
+    labels[1:, -1] = math.nan
+    links = gaigs.links(
+        task="rssi", transmitters=places, receivers=stand, labels=labels, split="random", test=0.0, seed=0
+    )
+    calibration = gaigs.train("knn", links).calibration
+    assert calibration.counts.sum() == len(links) - 1

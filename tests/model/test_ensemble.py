@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -83,3 +85,13 @@ def test_kriging_has_the_ensemble_as_its_trend(tmp_path, monkeypatch):
 def test_an_ensemble_has_a_member(links):
     with pytest.raises(ValueError, match="ensemble must be at least 1"):
         gaigs.train("gaigs", links, ensemble=0, **FEW)
+
+
+def test_deviations_do_not_depend_on_the_asked_directions():
+    links = gaigs.links("synthetic", transmitters=30, order=0)
+    options = {"max_steps": 1, "count": 20, "enable_progress_bar": False}
+    model = gaigs.train("gaigs", links, ensemble=2, **options)
+    batch = links.batch(links.split.test[:2])
+    few = gaigs.Grid.degrees([30], [40])
+    expected = model.deviations(batch)
+    torch.testing.assert_close(model.deviations(replace(batch, directions=few)), expected)
