@@ -83,7 +83,10 @@ class PluginConfigurations(SearchPathPlugin):
 
 
 class Constructors(ConfigSource):
-    """The configuration of a component without a file: ``name``, and its constructor's options with defaults."""
+    """The configuration of a component: ``name``, and its constructor's options with defaults.
+
+    A file of the same name takes it from the group ``constructors/<kind>``.
+    """
 
     def __init__(self, provider: str, path: str):
         super().__init__(provider, path)
@@ -97,7 +100,7 @@ class Constructors(ConfigSource):
         return "constructors"
 
     def load_config(self, config_path: str) -> ConfigResult:
-        kind, name = self.found[config_path.removesuffix(".yaml")]
+        kind, name = self.found[config_path.removesuffix(".yaml").removeprefix("constructors/")]
         node = OmegaConf.create({**registry(kind).options(name), "name": name})
         return ConfigResult(self.provider, f"{self.scheme()}://", node, {"package": None})
 
@@ -108,7 +111,7 @@ class Constructors(ConfigSource):
         return config_path.rstrip("/") in ("", *CONSTRUCTED)
 
     def is_config(self, config_path: str) -> bool:
-        return config_path.removesuffix(".yaml") in self.found
+        return config_path.removesuffix(".yaml").removeprefix("constructors/") in self.found
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
         files: list[str] = []

@@ -104,7 +104,7 @@ def test_a_components_name_is_its_files(kind):
     presets = {file.stem: yaml.safe_load(file.read_text()) for file in (ROOT / "conf" / kind).glob("*.yaml")}
     for stem, content in presets.items():
         preset = content.get(kind, content)  # tasks and data choose other parts, too
-        named = preset["name"] if "name" in preset else preset["defaults"][0]
+        named = preset.get("name") or Path(preset["defaults"][0]).name.removesuffix(f"@{kind}")
         assert named == stem or (stem not in names and named in names)
     (row,) = re.findall(rf"^\| `{kind}` \|.*\|(.*)\|$", PAGE, re.M)
     assert {*re.findall(r"`(\w+)`", row)} == names

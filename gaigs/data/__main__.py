@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument(
         "--deepmimo", action="store_true", help="write the paths of the built-in room, as a scenario of DeepMIMO v4"
     )
-    parser.add_argument("options", nargs="*", metavar="option=value", help="its options, as in conf/data/DATA.yaml")
+    parser.add_argument("options", nargs="*", metavar="option=value", help="its options, as in docs/data.md")
     arguments = parser.parse_intermixed_args()
     folder = arguments.folder
     try:

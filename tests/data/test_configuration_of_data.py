@@ -1,51 +1,36 @@
-"""Every data set's configuration has all its options with their defaults, and chooses its task and split."""
+"""Every data set brings its options with their defaults, its task and its split."""
 
 import inspect
 
 import pytest
 from omegaconf import OmegaConf
 
-from gaigs.configuration import conf_dir
 from gaigs.registry import registry
 
 CHOICES = {
     "nerf2_spectrum": ("spectrum", "official"),
     "nerf2_rssi": ("rssi", "official_runs"),
-    "rssi_csv": ("rssi", "random"),
-    "rssi_wide": ("rssi", "random"),
-    "csi_npz": ("csi", "random"),
-    "deepmimo": ("csi", "random"),
-    "deepmimo_rssi": ("rssi", "random"),
     "synthetic": ("spectrum", "official"),
     "synthetic_rssi": ("rssi", "official"),
     "synthetic_csi": ("csi", "official"),
     "sionna": ("spectrum", "official"),
     "sionna_rssi": ("rssi", "official"),
     "sionna_csi": ("csi", "official"),
+    **dict.fromkeys(("rssi_csv", "rssi_wide", "deepmimo_rssi"), ("rssi", "random")),
+    **dict.fromkeys(("csi_npz", "deepmimo"), ("csi", "random")),
 }
 """Task and split that each chooses."""
 
 
-def test_every_data_set_has_a_configuration():
-    assert {file.stem for file in (conf_dir() / "data").glob("*.yaml")} == CHOICES.keys()
-    assert CHOICES.keys() <= {*registry("data").names()}
-
-
 @pytest.mark.parametrize("name", CHOICES)
-def test_a_configuration_has_every_option_with_its_default(name):
-    file = OmegaConf.load(conf_dir() / "data" / f"{name}.yaml")
-    task, split = CHOICES[name]
-    assert file.defaults == [{"override /task": task}, {"override /split": split}]
-    config = OmegaConf.to_container(file.data)
-    mandatory = {key for key, value in config.items() if value == "???"}
-    parameters = inspect.signature(registry("data").get(config.pop("name"))).parameters
-    assert config.keys() == parameters.keys()
-    assert mandatory == {key for key, p in parameters.items() if p.default is p.empty}
-    for key in parameters.keys() - mandatory:
-        value, default = config[key], parameters[key].default
-        default = [*default] if isinstance(default, tuple) else default
-        # PyYAML reads 1e9 without a point as a string, so the numbers are compared by type too.
-        assert (value, type(value)) == (default, type(default))
+def test_a_data_set_brings_its_options_task_and_split(configured, name):
+    config, (task, split) = configured(f"data={name}"), CHOICES[name]
+    named = inspect.signature(registry("data").get(name)).parameters
+    defaults = {key: "???" if p.default is p.empty else p.default for key, p in named.items()}
+    defaults = {key: [*value] if isinstance(value, tuple) else value for key, value in defaults.items()}
+    assert OmegaConf.to_container(config.data) == {"name": name, **defaults}
+    assert config.task.name == task
+    assert config.split == configured(f"data={name}", f"split={split}").split
 
 
 def test_a_split_on_the_command_line_precedes_the_datas_own(configured):
