@@ -1,6 +1,6 @@
-"""Points, planes and mirrors of the projective algebra G(3,0,1), and events of space-time, as multivectors.
+"""Points and planes of the projective algebra G(3,0,1), and events of space-time, as multivectors.
 
-``PROJECTIVE.sandwich`` moves points and planes by any product of mirrors. Multiples of a multivector are the same point
+``PROJECTIVE.sandwich`` moves points and planes by any product of planes. Multiples of a multivector are the same point
 or plane; a mirrored point has a factor of -1, which ``extract_point`` divides away.
 
 Source: Brehmer et al., Geometric Algebra Transformer, 2023, table 1.
@@ -35,20 +35,6 @@ def embed_plane(normals: Float[Tensor, "*batch 3"], offsets: Float[Tensor, "*bat
     """Oriented planes {x: normal · x = offset} as vectors; the offset is in [m] where the normal is of unit length."""
     x, y, z = normals.unbind(-1)
     return _embed(e1=x, e2=y, e3=z, e0=-offsets)
-
-
-def embed_reflection(
-    normals: Float[Tensor, "*batch 3"], offsets: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch 16"]:
-    """Mirrors at planes {x: normal · x = offset} as unit versors; a normal must not be zero."""
-    exponents = torch.frexp(normals.detach().abs().amax(-1)).exponent
-    # Times a power of two, so that squares of the normals neither overflow nor vanish.
-    scale = torch.ldexp(torch.ones_like(offsets), -exponents.clamp(-126, 126))
-    normals, offsets = normals * scale[..., None], offsets * scale
-    length = normals.norm(dim=-1)
-    if not (length > 0).all():
-        raise ValueError("a mirror needs a normal, got one of length zero; check the planes")
-    return embed_plane(normals / length[..., None], offsets / length)
 
 
 def embed_event(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from strategies import coordinates, normals, points, quaternions, tensors
 
 from gaigs.algebra import PROJECTIVE
-from gaigs.algebra.embedding import embed_point, embed_reflection, extract_point
+from gaigs.algebra.embedding import embed_plane, embed_point, extract_point
 from gaigs.geometry import (
     from_spherical,
     quaternions_to_rotations,
@@ -67,5 +67,5 @@ def test_a_reflection_undoes_itself_and_is_the_sandwich_with_the_plane(normal, o
     offset = torch.tensor(offset, dtype=torch.float64)
     once = reflect(point, normal, offset)
     torch.testing.assert_close(reflect(once, normal, offset), point, rtol=0, atol=1e-10)
-    versor = embed_reflection(normal, offset)
+    versor = embed_plane(normal, offset)
     torch.testing.assert_close(extract_point(PROJECTIVE.sandwich(versor, embed_point(point))), once, rtol=0, atol=1e-9)
