@@ -15,7 +15,6 @@ from gaigs.gaussians import write_ply
 from gaigs.io.files import write_text
 from gaigs.placement.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
 from gaigs.placement.mirrored.paths import Mirrored
-from gaigs.placement.mirrored.reflections import fold, images
 from gaigs.placement.mirrored.sheets import Sheet
 from gaigs.propagation import fresnel
 from gaigs.query import Query
@@ -87,19 +86,16 @@ def all_over(scene: Scene) -> Query:
 def survey(placement: Mirrored, query: Query) -> Survey:
     """Powers and bounces of the kept paths of some links, without a deformation."""
     device = placement.sequences.device
-    sequences, normals, offsets = placement.sequences[placement.kept], placement.normals, placement.offsets
-    positions = placement.scene.positions(normals)
+    sequences = placement.sequences[placement.kept]
     powers, bounces, receivers = [], [], []
     for part in query.parts(64):  # links at a time
         part = part.to(device)
         powers.append(placement(None, part).gains.abs().square())
-        receivers.append(positions[part.receivers])
-        middle = placement.middle
-        seen = images(part.transmitters - middle, sequences, normals, offsets)
-        folded = fold(seen, receivers[-1] - middle, sequences, normals, offsets)
-        points = normals.new_full((len(part), *sequences.shape, 3), torch.nan)
+        _, stands, folded = placement.folded(part)
+        receivers.append(placement.scene.positions(stands)[part.receivers])
+        points = stands.new_full((len(part), *sequences.shape, 3), torch.nan)
         for back, met in enumerate(folded.bounces, 1):
-            points[:, met.first :, -back] = met.points + middle
+            points[:, met.first :, -back] = met.points + placement.middle
         bounces.append(points)
     parts = sequences, torch.cat(powers).double(), torch.cat(bounces), query.transmitters, torch.cat(receivers)
     return Survey(*(part.cpu().numpy() for part in parts))

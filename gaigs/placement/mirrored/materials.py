@@ -8,7 +8,7 @@ from scipy.constants import epsilon_0, speed_of_light
 
 from gaigs.data.synthetic.image_source import TABULATED, conductivity
 from gaigs.placement.mirrored.paths import Mirrored
-from gaigs.placement.mirrored.reflections import fold, images, polarised
+from gaigs.placement.mirrored.reflections import polarised
 from gaigs.propagation import slab
 from gaigs.query import Query
 
@@ -34,8 +34,7 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
 
     Source: ITU-R P.2040-3, table 3; outside 1 to 40 GHz its formulas are extrapolated.
     """
-    sequences, normals, offsets = placement.sequences[placement.kept], placement.normals, placement.offsets
-    receivers = placement.scene.positions(normals) - placement.middle
+    sequences, normals = placement.sequences[placement.kept], placement.normals
     gains = placement.path_gains[placement.kept] - placement.path_gains[0]
     gains = (gains / (sequences >= 0).sum(1).clamp_min(1)).exp()
     compared = torch.abs if placement.path_phases is not None else torch.Tensor.clone
@@ -50,9 +49,8 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
     for part in query.parts(64):  # links at a time
         part = part.to(normals.device)
         powers = placement(None, part).gains.abs().square()
-        seen = images(part.transmitters - placement.middle, sequences, normals, offsets)
         response = placement.responses(part)
-        for bounce in fold(seen, receivers[part.receivers], sequences, normals, offsets).bounces:
+        for bounce in placement.folded(part)[2].bounces:
             first, planes, _, cosines = bounce
             wanted = compared(response(bounce) * gains[first:])
             weights.index_add_(0, planes, powers[:, first:].sum(0))

@@ -311,6 +311,13 @@ class Mirrored(Placement):
         placed = Placed(seen[-1] + self.middle, lengths, quats, scales, ones, signal, gains, coherences, bandwidth)
         return placed if gaussians is None else _beside(placed, gaussians)
 
+    def folded(self, query: Query) -> tuple[list[Float[Tensor, "b n 3"]], Float[Tensor, "b 3"], Folded]:
+        """Images of the kept paths, their receivers, and the paths through the room; from its middle [m]."""
+        sequences, normals, offsets = self.sequences[self.kept], self.normals, self.offsets
+        seen = images(query.transmitters - self.middle, sequences, normals, offsets)
+        receivers = (self.scene.positions(normals) - self.middle)[query.receivers]
+        return seen, receivers, fold(seen, receivers, sequences, normals, offsets)
+
     def strengths(self, query: Query, folded: Folded, blocked: bool = True) -> Complex[Tensor, "b n"]:
         """Field of each kept path over free space, after reflections and obstacles; 0 for no path."""
         left = self.path_gains[self.kept] + self.receiver_gains[query.receivers, None]
@@ -352,10 +359,7 @@ class Mirrored(Placement):
 
     def passing(self, query: Query) -> Float[Tensor, "b v"]:
         """Field over free space of the direct path, then of that at each plane; 0 for no path."""
-        sequences = self.sequences[self.kept]
-        seen = images(query.transmitters - self.middle, sequences, self.normals, self.offsets)
-        receivers = (self.scene.positions(query.transmitters) - self.middle)[query.receivers]
-        strengths = self.strengths(query, fold(seen, receivers, sequences, self.normals, self.offsets)).abs()
+        sequences, strengths = self.sequences[self.kept], self.strengths(query, self.folded(query)[2]).abs()
         few = (sequences >= 0).sum(1) <= 1
         found = strengths.new_zeros(len(query), len(self.origin) + 1)
         found[:, sequences[few].amax(1) + 1] = strengths[:, few]
@@ -366,10 +370,7 @@ class Mirrored(Placement):
 
         It is the path's own times the share that obstacles block, and a tenth of that without obstacles.
         """
-        sequences, normals, offsets = self.sequences[self.kept], self.normals, self.offsets
-        seen = images(query.transmitters - self.middle, sequences, normals, offsets)
-        receivers = (self.scene.positions(normals) - self.middle)[query.receivers]
-        folded = fold(seen, receivers, sequences, normals, offsets)
+        seen, receivers, folded = self.folded(query)
         own, free = self.strengths(query, folded), self.strengths(query, folded, blocked=False)
         share = 1 - own.abs() / free.abs().clamp_min(torch.finfo(own.real.dtype).tiny)
         return (share * own + 0.1 * free) * self._patterns(query, seen[-1] - receivers[:, None])

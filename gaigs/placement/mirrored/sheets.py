@@ -17,7 +17,6 @@ from torch.nn import functional
 
 from gaigs.placement.mirrored.obstacles import Obstacles
 from gaigs.placement.mirrored.paths import Mirrored
-from gaigs.placement.mirrored.reflections import fold, images
 from gaigs.query import Query
 
 DENSITIES = 3
@@ -169,9 +168,7 @@ def fit_sheets(
     if obstacles is None:
         return [], 0.0
     query = query[:: math.ceil(len(query) * len(sequences) / PATHS)].to(middle.device)
-    seen = images(query.transmitters - middle, sequences, placement.normals, placement.offsets)
-    receivers = (placement.scene.positions(middle) - middle)[query.receivers]
-    folded = fold(seen, receivers, sequences, placement.normals, placement.offsets)
+    seen, receivers, folded = placement.folded(query)
     fields = placement.strengths(query, folded, blocked=False).abs() / (seen[-1] - receivers[:, None]).norm(dim=-1)
     fields, count = fields.double(), fields.numel()
     fields[fields.square() < FAINTEST * fields.square().sum(1, keepdim=True)] = 0
