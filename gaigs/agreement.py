@@ -225,7 +225,7 @@ def on_split(
     elif baselines:
         labels = torch.cat([links.labels[part] for part in links.split.test.split(evaluation.BATCH)])
         for name, look_up in evaluation.build_baselines(baselines, "", links.scene).items():
-            values = evaluation.predict(evaluation.fitted(look_up, links), links, links.split.test)
+            values = evaluation.predicted(evaluation.fitted(look_up, links), links, links.split.test)
             rows[f"`{name}`"] = task.summarise(task.scores(labels, values))
     return rows, remarks
 

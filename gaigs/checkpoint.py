@@ -140,7 +140,7 @@ def described(model: nn.Module) -> dict:
 def exchange_model(path: Path, model: nn.Module, trained: str) -> None:
     """Replaces the model of a checkpoint by one of the same scene, whose part ``trained`` is the trained model."""
     content = read(path)
-    content[KEY] |= {"version": VERSION, "trained": trained, **described(model)}
+    content[KEY] |= {"trained": trained, **described(model)}
     content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
     write(content, path)
 

@@ -220,22 +220,17 @@ def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str]
     return plain
 
 
-def presets(kind: str, name: str) -> list[DictConfig]:
+def files_of(kind: str, name: str) -> list[Path]:
     """The configuration files of that kind and name, of gaigs and of plug-ins."""
     files = (folder / kind / f"{name}.yaml" for folder in (conf_dir(), *plugin_conf_dirs()))
-    return [OmegaConf.load(file) for file in files if file.is_file()]  # type: ignore[misc]
-
-
-def has_file(kind: str, name: str) -> bool:
-    """True if gaigs or a plug-in has a configuration file of that kind and name."""
-    return any((folder / kind / f"{name}.yaml").is_file() for folder in (conf_dir(), *plugin_conf_dirs()))
+    return [file for file in files if file.is_file()]
 
 
 def preset(model: str, task: str) -> list[str]:
     """The command-line words for a model and a task, with their experiment if there is one."""
     names = (task,) if model == "gaigs" else (f"{model}_{task}", model)
-    experiment = [f"+experiment={name}" for name in names if has_file("experiment", name)][:1]
-    return [*experiment, f"model={model}", *([f"task={task}"] if has_file("task", task) else [])]
+    experiment = [f"+experiment={name}" for name in names if files_of("experiment", name)][:1]
+    return [*experiment, f"model={model}", *([f"task={task}"] if files_of("task", task) else [])]
 
 
 def resolve(config: DictConfig) -> dict:
@@ -392,7 +387,7 @@ def installed(*names: str) -> str:
 
 def known(kind: str, name: str, otherwise: str) -> str:
     """The name if a configuration file or a component has it, else the other one: for choices by task."""
-    return name if has_file(kind, name) or name in registry(kind).names() else otherwise
+    return name if files_of(kind, name) or name in registry(kind).names() else otherwise
 
 
 def by_task(values: Mapping, otherwise: object, *, _root_: DictConfig) -> object:

@@ -65,7 +65,8 @@ def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> dict[st
         )
     a = a[..., 0]
     tau = tau[:, None, :, None] if tau.ndim == 3 else tau
-    if tx.shape != (a.shape[2], 3) or rx.shape != (a.shape[0], 3) or tau.shape not in (a.shape, _shared(a.shape)):
+    shared = (a.shape[0], 1, a.shape[2], 1, a.shape[4])  # the delays of a synthetic array
+    if tx.shape != (a.shape[2], 3) or rx.shape != (a.shape[0], 3) or tau.shape not in (a.shape, shared):
         expected = f"tx {(a.shape[2], 3)}, rx {(a.shape[0], 3)} and tau {a.shape} or without antennas"
         raise ValueError(f"a of {a.shape}: expected {expected}, got {tx.shape}, {rx.shape} and {arrays['tau'].shape}")
     exists = a != 0
@@ -95,8 +96,3 @@ def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> dict[st
         "h": to_channels(gains.astype(complex), delays, frequencies - carrier),
         **{name: arrays[name] for name in ("elements",) if name in arrays},
     }
-
-
-def _shared(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The shape of the delays of a synthetic array, which all antennas share."""
-    return (shape[0], 1, shape[2], 1, shape[4])

@@ -233,6 +233,6 @@ def to_spectra(
     return torch.cat([min_max(bartlett(part, grid, array, frequency)).float() for part in responses])
 
 
-def rss_dbm(responses: Complex[Tensor, "b elements f"], tx_power_dbm: float = 0.0) -> Float[Tensor, " b"]:
-    """Received signal strength [dBm]: power averaged over elements and frequencies."""
-    return tx_power_dbm + 10 * torch.log10(responses.abs().square().mean((1, 2)))
+def rss_dbm(responses: Complex[Tensor, "b elements f"]) -> Float[Tensor, " b"]:
+    """Received signal strength of a transmitter of 0 dBm [dBm]: power averaged over elements and frequencies."""
+    return 10 * torch.log10(responses.abs().square().mean((1, 2)))

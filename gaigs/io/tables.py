@@ -112,11 +112,9 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
     return [cell.strip() for cell in cells] or [line]
 
 
-def split_rows(
-    file: Path, lines: Sequence[str], names: Sequence[str], skip: int, delimiter: str = ","
-) -> dict[int, list[str]]:
+def split_rows(file: Path, lines: Sequence[str], names: Sequence[str], skip: int) -> dict[int, list[str]]:
     """Cells of all lines but the first few; a ``ValueError`` unless each line has one for each name."""
-    rows = {number: split_cells(line, delimiter) for number, line in enumerate(lines[skip:], skip + 1)}
+    rows = {number: split_cells(line) for number, line in enumerate(lines[skip:], skip + 1)}
     wrong = {n: f"{len(cells)}: {quote(lines[n - 1])}" for n, cells in rows.items() if len(cells) != len(names)}
     refuse(file, wrong, f"{len(names)} columns {quote(','.join(names))}")
     return rows

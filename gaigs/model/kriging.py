@@ -392,6 +392,9 @@ def known(links: Links) -> Int[Tensor, " k"]:
     return torch.cat((links.split.train, links.split.validation))
 
 
-def predicted(model: Model, links: Links, index: Int[Tensor, " k"]) -> Tensor:
-    """Predictions of a model for some links, on the CPU."""
-    return torch.cat([values.cpu() for values in model.predict_batches(links.query[index], batch_size=64)])
+def predicted(
+    model: Model, links: Links, index: Int[Tensor, " k"], frequencies: Float[Tensor, " s"] | None = None
+) -> Tensor:
+    """Predictions of a model for some links, on the CPU; of channels at other subcarriers, if they are given [Hz]."""
+    values = model.predict_batches(links.query[index], batch_size=64, frequencies=frequencies)
+    return torch.cat([part.cpu() for part in values])

@@ -10,20 +10,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from gaigs.io.files import write_text
+from gaigs.report import systems
 from gaigs.report.claims import write_claims
 from gaigs.report.curves import speed_against_error
 from gaigs.report.runs import Run, by_seed, read_runs, train_seconds
 from gaigs.report.style import save
-from gaigs.report.systems import write_systems
 from gaigs.report.table import Spread, columns_of, markdown, task_class, terminal, write_csv, written
 
-COSTS = {
-    "train_seconds": "training [s]",
-    "num_gaussians": "Gaussians",
-    "num_parameters": "parameters",
-    "inference_ms": "inference [ms]",
-}
-"""Titles of the costs in ``metrics.json``."""
+COSTS = {key: systems.COSTS[key] for key in ("train_seconds", "num_gaussians", "num_parameters", "inference_ms")}
+"""Titles of the costs in a table of runs."""
 
 SEEDS = "Runs that differ in the seed alone: mean ± standard deviation (n - 1), and the least"
 
@@ -135,8 +130,8 @@ def report(folder: str | Path) -> Group:
         about = f"{SEEDS}; all columns in ablation.md"
         tables.append(_terminal("Over seeds", groups, titles, hidden | {"status"}, about))
     baselines = [row for row in rows if row["status"] == "baseline"]
-    systems = write_systems(folder, runs, baselines, shared, known)
-    return Group(*tables, *(table for table in (systems, claims) if table is not None))
+    of_systems = systems.write_systems(folder, runs, baselines, shared, known)
+    return Group(*tables, *(table for table in (of_systems, claims) if table is not None))
 
 
 def _speed(runs: list[Run], rows: list[dict], shared: Mapping, titles: Mapping[str, str]) -> Figure:

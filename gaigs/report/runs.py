@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gaigs.configuration import differences, presets
+from gaigs.configuration import differences, files_of
 from gaigs.registry import check_type
 from gaigs.report.table import headline
 
@@ -140,7 +140,7 @@ def _correct(overrides: dict[str, str], config: dict) -> tuple[str, ...]:
             there = there.get(part, MISSING) if isinstance(there, dict) else MISSING
         if isinstance(there, dict):
             there = there.get("name", MISSING)
-            known = [value, *(part.get("name") for part in presets(key, value))]
+            known = [value, *(OmegaConf.load(file).get("name") for file in files_of(key, value))]
         else:
             known = [there if "${" in value or isinstance(there, list) else _parsed(value)]
         if there is not MISSING and there not in known:

@@ -18,7 +18,7 @@ from rich.console import Console, Group
 from rich.jupyter import JupyterMixin
 from torch import Tensor
 
-from gaigs.configuration import composed, has_file
+from gaigs.configuration import composed, files_of
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.geometry import even_places
@@ -27,7 +27,7 @@ from gaigs.kriging.intervals import Calibration, holds, interval_scores, nearest
 from gaigs.kriging.links import evenly, folds_of
 from gaigs.kriging.scalar import is_scalar
 from gaigs.model import Model, call_optional
-from gaigs.model.kriging import Kriging
+from gaigs.model.kriging import Kriging, predicted
 from gaigs.query import Batch, Query
 from gaigs.registry import name_of, registry
 from gaigs.report.table import metrics_table, verdict
@@ -80,14 +80,6 @@ def fitted(look_up: Model, links: Links) -> Model:
     return model
 
 
-def predict(
-    model: Model, links: Links, index: Int[Tensor, " k"], frequencies: Float[Tensor, " s"] | None = None
-) -> Tensor:
-    """Predictions for some links, on the CPU; of channels at other subcarriers, if they are given [Hz]."""
-    values = model.predict_batches(links.query[index], batch_size=BATCH, frequencies=frequencies)
-    return torch.cat([part.cpu() for part in values])
-
-
 def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:
     """The model's own deviations of some links, ``Model.spread``, on the CPU; ``values`` are its predictions."""
     parts = zip(links.query[index].parts(BATCH), values.split(BATCH), strict=True)
@@ -105,7 +97,7 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
     level = stated_level(model, links.scene) if is_fitted_anew else None
     for one, part, known in unseen(model, links):
         asked.append(part)
-        values.append(predict(one, links, part))
+        values.append(predicted(one, links, part))
         stated = spreads(one, links, part, values[-1])
         if level is not None:  # hyperparameters of a fold may state larger or smaller deviations everywhere
             stated = stated * (level / stated_level(one, links.scene)).to(stated)[links.query.receivers[part]]
@@ -231,7 +223,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
     own = name_of(model.trend if isinstance(model, Kriging) else model)
     models = {own: model} | ({f"{own}_trend": model.trend} if isinstance(model, Kriging) else {})
     if baselines is None:
-        baselines = composed([f"task={task.name}"], {})["baselines"] if has_file("task", task.name) else ()
+        baselines = composed([f"task={task.name}"], {})["baselines"] if files_of("task", task.name) else ()
     baselines = [baselines] if isinstance(baselines, str) else baselines
     scores = score(models, build_baselines(baselines, own, links.scene), links)
     return Evaluation(task, links.split.name, scores, device_name(device_of(model)))
@@ -282,7 +274,7 @@ def score(
     frequencies = None if links.held_out is None else task.frequencies
     for key in [*models, *look_ups]:
         model = models[key] if key in models else fitted(look_ups[key], links)
-        values = predict(model, links, index, frequencies)
+        values = predicted(model, links, index, frequencies)
         add(key, values)
         calibration = model.calibration if key in models or not has_intervals else calibrated(model, links)
         if has_intervals and frequencies is None and calibration is not None and calibration.gives(0.9):
@@ -325,16 +317,12 @@ def shares(
     return np.array(found)
 
 
-def validating(links: Links) -> Links:
-    """The links as models that have not been fitted to validation links see them, which are the test."""
-    return replace(links, split=links.split.validating(), held_out=None)
-
-
 def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
     """Scores of every validation link, by models that have not been fitted to these links; empty without such links."""
     if not len(links.split.validation):
         return {}
-    return score(models, look_ups, validating(links), has_intervals=False)
+    held_out = replace(links, split=links.split.validating(), held_out=None)
+    return score(models, look_ups, held_out, has_intervals=False)
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:

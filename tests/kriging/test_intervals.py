@@ -226,9 +226,9 @@ def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch
         "gaigs", links, enable_progress_bar=False, max_steps=1, count=10, accelerator="cpu", kriging=False
     )
     chosen, predicted = [], []
-    krige, predict = Kriging.krige, evaluation.predict
+    krige, predict = Kriging.krige, evaluation.predicted
     monkeypatch.setattr(Kriging, "krige", lambda *a, **k: chosen.append(a[1].split.validation) or krige(*a, **k))
-    monkeypatch.setattr(evaluation, "predict", lambda *a: predicted.append(a[2]) or predict(*a))
+    monkeypatch.setattr(evaluation, "predicted", lambda *a: predicted.append(a[2]) or predict(*a))
     kriged = Kriging(links.scene, trend)
     calibration = evaluation.calibrated(kriged.krige(links), links)
     assert torch.equal(chosen[0], links.split.validation)

@@ -198,7 +198,7 @@ def fit(config, links):
 def compare(config, links, sign=-1):
     """Asserts that predictions of the test links are those of the definition, but for float32's rounding."""
     model, test = fit(config, links), links.split.test
-    values = evaluation.predict(model, links, test).reshape(TEST, -1).numpy()
+    values = evaluation.predicted(model, links, test).reshape(TEST, -1).numpy()
     if config["name"] == "gaussian_process":  # the search for these has a test of its own
         config = {**config, "length": model.facts()["length_m"], "nugget": model.facts()["nugget"]}
     elif config.get("k", 0) is None:  # so has the choice of this
