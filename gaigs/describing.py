@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from gaigs.data import Links, load, shortened
+from gaigs.data.doubts import places_doubts
 from gaigs.data.readings import marks_of
 from gaigs.io.files import write_text
 from gaigs.kriging.links import distances, evenly
@@ -24,9 +25,6 @@ from gaigs.task.scalar import with_unit
 
 LINKS, RECEIVERS = 2000, 12
 """Most links whose spectra or channels are read, evenly spread, and most receivers that the text lists."""
-
-SPANS = 0.3, 1000.0
-"""Least and largest usual extent of a measured room [m]; others are probably in another unit."""
 
 BETTER = 0.85
 """Ratio of the errors about the law of distance below which other coordinates of the receivers are named."""
@@ -81,7 +79,10 @@ def describe(links: Links) -> Description:
     ]
     if links.split is not None:
         read.append(f"split {links.split.name}: " + ", ".join(f"{len(p)} {n}" for n, p in links.split.parts().items()))
-    read += filter(None, links.remarks.split("; "))
+    suspicious, remarks = tuple(suspicions(links, sites)), links.remarks
+    for doubt in suspicious:  # which a split has told, too
+        remarks = remarks.replace(doubt, "")
+    read += filter(None, remarks.split("; "))
     if count > 1:
         read.append(f"{'receiver':20} {'links':>6} {'median':>7}  position [m]")
         numbers = links.query.receivers.bincount(minlength=count)
@@ -94,7 +95,7 @@ def describe(links: Links) -> Description:
             read.append(f"{receiver.name[:20]:20} {numbers[k]:6} {median}  {place}{about}")
         if count > RECEIVERS:
             read.append(f"... and {count - RECEIVERS} more receivers with fewer links")
-    return Description(tuple(read), tuple(suspicions(links, sites)))
+    return Description(tuple(read), suspicious)
 
 
 def _read(links: Links) -> Int[Tensor, " k"]:
@@ -127,16 +128,10 @@ def suspicions(links: Links, sites: Float[Tensor, "n 3"]) -> Iterator[str]:
     query, receivers = links.query, links.receivers
     stands = torch.stack([receiver.pose.position for receiver in receivers])
     given = torch.ones(len(receivers), dtype=torch.bool) if links.uncertainties is None else links.uncertainties == 0
-    span = (sites.amax(0) - sites.amin(0)).max().item()
-    if links.frame is None and not SPANS[0] <= span <= SPANS[1]:
-        yield f"places span {span:.3g} m; are they in mm, cm or km?"
-    near = distances(sites.double(), stands[given].double())
-    if len(sites) > 1 and given.any():
-        closest = near.min().item()
-        if closest > 10 * max(span, 1e-6):
-            yield f"receivers are {closest:.3g} m from all places, which span {span:.3g} m; are units and origin alike?"
-        elif (near < 0.01).any():
-            yield f"{int((near < 0.01).any(1).sum())} places are where a receiver stands"
+    yield from places_doubts(links)
+    near = (distances(sites.double(), stands[given].double()) < 0.01).any(1)
+    if len(sites) > 1 and near.any():
+        yield f"{int(near.sum())} places are where a receiver stands"
     for a, b in itertools.combinations(given.nonzero()[:, 0].tolist(), 2):
         if (stands[a] - stands[b]).norm() < 0.01:
             yield f"{receivers[a].name} and {receivers[b].name} stand at one place"

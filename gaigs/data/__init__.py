@@ -199,7 +199,7 @@ def divide(links: Links, split: Mapping) -> Links:
     if links.uncertainties is not None:
         links = with_places(only_trained(links))
     remarks = [links.remarks]
-    for doubt in doubts(links.task, links.labels, links.query.transmitters, links.receivers, links.edges):
+    for doubt in doubts(links):
         log.warning(doubt)
         remarks.append(doubt)
     if isinstance(links.task, Csi):

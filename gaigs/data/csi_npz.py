@@ -190,6 +190,10 @@ def _load(file: Path, given: Mapping[str, str | list]) -> tuple[dict[str, np.nda
 def _join(parts: list[np.ndarray], links: int) -> np.ndarray:
     """Channels from real and imaginary part, in two arrays or along the first or last axis of one."""
     if len(parts) == 2:
+        shapes, kinds = zip(*((part.shape, part.dtype.kind) for part in parts), strict=True)
+        if shapes[0] != shapes[1] or not all(kind in "iuf" for kind in kinds):
+            got = " and ".join(f"{part.dtype} {part.shape}" for part in parts)
+            raise ValueError(f"data.arrays: real and imaginary part of h must be real and of one shape, got {got}")
         return parts[0] + 1j * parts[1]
     (array,) = parts
     if array.ndim == 4 and array.dtype.kind in "iuf":
@@ -275,7 +279,8 @@ def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
         sizes = tuple(known.get(letter, letter) for letter in letters)
         fits = [isinstance(size, str) or size == got for size, got in zip(sizes, array.shape, strict=False)]
         if array.ndim != len(sizes) or not all(fits) or not array.size:
-            hint = "; for one antenna add an axis, h[:, None, :]" if name == "h" and array.ndim == 2 else ""
+            is_flat = name == "h" and (array.ndim == 2 or array.shape[-1] == 1)  # MATLAB's arrays get a last axis of 1
+            hint = "; for one antenna add an axis, h[:, None, :]" if is_flat else ""
             expected = str(sizes).replace("'", "")
             raise ValueError(f"{file}: {name}: expected the shape {expected}, got {array.shape}{hint}")
         known |= dict(zip(letters, array.shape, strict=True))

@@ -1,45 +1,81 @@
 """Doubts about data that were read: sizes in another unit or frame, spectra without a direction."""
 
-from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
+from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.antenna import Receiver
 from gaigs.io.images import GreyImages
-from gaigs.task import Task
 from gaigs.task.spectrum import Spectrum
+
+if TYPE_CHECKING:
+    from gaigs.data import Links
+
+SPANS = 0.3, 1000.0
+"""Least and largest usual extent of a measured room [m]; others are probably in another unit."""
 
 LARGEST = 50.0
 """Ratio of two diagonals above which one is probably in another unit: millimetres differ by 1000."""
 
 
-def doubts(
-    task: Task,
-    labels: Tensor | GreyImages,
-    transmitters: Float[Tensor, "n 3"],
-    receivers: Sequence[Receiver],
-    edges: Float[Tensor, "k 2 3"],
-) -> list[str]:
-    """Sentences about walls, arrays and spectra that do not fit the other data.
+def doubts(links: "Links") -> list[str]:
+    """Sentences about places, walls, arrays and spectra that do not fit the other data.
 
     Raises:
         ValueError: All spectra are constant.
     """
+    transmitters, receivers, task = links.query.transmitters, links.receivers, links.task
     stands = torch.stack([receiver.pose.position for receiver in receivers]).to(transmitters)
     places = torch.cat((transmitters, stands))
-    found = [walls_doubt(edges.flatten(0, 1), places)] if len(edges) else []
-    room = _diagonal(places)
+    found = places_doubts(links)
+    found += [walls_doubt(links.edges.flatten(0, 1), places)] if len(links.edges) else []
+    room, carriers = _diagonal(places), links.query.frequencies
+    wavelength = speed_of_light / carriers.max().item() if carriers is not None else 0.0
     for receiver in receivers:
-        if (extent := _diagonal(receiver.array.elements)) > room > 0:
+        elements = receiver.array.elements
+        extent, aside = _diagonal(elements), elements.mean(0).norm().item()
+        if extent > room > 0:
             found.append(
                 f"the array of {receiver.name} is {extent:.3g} m across, transmitters and receivers {room:.3g} m; "
                 "are its elements in m?"
             )
+        elif len(elements) > 1 and aside > 2 * extent:
+            found.append(
+                f"the elements of {receiver.name} are {aside:.3g} m from its position; elements are relative to it"
+            )
+        elif len(elements) > 1 and wavelength and (apart := torch.pdist(elements).min().item()) > 3 * wavelength:
+            found.append(
+                f"elements of {receiver.name} are {apart:.3g} m apart, "
+                f"{apart / wavelength:.3g} wavelengths; are they in m?"
+            )
+    rounding = places.abs().max().item() * torch.finfo(torch.float32).eps / 2
+    if task.dtype.is_complex and rounding > wavelength / 300 > 0:
+        found.append(
+            f"positions are rounded by up to {rounding:.2g} m, {rounding / wavelength:.2g} wavelengths, which phases "
+            "show; subtract a common origin from all"
+        )
     if isinstance(task, Spectrum):
-        found += _spectra_doubts(task, labels)
+        found += _spectra_doubts(task, links.labels)
     return [doubt for doubt in found if doubt]
+
+
+def places_doubts(links: "Links") -> list[str]:
+    """Sentences about an unusual extent of the places, and receivers far from all of them."""
+    sites = links.query.transmitters.unique(dim=0)
+    given = [k for k in range(len(links.receivers)) if links.uncertainties is None or not links.uncertainties[k]]
+    span, found = (sites.amax(0) - sites.amin(0)).max().item(), []
+    if links.frame is None and not SPANS[0] <= span <= SPANS[1]:
+        found.append(f"places span {span:.3g} m; are they in mm, cm or km?")
+    if len(sites) > 1 and given:
+        stands = torch.stack([links.receivers[k].pose.position for k in given])
+        closest = torch.cdist(sites.double(), stands.double()).min().item()
+        if closest > 10 * max(span, 1e-6):
+            found.append(
+                f"receivers are {closest:.3g} m from all places, which span {span:.3g} m; are units and origin alike?"
+            )
+    return found
 
 
 def walls_doubt(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> str:

@@ -9,11 +9,13 @@ import torch
 from gaigs import configuration
 from gaigs.antenna import Receiver
 from gaigs.data import Links, divide, load
-from gaigs.data.readings import gateway
+from gaigs.data.readings import LOUDEST, gateway, loud_remark, marks_of
 from gaigs.io.tables import number_places
 from gaigs.query import Query, as_numbers, as_positions, as_tensor, check_carrier
 from gaigs.registry import registry
 from gaigs.task import Task
+from gaigs.task.rssi import Rssi
+from gaigs.task.spectrum import Spectrum
 
 
 def links(reader: str | None = None, /, **options: Any) -> Links:
@@ -89,7 +91,10 @@ def from_arrays(
     if np.ma.is_masked(labels):
         raise ValueError("labels must be plain numbers, got a masked array; fill it with nan where nothing was heard")
     convert = as_tensor if task.dtype.is_complex else as_numbers
-    labels = convert("labels", labels, f"those of task {task.name!r}").detach().to(task.dtype)
+    labels = convert("labels", labels, f"those of task {task.name!r}").detach()
+    if task.dtype.is_complex and not labels.is_complex():
+        raise ValueError(f"labels of task {task.name!r} must be complex, got {labels.dtype}; magnitudes have no phase")
+    labels = labels.to(task.dtype)
     count, most, shape = len(places), len(receivers), tuple(task.shape)
     rows = torch.arange(count)
     if tuple(labels.shape) == (count, most, *shape) and index is None:
@@ -106,9 +111,25 @@ def from_arrays(
     if not is_whole or index.shape != (len(rows),) or not ((index >= 0) & (index < most)).all():
         raise ValueError(f"index must be {count} whole numbers from 0 to {most - 1}, got {index.tolist()[:5]} ...")
     flat = labels.reshape(len(rows), -1)
-    heard = (flat != 0).any(1) if task.dtype.is_complex else ~flat.isnan().all(1)
-    if not heard.any() or not flat[heard].isfinite().all():
-        raise ValueError("labels must be finite where something was heard, and something must have been heard")
+    heard = ~flat.isnan().all(1) & ((flat != 0).any(1) | (not task.dtype.is_complex))
+    broken = heard & ~flat.isfinite().all(1)
+    if not heard.any() or broken.any():
+        where = f"; link {int(broken.int().argmax())} is not" if broken.any() else ""
+        raise ValueError(f"labels must be finite where something was heard, and something must have been heard{where}")
+    remarks = f"{int((~heard).sum())} links were not heard and are left out" if not heard.all() else ""
+    if isinstance(task, Rssi | Spectrum):
+        lowest, highest, unit = (-200.0, LOUDEST, " dBm, nan where nothing was heard") if not shape else (0.0, 1.0, "")
+        wrong = heard & ((flat < lowest) | (flat > highest + 1e-6)).any(1)
+        if wrong.any():
+            link = int(wrong.int().argmax())
+            raise ValueError(
+                f"labels of task {task.name!r} must be from {lowest:g} to {highest:g}{unit}; "
+                f"those of link {link} are from {flat[link].min():g} to {flat[link].max():g}"
+            )
+    if isinstance(task, Rssi):
+        remarks += loud_remark(labels[heard].tolist())
+        marks = {mark: int((labels == mark).sum()) for mark in marks_of(labels[:, None].numpy())}
+        remarks += "".join(f"; {count} readings of {mark:g} dBm are taken for levels" for mark, count in marks.items())
     carriers = None
     if frequency is None and hasattr(task, "frequencies"):
         frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
@@ -125,6 +146,6 @@ def from_arrays(
         labels=labels[heard],
         task=task,
         rows=number_places(places.tolist())[1][rows][heard],
-        remarks=f"{int((~heard).sum())} links were not heard and are left out" if not heard.all() else "",
+        remarks=remarks.removeprefix("; "),
     )
     return divide(made, config)

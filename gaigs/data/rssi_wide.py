@@ -233,6 +233,8 @@ def _find_axes(table: Wide, coordinates: Sequence[str] | None = None) -> Axes:
         if len(coordinates) not in (2, 3):
             raise ValueError(f"data.coordinates must be the columns of x, y and optionally z, got {coordinates}")
         x, y, z = [table.column(name) for name in coordinates] + [-1] * (3 - len(coordinates))
+        if plain[x] in PAIRS[2][1] and plain[y] in PAIRS[2][0]:
+            raise ValueError(f"data.coordinates must have the longitude first, got {coordinates}")
         return Axes(x, y, z, plain[z] in FLOORS and z >= 0, plain[x] in PAIRS[2][0])
     found = lambda names: [k for k, name in enumerate(plain) if name in names]
     for pair in PAIRS:
@@ -272,10 +274,15 @@ def _read_gateways(
 ) -> tuple[dict[str, list[float]], list[str]]:
     """Coordinates of the gateways of a file by the names of the table's columns, and the file's other gateways."""
     if file.suffix.lower() in (".yml", ".yaml"):
-        found = {}
+        found, columns = {}, [axes.x, axes.y, axes.z if axes.z >= 0 else axes.x]
+        units = [1.0 if k == axes.z and axes.is_floor else _plain(table.names[k])[1] for k in columns]
         for name, value in read_mapping(file, "each gateway's name: [x, y, z]").items():
             count = 2 if isinstance(value, list) and len(value) == 2 else 3
-            found[name] = [*to_vector(f"{file}: {name}", value, "xyz"[:count]), height][:3]
+            vector = to_vector(f"{file}: {name}", value, "xyz"[:count])
+            place = [unit * x for unit, x in zip(units, vector, strict=False)]
+            if axes.is_floor:
+                place[2:] = [height + storey * floor for floor in place[2:]]
+            found[name] = [*place, height][:3]
     else:
         other = _read_wide(file, "a heading name,x,y,z and one gateway a line")
         own = _find_axes(other)

@@ -16,6 +16,7 @@ from gaigs.model import Model, Prediction, build_trend
 from gaigs.query import Batch, Query
 from gaigs.registry import name_of, register
 from gaigs.scene import Scene
+from gaigs.task.csi import Csi
 
 NEIGHBOURS = 300
 """Known links that enter each prediction of local kriging: with this kernel near links screen those behind them."""
@@ -43,8 +44,8 @@ class GaussianProcess(Model):
     It is a look-up: it keeps the links, and is not stored in a checkpoint.
 
     Args:
-        trend: Configuration of the model whose residuals the process describes. None: each receiver's mean label; for
-            labels of one real number this or ``path_loss``.
+        trend: Configuration of the model whose residuals the process describes. None: ``friis`` for channels, else each
+            receiver's mean label; for labels of one real number this or ``path_loss``.
 
     Raises:
         ValueError: The trend is a trained model.
@@ -54,7 +55,7 @@ class GaussianProcess(Model):
 
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
-        names = ("mean", "path_loss") if is_scalar(scene) else ("mean",)
+        names = ("mean", "path_loss") if is_scalar(scene) else ("friis" if isinstance(scene.task, Csi) else "mean",)
         # In plain sequences: their state is no state of this look-up.
         given = [{"name": name} for name in names] if trend is None else [trend]
         self.trends = tuple(build_trend(one, scene) for one in given)

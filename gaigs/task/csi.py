@@ -1,7 +1,9 @@
 """Channel state information: a complex channel at each element of the receiver's array and each subcarrier."""
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Complex, Float, Int
 from torch import Tensor
@@ -49,7 +51,13 @@ class Csi(Task):
     dtype = torch.complex64
     normalisation = "linear amplitude, in the data's own unit"
 
-    def __init__(self, elements: int, frequencies: Float[Tensor, " s"], phase: str = "known"):
+    def __init__(
+        self,
+        elements: int,
+        frequencies: Float[Tensor, " s"] | Float[np.ndarray, " s"] | Sequence[float],
+        phase: str = "known",
+    ):
+        frequencies = torch.as_tensor(frequencies, dtype=torch.float64)
         if elements < 1:
             raise ValueError(f"a channel needs at least one element, got {elements}")
         if not len(frequencies) or not ((frequencies > 0) & frequencies.isfinite()).all():
@@ -58,7 +66,7 @@ class Csi(Task):
             raise ValueError("subcarriers must have different frequencies, got one twice; leave it out")
         if phase not in PHASES:
             raise ValueError(f"data.phase must be {' or '.join(PHASES)}, got {phase!r}")
-        self.elements, self.frequencies, self.phase = elements, frequencies.double(), phase
+        self.elements, self.frequencies, self.phase = elements, frequencies, phase
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -45,6 +45,7 @@ def test_each_link_has_a_receiver_of_its_own():
     [
         ({"labels": np.zeros((12, 3))}, r"labels of task 'rssi' must be \(12,\) .* or \(12, 2\).*, got \(12, 3\)"),
         ({"labels": np.zeros((12, 2)) + np.inf}, "labels must be finite where something was heard"),
+        ({"labels": np.full((12, 2), 100.0)}, "from -200 to 30 dBm, nan where .*; those of link 0 are from 100 to 100"),
         ({"labels": np.zeros(12), "index": [5] * 12}, "index must be 12 whole numbers from 0 to 1"),
         ({"transmitters": PLACES[:, :2]}, r"transmitters must be \(..., 3\) positions \[m\], got shape \(12, 2\)"),
         ({"transmitters": PLACES * np.nan}, "transmitters must be finite"),
@@ -70,3 +71,23 @@ def test_channels_of_any_layout_are_labels():
         assert torch.equal(labels, torch.from_numpy(channels).to(torch.complex64))
     with pytest.raises(ValueError, match="labels must be those of task 'csi', got a sparse_coo tensor; give a dense"):
         gaigs.links(**arrays, labels=torch.from_numpy(channels).to_sparse())
+
+
+def test_readings_that_may_mean_not_heard_are_counted():
+    readings = np.arange(24.0).reshape(12, 2) - 80
+    readings[:6, 0] = -127
+    links = gaigs.links(task="rssi", transmitters=PLACES, receivers=GATEWAYS, labels=readings)
+    assert "6 readings of -127 dBm are taken for levels" in links.remarks
+
+
+def test_channels_are_complex_and_those_of_nan_are_left_out():
+    task = Csi(1, np.array([2.40e9, 2.41e9]))
+    channels = np.ones((12, 1, 2)) + 1j
+    channels[3] = np.nan
+    arrays = {"task": task, "transmitters": PLACES, "receivers": GATEWAYS[0]}
+    assert len(gaigs.links(**arrays, labels=channels)) == 11
+    channels[4, 0, 0] = np.nan
+    with pytest.raises(ValueError, match=r"must be finite .*; link 4 is not"):
+        gaigs.links(**arrays, labels=channels)
+    with pytest.raises(ValueError, match=r"labels of task 'csi' must be complex, got torch.float64"):
+        gaigs.links(**arrays, labels=np.abs(channels))

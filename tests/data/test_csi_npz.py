@@ -317,3 +317,12 @@ def test_receivers_may_have_different_numbers_of_elements(file):
     elements[1] = np.nan
     with pytest.raises(ValueError, match=r"elements\[1\]: expected an element of each receiver, got NaN alone"):
         read(changed(file, elements=elements, h=h))
+
+
+def test_real_and_imaginary_part_have_one_shape(tmp_path):
+    content = arrays()
+    channels = content.pop("h")
+    parts = {"re": channels.real, "im": channels.imag[..., :1]}
+    np.savez(tmp_path / "parts.npz", **content, **parts)
+    with pytest.raises(ValueError, match="real and imaginary part of h must be real and of one shape"):
+        load({"name": "csi_npz", "file": str(tmp_path / "parts.npz"), "arrays": {"h": ["re", "im"]}}, RANDOM)

@@ -1,5 +1,6 @@
 """Doubts about sizes and spectra, each once and with its numbers."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -58,3 +59,23 @@ def test_spectra_without_a_direction_are_counted_or_refused():
 
 def test_simulated_rooms_are_beyond_doubt():
     assert gaigs.links("synthetic", transmitters=20, order=0).remarks == ""
+
+
+@pytest.mark.parametrize(
+    ("changes", "doubt"),
+    [
+        ({"elements": lambda elements: elements + 3}, "are 5.2 m from its position; elements are relative to it"),
+        ({"elements": lambda elements: elements / 0.06}, "m apart, .* wavelengths; are they in m"),
+        (
+            {"places": lambda places: places + 3e4},
+            "positions are rounded by up to 0.0018 m, .* subtract a common origin",
+        ),
+        ({"places": lambda places: places / 1e5}, "receivers are .* m from all places, which span .* m; are units"),
+    ],
+)
+def test_positions_in_another_unit_or_frame_are_doubted(changes, doubt):
+    links = example_links("csi", 5e9)
+    elements, places = (changes.get(name, lambda values: values) for name in ("elements", "places"))
+    receivers = tuple(replace(each, array=Array(elements(each.array.elements))) for each in links.receivers)
+    query = replace(links.query, transmitters=places(links.query.transmitters))
+    assert re.search(doubt, divide(replace(links, receivers=receivers, query=query), SPLIT).remarks)

@@ -200,3 +200,17 @@ def test_one_level_out_of_bounds_is_an_error(survey):
     positive = re.sub(r"(?<=,)-", "", table())
     with pytest.raises(ValueError, match=r"expected columns of levels .* write levels with their sign"):
         survey(positive)
+
+
+def test_places_of_gateways_in_yaml_have_the_units_of_the_table(survey, tmp_path):
+    (tmp_path / "aps.yml").write_text(
+        "".join(f'"{key}": [{100 * x}, {100 * y}]\n' for key, (x, y, _) in GATEWAYS.items())
+    )
+    links = survey(table(("x [cm]", "y [cm]"), columns=100 * PLACES), gateways=str(tmp_path / "aps.yml"), height=1.5)
+    expected = [[x, y, 1.5] for x, y, _ in GATEWAYS.values()]
+    torch.testing.assert_close(torch.stack([each.pose.position for each in links.receivers]), torch.tensor(expected))
+
+
+def test_a_latitude_is_no_x(survey):
+    with pytest.raises(ValueError, match=r"data.coordinates must have the longitude first"):
+        survey(table(("lat", "lon")), coordinates=["lat", "lon"])
