@@ -3,7 +3,7 @@
 import logging
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
@@ -128,13 +128,7 @@ class ReceiverChannels:
         permittivities, thickness = _materials(slabs)
         depths = thickness[:, None] * self.frequencies / speed_of_light
         gains = folded.exists[..., None].to(self.channels.dtype).expand(-1, -1, len(self.frequencies))
-
-        def response(bounce: Bounces) -> Complex[Tensor, "b w s"]:
-            depth, permittivity = depths[bounce.planes], permittivities[bounce.planes, None]
-            te, tm = slab(permittivity, bounce.cosines[..., None].clamp(1e-3, 1), depth)
-            return polarised(normals[bounce.planes, None], te, tm)
-
-        gains = folded.reflected(gains, response)
+        gains = folded.reflected(gains, partial(_response, normals, permittivities, depths))
         waves = self.waves(seen[-1]).unflatten(-1, (len(self.elements), -1))
         return (waves * gains[:, :, None]).flatten(-2)
 
@@ -635,6 +629,13 @@ def _materials(slabs: Float[Tensor, "*w 3"]) -> tuple[Complex[Tensor, "*w"], Flo
     """Permittivities, and thicknesses [m]."""
     real, imaginary, thickness = slabs.exp().unbind(-1)
     return torch.complex(1 + real, -imaginary), thickness
+
+
+def _response(normals, permittivities, depths, bounce: Bounces) -> Complex[Tensor, "b w s"]:
+    """Reflection coefficients of a bounce at slabs whose thicknesses are given in wavelengths."""
+    depth, permittivity = depths[bounce.planes], permittivities[bounce.planes, None]
+    te, tm = slab(permittivity, bounce.cosines[..., None].clamp(1e-3, 1), depth)
+    return polarised(normals[bounce.planes, None], te, tm)
 
 
 def _evenly(count: int, most: int) -> Int[Tensor, " k"]:
