@@ -221,6 +221,7 @@ def test_intervals_that_the_links_cannot_give_are_refused():
 
 def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch):
     monkeypatch.setattr(scalar, "NEAREST", 4)
+    monkeypatch.setattr(scalar, "STEPS", 2)
     links = gaigs.links("synthetic_rssi", transmitters=100, order=0, validation=0.3)
     trend = gaigs.train(
         "gaigs", links, enable_progress_bar=False, max_steps=1, count=10, accelerator="cpu", kriging=False
