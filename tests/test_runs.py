@@ -21,6 +21,7 @@ from gaigs import configuration, runs
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.geometry import Pose
+from gaigs.placement.mirrored.channel_search import SLABS, ChannelSearch
 from gaigs.processes import Stopped, stopping
 from gaigs.radio_maps import RadioMap
 from gaigs.report.curves import read_curves
@@ -483,13 +484,15 @@ def test_rssi_from_end_to_end(tmp_path):
     assert floor.values[1, 2, 3] == pytest.approx(model.predict(point, "south").item(), abs=1e-3)
 
 
-def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path):
+def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path, monkeypatch):
     """Whatever the steps do: here they drive all apart. The start is looked at before the first revision."""
     options = (
         "+experiment=mirrored_csi", "data.transmitters=30", "data.order=1", "split.validation=0.5", "kriging=false",
         "baselines=[{name: friis}]", "trainer.max_steps=6", "trainer.val_check_interval=3", *SMALL[9:11],
         "training.learning_rates={planes: 10, paths: 10, obstacles: 10}", "placement.planes=6", "placement.order=1",
     )  # fmt: skip
+    found = torch.eye(4)[:3].double(), SLABS[:3]  # instead of a search
+    monkeypatch.setattr(ChannelSearch, "run", lambda _: found)
     metrics = runs.run(gaigs.compose(*options), tmp_path)
     own, free_space = (metrics["validation"][name] for name in ("mirrored", "friis"))
     for name in ("sinad_db_mean", "snr_db_median", "nmse_db"):
@@ -571,6 +574,7 @@ def test_tensorboard_logs_beside_the_csv(tmp_path):
 @pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
 def test_the_first_page_names_every_key_of_the_metrics(tmp_path, monkeypatch, task):
     monkeypatch.setattr(runs, "has_radio_map", lambda _: False)  # which takes long
+    monkeypatch.setattr("gaigs.kriging.scalar.STEPS", 2)
     words = [
         f"+experiment={'mirrored' if task == 'spectrum' else f'mirrored_{task}'}", "data.transmitters=16",
         "trainer.max_steps=1", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "placement.order=1",
