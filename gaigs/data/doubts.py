@@ -1,6 +1,6 @@
 """Doubts about data that were read: sizes in another unit or frame, spectra without a direction."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -10,9 +10,6 @@ from torch import Tensor
 from gaigs.io.images import GreyImages
 from gaigs.task.spectrum import Spectrum
 
-if TYPE_CHECKING:
-    from gaigs.data import Links
-
 SPANS = 0.3, 1000.0
 """Least and largest usual extent of a measured room [m]; others are probably in another unit."""
 
@@ -20,8 +17,8 @@ LARGEST = 50.0
 """Ratio of two diagonals above which one is probably in another unit: millimetres differ by 1000."""
 
 
-def doubts(links: "Links") -> list[str]:
-    """Sentences about places, walls, arrays and spectra that do not fit the other data.
+def doubts(links: Any) -> list[str]:
+    """Sentences about places, walls, arrays and spectra of ``Links`` that do not fit the other data.
 
     Raises:
         ValueError: All spectra are constant.
@@ -61,7 +58,7 @@ def doubts(links: "Links") -> list[str]:
     return [doubt for doubt in found if doubt]
 
 
-def places_doubts(links: "Links") -> list[str]:
+def places_doubts(links: Any) -> list[str]:
     """Sentences about an unusual extent of the places, and receivers far from all of them."""
     sites = links.query.transmitters.unique(dim=0)
     given = [k for k in range(len(links.receivers)) if links.uncertainties is None or not links.uncertainties[k]]
