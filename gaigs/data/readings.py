@@ -35,16 +35,17 @@ def to_dbm(file: Path, rows: Rows, names: Sequence[str], lowest: float, not_hear
 def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     """Values among readings [dBm] that mean "not heard", a gateway a column; NaN for an empty cell.
 
-    They are repeated or usual values out of bounds, and one from -1 to 1 that is 10 dB above all others. Of columns
-    with two values or more, they are usual values from -105 down that are 5 dB below all others, and the lowest and
-    usual ones that have 5 % of the readings, five times those of each value within 5 dB, and stand in two columns or
-    the only one.
+    They are repeated or usual values out of bounds, and 0 or a repeated -1 or 1 that is 10 dB above all others. Of
+    columns with two values or more, they are usual values from -105 down that are 5 dB below all others, and the lowest
+    and usual ones that have 5 % of the readings, five times those of each value within 5 dB, and stand in two columns
+    or the only one.
     """
     values, counts = np.unique(levels[np.isfinite(levels)], return_counts=True)
     outside = (values < QUIETEST) | (values > LOUDEST)
     marks = values[outside & ((counts > 1) | np.isin(values, MARKS))].tolist()
-    values = values[~outside]
-    if len(values) > 1 and abs(values[-1]) <= 1 and values[-2] < values[-1] - 10:
+    values, counts = values[~outside], counts[~outside]
+    is_usual = len(values) > 1 and (values[-1] == 0 or (abs(values[-1]) <= 1 and counts[-1] > 1))
+    if is_usual and values[-2] < values[-1] - 10:
         marks.append(values[-1].item())
     lowest = values.min(initial=0)
     own = np.where((levels >= QUIETEST) & (levels <= LOUDEST), levels, np.nan)

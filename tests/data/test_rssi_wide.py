@@ -163,7 +163,7 @@ def test_marks_are_found_and_levels_are_not():
     own = np.round(draw.normal(-75, 9, (100, 5))).clip(-104, -40)
     own[0, 0] = -104
     unheard = draw.random(own.shape) < 0.4
-    for mark in (100, -200, 127, -110, -105, -100, 0):
+    for mark in (100, -200, 127, -110, -105, -100, 0, -1):
         assert marks_of(np.where(unheard, mark, own)) == [mark]
     assert marks_of(np.where(unheard & (np.arange(5) == 2), -120, own)) == [-120]
     own = own.clip(-88)
