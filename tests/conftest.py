@@ -10,12 +10,10 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from hypothesis import HealthCheck, Phase, settings
 
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start
-yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same in C, for hundreds of configurations
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell runs the tests in the background
 settings.register_profile(
     "gaigs",
