@@ -682,8 +682,8 @@ def smoothed(logarithms: Float[Tensor, "n g"], places: Float[Tensor, "g 3"], ste
 
     def moved(logarithm: Tensor, first: Tensor, second: Tensor) -> Tensor:
         if not known or not all(map(torch.equal, known, (first, second))):  # a walk may stay
-            moves = (distances(places[second], places[first]) / step).square_().div_(-2).exp_().add_(JUMP)
-            known[:] = first, second, moves
+            moves = (distances(places[second], places[first]) / step).square_().div_(-2)
+            known[:] = first, second, moves.clamp_min_(-30).exp_().add_(JUMP)  # less is no number beside JUMP, and slow
         moves = known[2]
         return (moves @ (logarithm - logarithm.max()).exp()).log()  # above 0: each move may be a jump
 

@@ -36,7 +36,7 @@ def quick():
         patch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
         patch.setattr("gaigs.runs.evaluation.median_ms", lambda work: (work(), 1.0)[1])
         patch.setattr("gaigs.kriging.scalar.NEAREST", 4)
-        patch.setattr("gaigs.kriging.scalar.STEPS", 2)
+        patch.setattr("gaigs.kriging.scalar.ITERATIONS", 2)
         yield
 
 

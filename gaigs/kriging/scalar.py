@@ -28,8 +28,8 @@ DEGREES = 4.0
 ROUNDS = 3
 """Repetitions of expectation and maximisation for the variances of single readings."""
 
-STEPS = 50
-"""Most steps of a maximisation."""
+ITERATIONS = 50
+"""Most iterations of a maximisation."""
 
 PART = 2048
 """Places whose neighbours are held in memory at a time."""
@@ -288,7 +288,7 @@ class ScalarProcess(nn.Module):
                 own, made = unpacked(torch.from_numpy(point))
                 between = covariances(around, own.exp(), made)[:, :-1, :-1]
                 factors = expected_factors(between, heard, (2 * own[around.receivers, 2]).exp(), made.degrees)
-            found = minimize(cost, point, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
+            found = minimize(cost, point, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS})
             point = found.x
         own, made = unpacked(torch.from_numpy(point))
         return float(found.fun), own, made._replace(scale=float(made.scale))

@@ -130,8 +130,8 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
     """Models like a model, links that they have not seen, and the links that they know; each when it is asked for.
 
     A look-up is fitted anew without each fold of the known links. A trained model has the validation links; the step of
-    its training stays the one chosen on all of them. Kriging knows them, and has chosen weights and hyperparameters by
-    them: for each half of them it is fitted and chosen anew on the other links.
+    its training stays the one chosen on all of them. Kriging is fitted anew to the training links, and its weights and
+    hyperparameters are chosen for each half of the validation links by the other half; one group alone chooses, too.
     """
     split, validation, receivers = links.split, links.split.validation, links.query.receivers
     if not (is_trained(model) or isinstance(model, Kriging)):
@@ -154,8 +154,9 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
         if len(validation):
             yield model, validation, split.train
         return
-    pairs = (parts, parts[::-1]) if all(map(len, parts)) else [(validation, validation)] * bool(len(validation))
-    for own, other in pairs:
+    if not len(validation):
+        return
+    for own, other in (parts, parts[::-1]) if all(map(len, parts)) else ((validation, validation),):
         kriged = Kriging(links.scene, model.trend, model.fallback_options).to(device_of(model))
         yield kriged.krige(replace(links, split=split.choosing(own)), is_final=False), other, split.train
 

@@ -219,13 +219,17 @@ def test_intervals_that_the_links_cannot_give_are_refused():
             model.predict([1.0, 1.0, 1.0], interval=wrong)
 
 
-def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch):
-    monkeypatch.setattr(scalar, "NEAREST", 4)
-    monkeypatch.setattr(scalar, "STEPS", 2)
-    links = gaigs.links("synthetic_rssi", transmitters=100, order=0, validation=0.3)
-    trend = gaigs.train(
+def barely_trained(links):
+    return gaigs.train(
         "gaigs", links, enable_progress_bar=False, max_steps=1, count=10, accelerator="cpu", kriging=False
     )
+
+
+def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch):
+    monkeypatch.setattr(scalar, "NEAREST", 4)
+    monkeypatch.setattr(scalar, "ITERATIONS", 2)
+    links = gaigs.links("synthetic_rssi", transmitters=100, order=0, validation=0.3)
+    trend = barely_trained(links)
     chosen, predicted = [], []
     krige, predict = Kriging.krige, evaluation.predicted
     monkeypatch.setattr(Kriging, "krige", lambda *a, **k: chosen.append(a[1].split.validation) or krige(*a, **k))
@@ -263,3 +267,14 @@ def test_a_receiver_that_one_place_hears_leaves_the_others_their_intervals():
     )
     calibration = gaigs.train("knn", links).calibration
     assert calibration.counts.sum() == len(links) - 1
+
+
+def test_kriging_does_not_know_a_single_group_of_validation_links():
+    links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
+    alone = (links.query.transmitters == links.query.transmitters[links.split.validation[0]]).all(1).nonzero()[:, 0]
+    links = replace(links, split=links.split.only(links.split.train).choosing(alone))
+    kriged = Kriging(links.scene, barely_trained(links))
+    kriged.krige(links)
+    ((model, part, known),) = evaluation.unseen(kriged, links)
+    assert torch.equal(part, alone)
+    assert len(model.process.values) == len(known) == len(links.split.train)

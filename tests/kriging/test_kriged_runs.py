@@ -28,7 +28,7 @@ def quick():
         patch.setattr(evaluation, "median_ms", lambda *_: 1.0)
         patch.setattr(fit, "AROUND", 8)
         patch.setattr(scalar, "NEAREST", 8)
-        patch.setattr(scalar, "STEPS", 2)
+        patch.setattr(scalar, "ITERATIONS", 2)
         yield
 
 

@@ -74,7 +74,7 @@ def test_channels_deviate_by_the_size_of_their_complex_difference():
 
 def test_kriging_has_the_ensemble_as_its_trend(tmp_path, monkeypatch):
     monkeypatch.setattr(scalar, "NEAREST", 4)
-    monkeypatch.setattr(scalar, "STEPS", 2)
+    monkeypatch.setattr(scalar, "ITERATIONS", 2)
     links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
     model = gaigs.train("gaigs", links, ensemble=2, kriging=True, folder=tmp_path, **FEW)
     assert isinstance(gaigs.load(tmp_path / "best.ckpt").trend, Ensemble)

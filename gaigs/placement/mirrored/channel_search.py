@@ -631,8 +631,13 @@ def _materials(slabs: Float[Tensor, "*w 3"]) -> tuple[Complex[Tensor, "*w"], Flo
     return torch.complex(1 + real, -imaginary), thickness
 
 
-def _response(normals, permittivities, depths, bounce: Bounces) -> Complex[Tensor, "b w s"]:
-    """Reflection coefficients of a bounce at slabs whose thicknesses are given in wavelengths."""
+def _response(
+    normals: Float[Tensor, "v 3"],
+    permittivities: Complex[Tensor, " v"],
+    depths: Float[Tensor, "v s"],
+    bounce: Bounces,
+) -> Complex[Tensor, "b w s"]:
+    """Reflection coefficients of a bounce at slabs, their thicknesses (depths) in wavelengths."""
     depth, permittivity = depths[bounce.planes], permittivities[bounce.planes, None]
     te, tm = slab(permittivity, bounce.cosines[..., None].clamp(1e-3, 1), depth)
     return polarised(normals[bounce.planes, None], te, tm)
