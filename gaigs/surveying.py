@@ -291,19 +291,8 @@ def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process
 def posterior(process: Process, asked: Float[Tensor, "g d"]) -> Float[Tensor, "g g"]:
     """Covariances of the process at places, given its readings; of many an even part."""
     rows = evenly(torch.arange(len(process.places)), LIMIT).to(process.places.device)
-    left, _ = whitened(process, rows, asked)
+    left, _ = process.whitened(asked, rows)
     return process.covariances(asked, asked) - left.mT @ left
-
-
-def whitened(
-    process: Process, rows: Int[Tensor, " j"], asked: Float[Tensor, "g d"]
-) -> tuple[Float[Tensor, "j g"], Float[Tensor, "j j"]]:
-    """Covariances of some known readings with places over the readings' Cholesky factor; and this factor."""
-    places = process.places[rows]
-    own = process.covariances(places, places)
-    own.diagonal().add_(process.noises[rows])
-    factor = torch.linalg.cholesky(own)
-    return torch.linalg.solve_triangular(factor, process.covariances(places, asked), upper=False), factor
 
 
 def without(
@@ -320,13 +309,13 @@ def without(
     def error(kept: Bool[Tensor, " k"]) -> float:
         parts = []
         for process, own, place, variance in zip(processes, rows, which, prior, strict=True):
-            left, _ = whitened(process, own[kept[place]], asked)
+            left, _ = process.whitened(asked, own[kept[place]])
             parts.append(((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt().mean().item())
         return float(np.mean(parts))
 
     losses = known.new_zeros(len(known))
     for process, own, place, variance in zip(processes, rows, which, prior, strict=True):
-        left, root = whitened(process, own, asked)
+        left, root = process.whitened(asked, own)
         deviations = ((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt()
         weights = torch.linalg.solve_triangular(root.mT, left, upper=True)
         inverse = torch.cholesky_inverse(root)

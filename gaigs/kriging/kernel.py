@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.kriging.links import distances
@@ -25,6 +25,17 @@ class Process:
     places: Float[Tensor, "k d"]
     noises: Float[Tensor, " k"]
     noise: float
+
+    def whitened(
+        self, asked: Float[Tensor, "g d"], rows: Int[Tensor, " j"] | slice = slice(None)
+    ) -> tuple[Float[Tensor, "j g"], Float[Tensor, "j j"]]:
+        """Covariances of known readings, or some rows of them, with places over the readings' Cholesky factor; and this
+        factor. Squares of the first, summed over the readings, are what they take off the variance at a place."""
+        places = self.places[rows]
+        own = self.covariances(places, places)
+        own.diagonal().add_(self.noises[rows])
+        factor = torch.linalg.cholesky(own)
+        return torch.linalg.solve_triangular(factor, self.covariances(places, asked), upper=False), factor
 
 
 LIMIT = 6000
