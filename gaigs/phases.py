@@ -9,6 +9,15 @@ from torch import Tensor
 TELLING = 5
 """Fewest links of a receiver that show a sign of the phases; with fewer, chance decides."""
 
+MANY = 30
+"""Fewest links a receiver that tell random phases, and phases that geometry does not explain, from chance."""
+
+LEAST = 0.01
+"""Least share of the power that the direct wave keeps in a mean over links, beside that of chance."""
+
+ALIKE = 0.7
+"""Least share of a mean response that elements or subcarriers have in common; of calibrated arrays it is 0.99."""
+
 
 def phase_sign(
     channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, " k"]
@@ -20,17 +29,63 @@ def phase_sign(
     times that of chance: never with fewer than ``TELLING`` links a receiver. ``waves`` are ``direct_waves`` of the same
     links with the sign -1.
     """
-    relative, phases = _relative(channels, waves), waves.angle()
-    kept = {-1: 0.0, 1: 0.0}
-    for receiver in receivers.unique().tolist():
-        own = receivers == receiver
-        for sign in kept:
-            still = relative[own] * torch.polar(torch.ones_like(phases[own]), sign * phases[own])
-            kept[sign] += int(own.sum()) * still.mean(0).abs().square().mean().item()
-    total = relative.abs().square().mean().item() * len(receivers)
+    kept = {}
+    for sign in (-1, 1):
+        responses = common_responses(channels, waves, receivers, sign)
+        powers = [(receivers == k).sum() * response.abs().square().mean() for k, response in responses.items()]
+        kept[sign] = float(sum(powers)) / len(receivers)
     best = max(kept, key=kept.__getitem__)
     chance = len(receivers.unique()) / len(receivers)
-    return best if kept[best] > (0.01 + 4 * chance) * total else 0
+    return best if kept[best] > LEAST + 4 * chance else 0
+
+
+def common_responses(
+    channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, " k"], sign: int
+) -> dict[int, Complex[Tensor, "e s"]]:
+    """Mean of each receiver's channels over free space, by its number; arguments are as for ``phase_sign``.
+
+    It is one number for all elements and subcarriers, as far as their places and frequencies are true.
+    """
+    relative, phases = _relative(channels, waves), waves.angle()
+    still = relative * torch.polar(torch.ones_like(phases), sign * phases)
+    return {receiver: still[receivers == receiver].mean(0) for receiver in receivers.unique().tolist()}
+
+
+def strange_parts(
+    channels: Complex[Tensor, "k e s"],
+    waves: Complex[Tensor, "k e s"],
+    receivers: Int[Tensor, " k"],
+    frequencies: Float[Tensor, " s"],
+    sign: int,
+) -> dict[int, tuple[bool, bool, float | None]]:
+    """Receivers at which the direct wave has fixed phases or strengths that geometry does not explain.
+
+    Of each the result says whether elements have them, whether subcarriers do, and the delay [s] that explains the
+    latter if one does. A receiver counts with ``MANY`` links or more that have a direct wave, its elements if the waves
+    come from directions that they tell apart: from one direction, reflections look the same. Other arguments are as for
+    ``phase_sign``.
+    """
+    found = {}
+    for receiver, response in common_responses(channels, waves, receivers, sign).items():
+        own, shown = receivers == receiver, response.abs().square().mean().item()
+        count, heard = int(own.sum()), (waves[receivers == receiver] != 0).any(2).any(0)
+        if count < MANY or shown < LEAST + 4 / count:
+            continue
+        response, turns = response[heard], waves[own][:, heard].sgn()
+        power = response.abs().square().mean() * (1 - (1 - shown) / count / shown)  # without that of chance
+        if response.mean().abs().square() > ALIKE * power:
+            continue
+        by_element, by_subcarrier = (response.mean(axis).abs().square().mean() < ALIKE * power for axis in (0, 1))
+        aside = (turns * turns.mean(1, keepdim=True).sgn().conj()).mean(0).abs().square().mean()
+        elements, subcarriers, delay = bool(by_element and aside < 0.5), bool(by_subcarrier), None
+        if subcarriers:
+            rates = 2 * math.pi * (frequencies - frequencies.mean())
+            late = _best_delays(response.sum(0), rates)
+            if (response * torch.polar(torch.ones_like(rates), late * rates)).mean().abs().square() > ALIKE * power:
+                delay = -sign * late.item()
+        if elements or subcarriers:
+            found[receiver] = elements, subcarriers, delay
+    return found
 
 
 def array_sign(
@@ -93,6 +148,7 @@ def unknown_phase(
     waves: Complex[Tensor, "k e s"],
     receivers: Int[Tensor, " k"],
     frequencies: Float[Tensor, " s"],
+    declared: str = "known",
 ) -> str | None:
     """The ``data.phase`` of channels that resemble the direct wave within each link, but by no phase in common.
 
@@ -103,7 +159,7 @@ def unknown_phase(
     ``direct_waves`` of the same links.
     """
     chance = len(receivers.unique()) / max(len(receivers), 1)
-    if chance > 1 / 30:
+    if chance > 1 / MANY:
         return None
     numbers, elements = channels[0].numel(), channels.shape[1]
     normalised = _normalised(channels.to(torch.complex128))
@@ -123,7 +179,10 @@ def unknown_phase(
             agreement.append((sum(sums) / plain.abs().sum()).item())
         if max(agreement) > 3 * math.sqrt(chance):
             return None
-        if max(likeness) >= 0.5:
+        if phase == declared:
+            if max(likeness) >= 0.25:
+                return None
+        elif max(likeness) >= 0.5:
             return phase
     return None
 

@@ -9,7 +9,7 @@ import torch
 import gaigs
 from gaigs.data import divide
 from gaigs.model.kriging import Kriging
-from gaigs.phases import array_sign, unknown_phase
+from gaigs.phases import array_sign, strange_parts, unknown_phase
 from gaigs.registry import registry
 from gaigs.scene import direct_waves
 from gaigs.task.csi import PHASES, Csi
@@ -61,6 +61,45 @@ def test_channels_unlike_the_direct_wave_tell_nothing(what):
     count = 4 if what == "few" else len(labels)
     parts = (part[:count] for part in (labels, waves, query.receivers))
     assert unknown_phase(*parts, task.frequencies) is None
+
+
+def test_random_delays_declared_as_phases_alone_are_noticed():
+    links = simulated("per_link_and_delay")
+    task = Csi(links.task.elements, links.task.frequencies, "per_link")
+    assert divide(replace(links, task=task), SPLIT).remarks.endswith(
+        "no delay in common, as if each packet had its own; set data.phase=per_link_and_delay"
+    )
+
+
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("delay", "take a delay of 4.99 ns off h"),
+        ("elements", "the elements of gateway1 have phases that geometry does not explain"),
+        ("order", "phases of the channels follow the direct distance at no receiver"),
+    ],
+)
+def test_phases_that_geometry_does_not_explain_are_noticed(what, words, caplog):
+    links = simulated("known")
+    labels, frequencies = links.labels, links.task.frequencies
+    if what == "delay":
+        labels = labels * torch.exp(-2j * torch.pi * 5e-9 * frequencies).to(labels)
+    if what == "elements":
+        labels = labels * torch.exp(1j * torch.arange(16.0))[:, None]
+    if what == "order":
+        labels = labels.roll(1, 0)
+    remarks = undeclared(links, labels).remarks
+    assert words in remarks
+    assert words in caplog.text
+    assert remarks.count(";") == 2
+
+
+def test_places_in_one_direction_say_nothing_of_elements():
+    links = simulated("known")
+    task, receivers = links.task, torch.zeros(60, dtype=torch.long)
+    waves = torch.ones(60, *task.shape, dtype=torch.complex128)
+    turns = torch.polar(torch.ones(16), torch.arange(16.0))[:, None]
+    assert strange_parts(turns * waves, waves, receivers, task.frequencies, -1) == {}
 
 
 @each

@@ -16,7 +16,7 @@ from gaigs.data.doubts import doubts
 from gaigs.data.gateways import estimate_place
 from gaigs.geometry import Frame, Pose
 from gaigs.io.images import GreyImages
-from gaigs.phases import unknown_phase
+from gaigs.phases import MANY, phase_sign, strange_parts, unknown_phase
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.scene import Scene, direct_waves
@@ -203,25 +203,51 @@ def divide(links: Links, split: Mapping) -> Links:
         log.warning(doubt)
         remarks.append(doubt)
     if isinstance(links.task, Csi):
-        remarks.append(_phase_remark(links, links.task))
+        remarks += _phase_remarks(links, links.task)
     return replace(links, remarks="; ".join(filter(None, remarks)))
 
 
-def _phase_remark(links: Links, task: Csi) -> str:
-    """A sentence if the phase of channels is unknown, declared or found; else empty."""
+def _phase_remarks(links: Links, task: Csi) -> list[str]:
+    """Sentences if phases of channels are unknown, declared or found, or do not follow the geometry."""
+    found = []
     if task.phase != "known":
         unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[task.phase]
-        return f"{unknown} of each link unknown, and removed in every score"
+        found.append(f"{unknown} of each link unknown, and removed in every score")
+    if task.phase == "per_link_and_delay":
+        return found
     train = links.split.train[:: max(1, len(links.split.train) // 256)]
-    query = links.query[train]
+    receivers, labels = links.query.receivers[train], links.labels[train].to(torch.complex128)
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
-    waves = direct_waves(everywhere, query, task.frequencies)
-    phase = unknown_phase(links.labels[train], waves, query.receivers, task.frequencies)
-    if phase is None:
-        return ""
-    remark = f"channels have no phase in common, as if each packet had its own; set data.phase={phase}"
-    log.warning(remark)
-    return remark
+    waves, doubts = direct_waves(everywhere, links.query[train], task.frequencies), []
+    is_known, strange = task.phase == "known", {}
+    sign = phase_sign(labels, waves, receivers) if is_known else 0
+    if sign:
+        strange = strange_parts(labels, waves, receivers, task.frequencies, sign)
+    is_fixed = any(elements or delay is not None for elements, _, delay in strange.values())
+    if not is_fixed and (phase := unknown_phase(labels, waves, receivers, task.frequencies, task.phase)):
+        common = "phase" if is_known else "delay"
+        doubts.append(f"channels have no {common} in common, as if each packet had its own; set data.phase={phase}")
+        strange = {}
+    elif is_known and not sign and len(train) >= MANY * len(receivers.unique()):
+        doubts.append(
+            "phases of the channels follow the direct distance at no receiver; unless walls block all direct waves, "
+            "check units and order of tx, rx, elements and h, and the frequencies"
+        )
+    for receiver, (elements, subcarriers, delay) in strange.items():
+        unexplained = "have phases that geometry does not explain, the same at all links"
+        if elements:
+            doubts.append(
+                f"the elements of {links.receivers[receiver].name} {unexplained}; check order, axes and unit of "
+                "elements and tx, or calibrate the array"
+            )
+        if subcarriers:
+            late = "check their order"
+            if delay is not None:
+                late = f"take a delay of {1e9 * delay:.3g} ns off h, or set data.phase=per_link_and_delay"
+            doubts.append(f"the subcarriers of {links.receivers[receiver].name} {unexplained}; {late}")
+    for doubt in doubts:
+        log.warning(doubt)
+    return found + doubts
 
 
 def only_trained(links: Links) -> Links:
