@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,8 @@ class Kriging(Model):
     of a place as one: without such links a half. Their weight is 1.
 
     Of a trend whose paths have ``margins``, strengths are kriged path by path, and phases stay those of the geometry.
-    The process is always the same, and the weight 1 or 0.
+    The process is always the same, and the weight 1 or 0. Where the validation links say that kriged labels are better
+    by more than chance, as of places closer than half a wavelength, those are taken.
 
     A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal components. Of a receiver
     with more than ``LIMIT`` known links an even part is used.
@@ -88,12 +89,19 @@ class Kriging(Model):
         self.register_buffer("trend_weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("hyperparameters", torch.full((3,), math.nan, dtype=torch.float64))
-        self.by_paths = getattr(self.trend, "has_margins", False)
         self.is_scalar = is_scalar(scene)
         if self.is_scalar:
             self.process = ScalarProcess(scene)
-        else:
-            self.fields = nn.ModuleList(PathField() if self.by_paths else Field(scene) for _ in scene.receivers)
+        self._make_fields(getattr(self.trend, "has_margins", False))
+
+    def _make_fields(self, by_paths: bool) -> None:
+        self.by_paths = by_paths
+        if not self.is_scalar:
+            self.fields = nn.ModuleList(PathField() if by_paths else Field(self.scene) for _ in self.scene.receivers)
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        self._make_fields(f"{prefix}fields.0.precisions" in state_dict)
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def fit(self, links: Links) -> None:
         """Kriges the residuals of the trend, which must be trained."""
@@ -106,16 +114,41 @@ class Kriging(Model):
         If not ``is_final``, only the validation model is fitted, without a word.
         """
         links = thinned(links, LIMIT)
-        split = links.split
-        values = predicted(self.trend, links, known(links))
+        values, held = predicted(self.trend, links, known(links)), links.split.validation
         self.fallback.fit(links)
-        if self.by_paths:
-            return self._krige_paths(links, values, is_final)
+        if getattr(self.trend, "has_margins", False):
+            whole = self._krige_labels(links, values, False) if len(held) else None
+            by_paths = self._krige_paths(links, values, is_final)
+            if whole is None:
+                return by_paths
+            scores = self._validation_scores(links, (predicted(model, links, held) for model in (whole, by_paths)))
+            if not is_surely_better(*scores):
+                return by_paths
+            if is_final:
+                log.warning(
+                    "paths do not explain the channels: %s on validation links is %.3g, of kriged labels %.3g\n"
+                    "the prediction is that of kriged labels",
+                    links.task.monitor,
+                    *(score.mean() for score in scores[::-1]),
+                )
+        return self._krige_labels(links, values, is_final)
+
+    def _validation_scores(self, links: Links, values: Iterable[Tensor]) -> list[Float[Tensor, " k"]]:
+        """Monitored scores of predictions of the validation links, higher ones better."""
+        task, labels = links.task, links.labels[links.split.validation]
+        sign = 1 if task.higher_is_better else -1
+        return [sign * task.scores(labels, part)[task.monitor].double() for part in values]
+
+    def _krige_labels(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
+        """``krige`` of whole labels; ``values`` are the trend's predictions of known links."""
+        split = links.split
+        self._make_fields(False)
         self._fit_trend_weight(links, values)
         if is_final:
             self._solve(links, values)
         training = replace(links, split=split.validating())
         validation_model = Kriging(self.scene, self.trend, self.fallback_options)
+        validation_model._make_fields(False)
         validation_model.trend_weight.copy_(self.trend_weight)
         validation_model.hyperparameters.copy_(self.hyperparameters)
         if self.is_scalar:
@@ -124,16 +157,16 @@ class Kriging(Model):
         validation_model._solve(training, values[: len(split.train)])
         validation_model.to(self.weight.device)
         if len(split.validation):
-            labels, trend = links.labels[split.validation], values[len(split.train) :]
+            trend = values[len(split.train) :]
             if not self.is_scalar:
                 kriged = predicted(validation_model, links, split.validation)
-                task, sign = links.task, 1 if links.task.higher_is_better else -1
-                score = lambda weight: task.scores(labels, blend(task, kriged, trend, weight))[task.monitor].mean()
-                best = max(WEIGHTS, key=lambda weight: sign * score(weight).item())
+                blends = (blend(links.task, kriged, trend, weight) for weight in WEIGHTS)
+                means = [score.mean().item() for score in self._validation_scores(links, blends)]
+                best = WEIGHTS[means.index(max(means))]
                 self.weight.fill_(best)
                 validation_model.weight.fill_(best)
             if is_final:
-                self._is_learnt(links, trend, validation_model.fallback)
+                self._warn_if_not_learnt(links, trend, validation_model.fallback)
         if is_final:
             self._log()
         return validation_model
@@ -144,6 +177,7 @@ class Kriging(Model):
         The weight is 1 if ``FEWEST`` validation links or more have a mean score that rises by more than 1.5 standard
         errors, else 0.
         """
+        self._make_fields(True)
         split, task, index = links.split, links.task, known(links)
         query, labels = links.query[index], links.labels[index]
         aligned = task.align(labels, values)
@@ -155,8 +189,6 @@ class Kriging(Model):
             margins = lambda part, rows=rows: trend.margins(query[rows[part]].to(device)).cpu()
             equations.append(Equations.of(query.transmitters[rows], margins, aligned[rows], residuals[rows]))
         validation_model = Kriging(self.scene, self.trend, self.fallback_options)
-        training = replace(links, split=split.validating())
-        validation_model.fallback.fit(training)
         held = torch.arange(len(split.train), len(index))
         plain, kriged, process = values[held], values[held].clone(), usual_process(self.scene.spacing)
         for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
@@ -170,12 +202,9 @@ class Kriging(Model):
             before, after = (task.scores(labels[held], part)[task.monitor] for part in (plain, kriged))
             gain = after - before if task.higher_is_better else before - after
             helps = bool(gain.mean() > 1.5 * gain.std() / math.sqrt(len(gain)))
-        self.trend_weight.fill_(0)
-        if len(held) == 0 or self._is_learnt(links, plain, validation_model.fallback, is_final):
-            self.trend_weight.fill_(1)
         for model in (self, validation_model) if is_final else (validation_model,):
-            model.trend_weight.copy_(self.trend_weight)
-            model.weight.fill_(float(helps) if self.trend_weight else 1.0)
+            model.trend_weight.fill_(1)
+            model.weight.fill_(helps)
             model.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
         for field, known_ones in zip(self.fields, equations, strict=True) if is_final else ():
             field.solve(known_ones, process)
@@ -220,24 +249,17 @@ class Kriging(Model):
                 found[own] = field.deviations(places[own], process).square()
         return found.sqrt()
 
-    def _is_learnt(self, links: Links, trend: Tensor, fallback: Model, says: bool = True) -> bool:
-        """False if the trend's values of the validation links score worse than the fallback's by more than chance."""
-        task, held = links.task, links.split.validation
-        own, other = (
-            task.scores(links.labels[held], values)[task.monitor].double()
-            for values in (trend, predicted(fallback, links, held))
-        )
-        behind = (other - own) * (1 if task.higher_is_better else -1)
-        is_learnt = len(held) < 2 or bool(behind.mean() <= 2 * behind.std() / math.sqrt(len(held)))  # standard errors
-        if not is_learnt and says:
+    def _warn_if_not_learnt(self, links: Links, trend: Tensor, fallback: Model) -> None:
+        """Says where the trend's values of the validation links score worse than the fallback's by more than chance."""
+        own, other = self._validation_scores(links, (trend, predicted(fallback, links, links.split.validation)))
+        if is_surely_better(other, own):
             name = self.fallback_options["name"]
             log.warning(
                 "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
-                "the prediction falls back on %s%s, with %.0f %% of the trained model",
-                *(task.monitor, own.mean(), name, other.mean(), "" if self.by_paths else "kriging of ", name),
+                "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
+                *(links.task.monitor, own.mean().abs(), name, other.mean().abs(), name),
                 100 * (1 - self.weight * (1 - self.trend_weight)),
             )
-        return is_learnt
 
     def _fit_trend_weight(self, links: Links, values: Tensor) -> None:
         """Fits the trend weight and the hyperparameters; ``values`` are the trend's predictions of known links."""
@@ -324,7 +346,7 @@ class Kriging(Model):
             levels = self.process(coordinates(self.scene, query, 1.0), query.receivers).to(value)
             return Prediction(blend(task, value + levels, trend, weight), {})
         places = query.transmitters if self.by_paths else coordinates(self.scene, query, scale)
-        for receiver in query.receivers.unique().tolist() if trend_weight or not self.by_paths else ():
+        for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver
             if self.by_paths:
                 strengths = self.fields[receiver](query.transmitters[own].double(), Hyperparameters(length.item()))
@@ -385,6 +407,12 @@ def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -
     if weight in (0, 1):
         return (one if weight else other).clone()
     return weight * task.align(one, other) + (1 - weight) * other
+
+
+def is_surely_better(one: Float[Tensor, " k"], other: Float[Tensor, " k"]) -> bool:
+    """True if scores are higher by more than two standard errors; False of fewer than two."""
+    gain = one - other
+    return len(gain) > 1 and bool(gain.mean() > 2 * gain.std() / math.sqrt(len(gain)))
 
 
 def known(links: Links) -> Int[Tensor, " k"]:

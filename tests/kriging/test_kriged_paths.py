@@ -150,3 +150,19 @@ def test_noise_is_not_kriged_nor_links_without_validation(smooth, noise, validat
     model.fit(links)
     assert model.weight == 0
     assert torch.equal(model.predict(links.query), trend.predict(links.query))
+
+
+def test_labels_are_kriged_where_paths_explain_less(caplog):
+    """Of dense places whose phases no plane explains."""
+    links, trend = made()
+    places = links.query.transmitters / 100
+    labels = torch.polar(torch.ones(120), 30 * places.sum(1))[:, None, None] * trend.predict(links.query).mean(0)
+    links = replace(links, query=replace(links.query, transmitters=places), labels=labels)
+    model = Kriging(links.scene, trend, {"name": "friis"})
+    model.fit(links)
+    assert "paths do not explain the channels" in caplog.text
+    assert errors(model, links) < 0.1 * errors(trend, links)
+    fresh = Kriging(links.scene, trend, {"name": "friis"})
+    fresh.load_state_dict(model.state_dict())
+    assert torch.equal(fresh.predict(links.query), model.predict(links.query))
+    assert model.deviations(links.batch(torch.arange(5))).shape == (5,)
