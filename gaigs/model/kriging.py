@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -141,35 +141,44 @@ class Kriging(Model):
 
     def _krige_labels(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` of whole labels; ``values`` are the trend's predictions of known links."""
-        split = links.split
         self._make_fields(False)
-        self._fit_trend_weight(links, values)
+        held, trend = links.split.validation, values[len(links.split.train) :]
+        model = self._validation_model(links, values)
+        if len(held) and self._is_unlearnt(links, trend, model.fallback) and not self.is_scalar:
+            # The likelihood may still mix it in: where the score is higher without it, it is left out.
+            models = model, self._validation_model(links, values, (0.0,))
+            scores = self._validation_scores(links, (predicted(one, links, held) for one in models))
+            model = models[int(scores[1].mean() > scores[0].mean())]
+            for name in ("trend_weight", "hyperparameters", "weight"):
+                getattr(self, name).copy_(getattr(model, name))
         if is_final:
             self._solve(links, values)
-        training = replace(links, split=split.validating())
-        validation_model = Kriging(self.scene, self.trend, self.fallback_options)
-        validation_model._make_fields(False)
-        validation_model.trend_weight.copy_(self.trend_weight)
-        validation_model.hyperparameters.copy_(self.hyperparameters)
-        if self.is_scalar:
-            validation_model.process.load_state_dict(self.process.state_dict())
-        validation_model.fallback.fit(training)
-        validation_model._solve(training, values[: len(split.train)])
-        validation_model.to(self.weight.device)
-        if len(split.validation):
-            trend = values[len(split.train) :]
-            if not self.is_scalar:
-                kriged = predicted(validation_model, links, split.validation)
-                blends = (blend(links.task, kriged, trend, weight) for weight in WEIGHTS)
-                means = [score.mean().item() for score in self._validation_scores(links, blends)]
-                best = WEIGHTS[means.index(max(means))]
-                self.weight.fill_(best)
-                validation_model.weight.fill_(best)
-            if is_final:
-                self._warn_if_not_learnt(links, trend, validation_model.fallback)
-        if is_final:
+            if len(held):
+                self._is_unlearnt(links, trend, model.fallback, says=True)
             self._log()
-        return validation_model
+        return model
+
+    def _validation_model(self, links: Links, values: Tensor, weights: Sequence[float] = WEIGHTS) -> "Kriging":
+        """Fits weights and hyperparameters, the trend weight one of ``weights``; a model of the training links."""
+        split = links.split
+        self._fit_trend_weight(links, values, weights)
+        training = replace(links, split=split.validating())
+        model = Kriging(self.scene, self.trend, self.fallback_options)
+        model._make_fields(False)
+        model.trend_weight.copy_(self.trend_weight)
+        model.hyperparameters.copy_(self.hyperparameters)
+        if self.is_scalar:
+            model.process.load_state_dict(self.process.state_dict())
+        model.fallback.fit(training)
+        model._solve(training, values[: len(split.train)])
+        model.to(self.weight.device)
+        if len(split.validation) and not self.is_scalar:
+            kriged, trend = predicted(model, links, split.validation), values[len(split.train) :]
+            blends = (blend(links.task, kriged, trend, weight) for weight in WEIGHTS)
+            means = [score.mean().item() for score in self._validation_scores(links, blends)]
+            self.weight.fill_(WEIGHTS[means.index(max(means))])
+            model.weight.copy_(self.weight)
+        return model
 
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` for a trend of paths.
@@ -249,10 +258,11 @@ class Kriging(Model):
                 found[own] = field.deviations(places[own], process).square()
         return found.sqrt()
 
-    def _warn_if_not_learnt(self, links: Links, trend: Tensor, fallback: Model) -> None:
-        """Says where the trend's values of the validation links score worse than the fallback's by more than chance."""
+    def _is_unlearnt(self, links: Links, trend: Tensor, fallback: Model, says: bool = False) -> bool:
+        """True if the trend's values of the validation links score worse than the fallback's by more than chance."""
         own, other = self._validation_scores(links, (trend, predicted(fallback, links, links.split.validation)))
-        if is_surely_better(other, own):
+        is_unlearnt = is_surely_better(other, own)
+        if is_unlearnt and says:
             name = self.fallback_options["name"]
             log.warning(
                 "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
@@ -260,12 +270,13 @@ class Kriging(Model):
                 *(links.task.monitor, own.mean().abs(), name, other.mean().abs(), name),
                 100 * (1 - self.weight * (1 - self.trend_weight)),
             )
+        return is_unlearnt
 
-    def _fit_trend_weight(self, links: Links, values: Tensor) -> None:
-        """Fits the trend weight and the hyperparameters; ``values`` are the trend's predictions of known links."""
+    def _fit_trend_weight(self, links: Links, values: Tensor, weights: Sequence[float]) -> None:
+        """Fits the trend weight, one of ``weights``, and the hyperparameters; ``values`` as for ``_krige_labels``."""
         index = known(links)
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
-        residuals: dict[float, Any] = {trend_weight: [] for trend_weight in WEIGHTS}
+        residuals: dict[float, Any] = {trend_weight: [] for trend_weight in weights}
         for part in torch.arange(len(index)).split(PART):
             labels, fallback = links.labels[index[part]], predicted(self.fallback, links, index[part])
             for trend_weight, parts in residuals.items():
@@ -301,8 +312,8 @@ class Kriging(Model):
                 left = left * damping(left, thin_labels(links.labels[index]), links.query.receivers[index])[:, None]
             return fit_hyperparameters(self.scene, links, lambda some: left[rows[some]], **options)
 
-        found = {trend_weight: fitted(trend_weight) for trend_weight in WEIGHTS}
-        best = min(WEIGHTS, key=lambda trend_weight: found[trend_weight][1])
+        found = {trend_weight: fitted(trend_weight) for trend_weight in weights}
+        best = min(weights, key=lambda trend_weight: found[trend_weight][1])
         # Residuals of a good trend correlate weakly with position: few links would overfit.
         process, _ = fitted(best, most=1000) if best else found[best]
         self.trend_weight.fill_(best)

@@ -1,5 +1,6 @@
 """Kriging of trained models against its formulas in numpy, and against labels of known composition."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -99,6 +100,7 @@ def half(monkeypatch):
 
     costs = []
     monkeypatch.setattr(kriging, "fit_hyperparameters", fixed)
+    monkeypatch.setattr(Kriging, "_is_unlearnt", lambda *_, **__: False)
     monkeypatch.setattr(ScalarProcess, "fit", fixed_scalar)
     monkeypatch.setattr(ScalarProcess, "refit", fixed_scalar)
 
@@ -239,6 +241,15 @@ def test_a_trend_that_scores_worse_than_its_fallback_is_reported(task, trained, 
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert [message.split(":")[0] for message in said] == ([] if trained else ["the room was not learnt"])
     assert trained or "falls back on kriging of mean" in said[0]
+
+
+def test_a_trend_that_was_not_learnt_is_left_out_where_scores_are_higher_without_it(monkeypatch):
+    links, numbers = make("spectrum", smooth=1.0, noise=0.1), itertools.count()
+    likely = lambda *parts, **options: (fit.fit_hyperparameters(*parts, **options)[0], next(numbers))  # first the trend
+    monkeypatch.setattr(kriging, "fit_hyperparameters", likely)
+    model = Kriging(links.scene, Trained(links.scene))
+    model.fit(links)
+    assert model.trend_weight == 0
 
 
 @pytest.mark.parametrize(("task", "weight"), [("spectrum", 0.25), ("csi", 0.75)])
