@@ -14,16 +14,19 @@ from gaigs.scene import Scene
 
 @register("model", "path_loss")
 class PathLoss(Model):
-    """T - 10 gamma log10(distance / 1 m) for each receiver, by least squares; NaN before ``fit``.
+    """T - 10 gamma log10(distance / 1 m) for each receiver; NaN before ``fit``.
 
-    It is meant for RSSI [dBm], and accepts any task of one real number a link. Negative exponents are kept: there
-    distance explains nothing. If all links of a receiver are equally long, gamma is 2 as in free space, and only T is
-    fitted. Distances below 0.1 m count as 0.1 m: within about a wavelength the field does not follow the law.
+    It is meant for RSSI [dBm], and accepts any task of one real number a link. T is that of least squares. So is gamma,
+    but drawn towards the mean of all receivers as far as chance explains their scatter: a few readings alone give wild
+    slopes. Negative exponents are kept: there distance explains nothing. If all links of a receiver are equally long,
+    gamma is that mean; without any other receiver 2, as in free space. Distances below 0.1 m count as 0.1 m: within
+    about a wavelength the field does not follow the law.
 
     Raises:
         ValueError: A label is more than one real number.
 
-    Source: Rappaport, Wireless Communications, 2nd edition, section 4.9.
+    Source: Rappaport, Wireless Communications, 2nd edition, section 4.9; DerSimonian and Laird, Meta-analysis in
+    clinical trials, 1986.
     """
 
     def __init__(self, scene: Scene):
@@ -36,16 +39,22 @@ class PathLoss(Model):
 
     def fit(self, links: Links) -> None:
         """Fits level and exponent of each receiver."""
-        for receiver, index in enumerate(known_links(links)):
+        lines = []
+        for index in known_links(links):
             labels = links.labels[index].double()
             decades = self._decades(links.query.transmitters[index].double(), links.query.receivers[index])
-            centred = decades - decades.mean()
-            exponent = torch.tensor(2.0)
+            level, centre = labels.mean(), decades.mean()
+            labels, steps = labels - level, -10 * (decades - centre)
             # Below a ratio of 1.01 one unit of the exponent changes the labels by less than 0.05 dB.
-            if 10 ** (decades.max() - decades.min()) >= 1.01:
-                exponent = -(centred @ labels) / (10 * centred.square().sum())
-            self.exponents[receiver] = exponent
-            self.levels[receiver] = labels.mean() + 10 * exponent * decades.mean()
+            is_spread = 10 ** (decades.max() - decades.min()) >= 1.01
+            weight = steps.square().sum() * is_spread
+            exponent = steps @ labels / weight if is_spread else weight
+            errors = (labels - exponent * steps).square().sum()
+            lines.append(torch.stack((level, centre, exponent, weight, errors, weight.new_tensor(len(index) - 2))))
+        levels, centres, exponents, weights, errors, freedom = torch.stack(lines, 1)
+        exponents = shrunk(exponents, weights, errors.sum() / freedom.clamp_min(0).sum().clamp_min(1))
+        self.exponents.copy_(exponents)
+        self.levels.copy_(levels + 10 * exponents * centres)
 
     def forward(self, batch: Batch) -> Prediction:
         receivers = batch.query.receivers
@@ -55,3 +64,24 @@ class PathLoss(Model):
     def _decades(self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, " b"]) -> Float[Tensor, " b"]:
         """log10 of the distances in [m]."""
         return (transmitters - self.scene.positions(transmitters)[receivers]).norm(dim=-1).clamp_min(0.1).log10()
+
+
+def shrunk(
+    exponents: Float[Tensor, " r"], weights: Float[Tensor, " r"], noise: Float[Tensor, ""]
+) -> Float[Tensor, " r"]:
+    """Exponents drawn towards their mean as far as chance explains their scatter.
+
+    Args:
+        exponents: Of least squares.
+        weights: Inverse variances of their errors, for noise of variance 1; 0 without an exponent.
+        noise: Variance of the labels about the law.
+    """
+    total, noise = weights.sum(), noise.clamp_min(1e-12)
+    if not total:
+        return torch.full_like(exponents, 2)
+    squares = weights @ (exponents - weights @ exponents / total).square()
+    chance = ((weights > 0).sum() - 1) * noise
+    scatter = ((squares - chance) / (total - weights.square().sum() / total)).nan_to_num(0, posinf=0).clamp_min(0)
+    precisions = weights / (scatter * weights + noise)  # of the exponents about the mean
+    shares = scatter * precisions
+    return shares * exponents + (1 - shares) * (precisions @ exponents / precisions.sum())

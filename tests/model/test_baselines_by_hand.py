@@ -130,8 +130,9 @@ def knn(config, known, places):
 
 def path_loss(config, known, places):
     own = known.receiver.pose.position.double().numpy()
-    decades = lambda points: np.log10([max(math.dist(point, own), 0.1) for point in points])
-    return np.polyval(np.polyfit(decades(known.places), known.labels[:, 0], 1), decades(places))[:, None]
+    decades = lambda points: np.log10([max(math.dist(point, own), 0.1) for point in points])[:, None]
+    steps = decades(places) - decades(known.places).mean()
+    return known.labels.mean() - 10 * config["exponents"][known.receiver.name] * steps
 
 
 def waves(receiver, places, sign):
@@ -203,6 +204,11 @@ def compare(config, links, sign=-1):
         config = {**config, "length": model.facts()["length_m"], "nugget": model.facts()["nugget"]}
     elif config.get("k", 0) is None:  # so has the choice of this
         config = {**config, "k": model.facts()["neighbours"]}
+    elif config["name"] == "path_loss":  # and these
+        config = {
+            **config,
+            "exponents": {at.name: gamma.item() for at, gamma in zip(links.receivers, model.exponents, strict=True)},
+        }
     index = torch.cat((links.split.train, links.split.validation))
     for receiver in range(3):
         asked, known = heard(links, receiver, test), heard(links, receiver, index, sign)
