@@ -238,6 +238,10 @@ class ScalarProcess(nn.Module):
             factor = torch.linalg.cholesky(covariances)
             self.weights[own] = torch.cholesky_solve(values[own, None], factor)[:, 0]
 
+    def take(self, other: "ScalarProcess") -> None:
+        """Takes the hyperparameters of another process for ``deviations``; means need ``solve`` again."""
+        self.logarithms, self.choice = other.logarithms, other.choice
+
     def _maximise(
         self,
         values: Float[Tensor, " k"],

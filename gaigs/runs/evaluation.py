@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from rich.console import Console, Group
 from rich.jupyter import JupyterMixin
 from torch import Tensor
@@ -21,12 +21,11 @@ from torch import Tensor
 from gaigs.configuration import composed, files_of
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
-from gaigs.geometry import even_places
 from gaigs.io.files import atomic_write
 from gaigs.kriging.intervals import Calibration, holds, interval_scores, nearest, summarise_intervals, thin
 from gaigs.kriging.links import evenly, folds_of
-from gaigs.kriging.scalar import is_scalar
 from gaigs.model import Model, call_optional
+from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging, predicted
 from gaigs.query import Batch, Query
 from gaigs.registry import name_of, registry
@@ -93,15 +92,13 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
     if links.held_out is not None:
         return None
     asked, values, deviations, near = [], [], [], []
-    is_fitted_anew = is_scalar(links.scene) and not (is_trained(model) or isinstance(model, Kriging))
-    level = stated_level(model, links.scene) if is_fitted_anew else None
     for one, part, known in unseen(model, links):
         asked.append(part)
         values.append(predicted(one, links, part))
-        stated = spreads(one, links, part, values[-1])
-        if level is not None:  # hyperparameters of a fold may state larger or smaller deviations everywhere
-            stated = stated * (level / stated_level(one, links.scene)).to(stated)[links.query.receivers[part]]
-        deviations.append(stated)
+        if isinstance(model, GaussianProcess) and isinstance(one, GaussianProcess):
+            for process, whole in zip(one.scalar, model.scalar, strict=True):
+                process.take(whole)  # a fold's hyperparameters may state larger or smaller deviations everywhere
+        deviations.append(spreads(one, links, part, values[-1]))
         there = links.query[known]
         near.append(nearest(links.query[part], there.transmitters, there.receivers))
     if not asked:
@@ -111,19 +108,6 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
     apart = None if hasattr(model, "deviations") else torch.cat(near)
     known_ones = links.query[torch.cat((links.split.train, links.split.validation))]
     return Calibration.of(links.task, *parts, apart, known_ones)
-
-
-def stated_level(model: Model, scene: Scene) -> Float[Tensor, " receivers"] | None:
-    """Mean deviation that a model itself states for each receiver, over the box of the training transmitters."""
-    if not hasattr(model, "deviations"):
-        return None
-    places, names = even_places(scene.lower, scene.upper, 256), [receiver.name for receiver in scene.receivers]
-    frequency = float(scene.frequencies[len(scene.frequencies) // 2]) if len(scene.frequencies) else None
-    levels = []
-    for receiver in range(len(names)):
-        query, _ = Query.from_positions(places, receiver, frequency, names, scene.frequencies)
-        levels.append(model.deviations(Batch(query).to(device_of(model))).double().mean())
-    return torch.stack(levels).cpu()
 
 
 def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"], Int[Tensor, " j"]]]:
