@@ -3,19 +3,20 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Inexact
 from torch import Tensor, nn
 
 
 class Obstacles(nn.Module):
-    """Gaussians of matter: along a segment the field is attenuated by exp(-depth).
+    """Gaussians of matter: along a segment the field is multiplied by exp(-depth).
 
     depth = sum_i rho_i integral exp(-|S_i^-1 (x - c_i)|² / 2) dx along the segment, S_i = diag(widths), a closed form:
     with the ray a + t (b - a) in units of the widths, A = |ray|², B = ray . offset, C = |offset|²,
 
         depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B / sqrt(2 A)))
 
-    ``lower`` and ``upper`` are corners of the box around transmitters and receivers [m].
+    Matter also slows waves. With ``has_phases`` each obstacle has a learnt ratio of phase lag to attenuation, its turn,
+    and the depth is complex. ``lower`` and ``upper`` are corners of the box around transmitters and receivers [m].
 
     Source: Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
     """
@@ -23,7 +24,7 @@ class Obstacles(nn.Module):
     origin: Tensor
     unit: Tensor
 
-    def __init__(self, count: int, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]):
+    def __init__(self, count: int, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], has_phases: bool = False):
         super().__init__()
         edges = upper - lower
         diagonal = float(edges.norm())
@@ -34,6 +35,7 @@ class Obstacles(nn.Module):
         # As large as furniture; a path through one is attenuated by a fraction of a decibel.
         self.log_widths = nn.Parameter(torch.full((count, 3), math.log(0.05 * diagonal)))
         self.log_densities = nn.Parameter(torch.full((count,), math.log(0.8 / diagonal)))
+        self.turns = nn.Parameter(torch.zeros(count)) if has_phases else None
 
     def __len__(self) -> int:
         return len(self.places)
@@ -52,13 +54,15 @@ class Obstacles(nn.Module):
         """At the centres [Np/m]."""
         return self.log_densities.exp()
 
-    def forward(self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Optical depth along segments [Np]."""
+    def forward(self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]) -> Inexact[Tensor, "*batch"]:
+        """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad]."""
         legs = start.reshape(-1, 3), end.reshape(-1, 3)
         size = max(1, PAIRS // len(self)) if start.device.type == "cpu" else len(legs[0]) or 1
-        own = self.centres, self.log_widths, self.log_densities
+        columns = [self.densities] if self.turns is None else [self.densities, self.densities * self.turns]
+        own = self.centres, self.log_widths, torch.stack(columns, 1)
         parts = [_Depth.apply(*part, *own) for part in zip(*(ends.split(size) for ends in legs), strict=True)]
-        return torch.cat(parts).view(start.shape[:-1])
+        depths = torch.cat(parts)
+        return (depths[:, 0] if self.turns is None else torch.view_as_complex(depths)).view(start.shape[:-1])
 
 
 PAIRS = 2**16
@@ -73,20 +77,24 @@ class _Depth(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, start, end, centres, log_widths, log_densities):
+    def forward(ctx, start, end, centres, log_widths, densities):
         parts = *_, r, near, inside, length = _parts(start, end, centres, log_widths)
-        each = near * inside * r * (log_densities.exp() * math.sqrt(math.pi))
-        ctx.save_for_backward(start, end, centres, log_widths, log_densities, *parts)
-        return each.sum(-1) * length
+        each = near * inside * r
+        ctx.save_for_backward(start, end, centres, log_widths, densities, *parts)
+        return (each @ densities) * (math.sqrt(math.pi) * length)[:, None]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
-        start, end, centres, log_widths, log_densities, a, b, r, near, inside, length = ctx.saved_tensors
-        gradient = gradient[:, None]
+        start, end, centres, log_widths, densities, a, b, r, near, inside, length = ctx.saved_tensors
+        gradient = gradient * (math.sqrt(math.pi) * length)[:, None]
         # In place where it can be: fresh memory costs more than the sums.
-        rate = (near * r).mul_(gradient * length[:, None]).mul_(log_densities.exp() * math.sqrt(math.pi))  # of E
+        rate = near * r  # of E
         each = rate * inside
+        d_densities = each.T @ gradient
+        weights = gradient @ densities.T
+        rate.mul_(weights)
+        each.mul_(weights)
         slope = rate.mul_(r).mul_(2 / math.sqrt(math.pi))
         e1 = (a + b).mul_(r).square_().neg_().clamp_min_(FAINTEST).exp_().mul_(slope)
         e0 = (b * r).square_().neg_().clamp_min_(FAINTEST).exp_().mul_(slope)
@@ -112,7 +120,6 @@ class _Depth(torch.autograd.Function):
         # d log width: -2 (A's, B's and C's share of the axis)
         squares = (ray.square().T @ d_a + (ray * start).T @ d_b + start.square().T @ d_c).T
         squares = squares - by_ray * centres - 2 * centres * by_start + centres.square() * ones
-        d_densities = each.sum(0)
         return d_start, d_end, d_centres, -2 * squares * widths, d_densities
 
 

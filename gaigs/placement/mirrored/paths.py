@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Inexact, Int
 from scipy.constants import speed_of_light
 from torch import Tensor, distributed, nn
 from torch.nn import functional
@@ -64,7 +64,8 @@ class Mirrored(Placement):
     with the element's pattern F towards the image, times a learnt power of the cosine; the gain g of a path and, except
     of channels, its phase phi; the gain g_r and, of channels, the phase phi_r of a receiver; the gain g_w of a plane,
     which falls off as a Gaussian about the plane's middle; Fresnel's reflection Gamma_w with a learnt permittivity, of
-    channels that of a slab with a learnt thickness; and the optical depth tau_k of the obstacles along the folded path.
+    channels that of a slab with a learnt thickness; and the depth tau_k of the obstacles along the folded path, which of
+    channels has a phase.
     Polarisation is vertical: TE at upright planes, TM at level ones, weighted by n_z² in between. A path that does not
     meet its planes in their order does not exist.
 
@@ -167,9 +168,10 @@ class Mirrored(Placement):
         self.log_bandwidth = None
         if scene.bandwidth != 0 and not is_complex:
             self.log_bandwidth = filled(math.log(scene.bandwidth or speed_of_light / self.diagonal))
-        self.obstacles = Obstacles(obstacles, -half, half) if obstacles else None
+        self.obstacles = Obstacles(obstacles, -half, half, is_complex) if obstacles else None
         self.boresights = [torch.tensor([0.0, 0.0, 1.0])] * antennas
         if is_complex:
+            self.carrier = scene.task.frequencies.mean().item()  # of the turns of obstacles [Hz]
             self.boresights = [boresight(receiver, self.middle) for receiver in scene.receivers]
         # Of a spectrum even faint paths show: where obstacles block the others.
         self.skips_faint = not is_complex and scene.task.directions is None
@@ -324,7 +326,11 @@ class Mirrored(Placement):
         left = torch.complex(left.exp() * folded.exists, torch.zeros_like(left))
         left = folded.reflected(left, self.responses(query))
         if blocked and self.obstacles is not None and not self.is_bare:
-            left = left * (-self._depths(self.obstacles, folded, left)).exp()
+            depths = self._depths(self.obstacles, folded, left)
+            if depths.is_complex():  # matter delays: its phases are in proportion to the frequency
+                stretch = carriers(self.scene, query).to(depths.real) / self.carrier
+                depths = torch.complex(depths.real, depths.imag * stretch[:, None])
+            left = left * (-depths).exp()
         return left
 
     def responses(self, query: Query) -> Callable[[Bounces], Complex[Tensor, "b w"]]:
@@ -344,11 +350,11 @@ class Mirrored(Placement):
 
         return response
 
-    def _depths(self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]) -> Float[Tensor, "b n"]:
-        """Optical depth of each path through the obstacles [Np]; 0 for no path and, of levels, for a ``FAINT`` one."""
-        depths = torch.zeros_like(strengths.real)
+    def _depths(self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]) -> Inexact[Tensor, "b n"]:
+        """Depth of each path through the obstacles; 0 for no path and, of levels, for a ``FAINT`` one."""
+        depths = torch.zeros_like(strengths.real if obstacles.turns is None else strengths)
         with torch.no_grad():
-            lengths = depths.index_add(1, folded.path, (folded.end - folded.start).norm(dim=-1)).clamp_min(NEAREST)
+            lengths = depths.real.index_add(1, folded.path, (folded.end - folded.start).norm(dim=-1)).clamp_min(NEAREST)
             powers = (strengths.abs() / lengths).square()
             least = FAINT * powers.sum(1, keepdim=True) if self.skips_faint else 0
             legs = (powers > least)[:, folded.path].flatten().nonzero()[:, 0]

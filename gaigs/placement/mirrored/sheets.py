@@ -175,7 +175,7 @@ def fit_sheets(
     link, leg = (fields > 0)[:, folded.path].nonzero().T
     paths, start = link * len(sequences) + folded.path[leg], folded.start[link, leg].double()
     along = folded.end[link, leg].double() - start
-    depths = obstacles(start.float(), (start + along).float()).double()
+    depths = obstacles(start.float(), (start + along).float()).real.double()
     left = (-fields.new_zeros(count).index_add(0, paths, depths)).exp().view_as(fields)
     steps = torch.linspace(0, 1, SAMPLES).to(along)[:, None]
     levels = torch.stack([densities(obstacles, a + steps * b).sum(1) for a, b in zip(start, along, strict=True)])

@@ -12,12 +12,14 @@ from gaigs.placement.mirrored.obstacles import Obstacles
 LOWER, UPPER = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([6.0, 4.0, 3.0])
 
 
-@pytest.fixture
-def obstacles():
+@pytest.fixture(params=[False, True], ids=["real", "with phases"])
+def obstacles(request):
     """Seven of different shapes, float64."""
     torch.manual_seed(0)
-    made = Obstacles(7, LOWER, UPPER).double()
+    made = Obstacles(7, LOWER, UPPER, request.param).double()
     with torch.no_grad():
+        if request.param:
+            made.turns.uniform_(-2.0, 2.0)
         made.log_widths.uniform_(math.log(0.1), math.log(1.5))
         made.log_densities.uniform_(math.log(0.05), math.log(5.0))
     return made
@@ -37,6 +39,8 @@ def integral(obstacles, start, end, steps=4000):
     points = start + t[:, None] * (end - start)
     parts = (obstacles.centres, obstacles.widths, obstacles.densities)
     centres, widths, densities = (part.detach().numpy() for part in parts)
+    if obstacles.turns is not None:
+        densities = densities * (1 + 1j * obstacles.turns.detach().numpy())
     squares = (((points[:, None] - centres) / widths) ** 2).sum(-1)
     return np.linalg.norm(end - start) * (w[:, None] * densities * np.exp(-squares / 2)).sum()
 
@@ -46,7 +50,7 @@ def test_the_depth_is_the_integral_of_the_density(obstacles):
     depths = obstacles(starts, ends)
     for start, end, depth in zip(starts.numpy(), ends.numpy(), depths.tolist(), strict=True):
         assert depth == pytest.approx(integral(obstacles, start, end), rel=1e-7)
-    assert depths.max() > 1
+    assert depths.abs().max() > 1
 
 
 def test_pieces_of_a_segment_add_up_and_its_direction_does_not_matter(obstacles):
@@ -65,28 +69,27 @@ def test_segments_taken_in_parts_have_the_same_depths_and_gradients(obstacles, m
     for pairs in (1000, 15, 1):
         monkeypatch.setattr(module, "PAIRS", pairs)
         depths = obstacles(starts, ends)
-        results.append((depths, *torch.autograd.grad(depths.square().sum(), [*obstacles.parameters()])))
+        results.append((depths, *torch.autograd.grad(depths.abs().square().sum(), [*obstacles.parameters()])))
     for other in results[1:]:
         torch.testing.assert_close(other, results[0])
 
 
 def test_gradients_are_the_derivatives(obstacles):
     starts, ends = (part.requires_grad_() for part in segments(6))
-    leaves = [starts, ends, obstacles.places, obstacles.log_widths, obstacles.log_densities]
+    names, leaves = zip(*obstacles.named_parameters(), strict=True)
 
-    def depth(start, end, places, log_widths, log_densities):
-        values = {"places": places, "log_widths": log_widths, "log_densities": log_densities}
-        return torch.func.functional_call(obstacles, values, (start, end))
+    def depth(start, end, *values):
+        return torch.func.functional_call(obstacles, dict(zip(names, values, strict=True)), (start, end))
 
-    assert torch.autograd.gradcheck(depth, leaves)
+    assert torch.autograd.gradcheck(depth, [starts, ends, *leaves])
 
 
 def test_a_segment_of_no_length_has_no_depth(obstacles):
     start = segments(5)[0].requires_grad_()
     end = start.detach().clone().requires_grad_()
     depth = obstacles(start, end)
-    assert torch.equal(depth, torch.zeros(5, dtype=torch.float64))
-    for gradient in torch.autograd.grad(depth.sum(), [start, end, *obstacles.parameters()]):
+    assert not depth.any()
+    for gradient in torch.autograd.grad(depth.abs().sum(), [start, end, *obstacles.parameters()]):
         assert gradient.isfinite().all()
 
 
@@ -95,8 +98,8 @@ def test_depths_vanish_far_away(obstacles, dtype):
     obstacles.to(dtype)
     start = torch.tensor([[100.0, 0, 0], [0, 1e4, 0], [1e6, 1e6, 1e6]], dtype=dtype, requires_grad=True)
     depth = obstacles(start, start.detach() + torch.tensor([0, 0, 50.0], dtype=dtype))
-    assert (depth < 1e-20).all()
-    for gradient in torch.autograd.grad(depth.sum(), [start, *obstacles.parameters()]):
+    assert (depth.abs() < 1e-20).all()
+    for gradient in torch.autograd.grad((depth.real + depth.imag if depth.is_complex() else depth).sum(), [start, *obstacles.parameters()]):
         assert gradient.isfinite().all()
         assert gradient.abs().max() < 1e-15
 
@@ -105,11 +108,11 @@ def test_single_precision_is_near_double(obstacles):
     starts, ends = segments(40)
     true = obstacles(starts, ends)
     weights = torch.arange(40.0).cos().double()
-    exact = torch.autograd.grad((true * weights).sum(), [*obstacles.parameters()])
+    exact = torch.autograd.grad((true * weights).abs().sum(), [*obstacles.parameters()])
     obstacles.float()
     found = obstacles(starts.float(), ends.float())
-    gradients = torch.autograd.grad((found * weights.float()).sum(), [*obstacles.parameters()])
-    torch.testing.assert_close(found.double(), true, rtol=1e-4, atol=1e-5)
+    gradients = torch.autograd.grad((found * weights.float()).abs().sum(), [*obstacles.parameters()])
+    torch.testing.assert_close(found.to(true), true, rtol=1e-4, atol=1e-5)
     for gradient, expected in zip(gradients, exact, strict=True):
         torch.testing.assert_close(gradient.double(), expected, rtol=0, atol=1e-4 * expected.abs().max().item())
 
