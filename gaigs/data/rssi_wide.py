@@ -155,6 +155,7 @@ def read(
     silent = columns.silent + [table.names[k] for k in columns.gateways if table.names[k] not in names]
     marks = " and ".join(f"{mark:g}" for mark in sorted(columns.marks))
     unplaced = [name for name in names if name not in stands]
+    level = [name for name, place in placed.items() if place[2] == height]  # the file may have no height of theirs
     empty = len(places) - some
     remarks = [
         f"{len(rows)} readings of {some} places at {len(names)} gateways",
@@ -167,6 +168,7 @@ def read(
         unused and f"gateways of {Path(gateways).name} without a column: {shortened(unused)}",
         not is_placed.all() and f"{int((~is_placed).sum())} rows without coordinates are left out",
         axes.z < 0 and f"all places are {height:g} m high (data.height)",
+        axes.z >= 0 and level and f"gateways that are {height:g} m high (data.height): {shortened(level)}",
         axes.is_floor and f"heights are those of floors, {storey:g} m each (data.storey)",
         moved,
         columns.ignored and f"columns ignored: {shortened(columns.ignored)}",

@@ -214,3 +214,10 @@ def test_places_of_gateways_in_yaml_have_the_units_of_the_table(survey, tmp_path
 def test_a_latitude_is_no_x(survey):
     with pytest.raises(ValueError, match=r"data.coordinates must have the longitude first"):
         survey(table(("lat", "lon")), coordinates=["lat", "lon"])
+
+
+def test_gateways_without_a_height_are_named(survey, tmp_path):
+    (tmp_path / "aps.yml").write_text('"00:cd:1a": [0.0, 0.0]\n"00:cd:1b": [7.0, 4.0, 2.5]\n')
+    places = table(("x", "y", "z"), columns=np.column_stack((PLACES, np.ones(len(PLACES)))))
+    remarks = survey(places, gateways=str(tmp_path / "aps.yml"), height=1.5).remarks
+    assert "gateways that are 1.5 m high (data.height): 00:cd:1a" in remarks
