@@ -36,8 +36,17 @@ def pytest_collection_finish():
 
 
 @pytest.fixture(scope="session", autouse=True)
+def quick_runs():
+    """Figures and times of a run take longer than all else; the report's tests and processes have them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
+        patch.setattr("gaigs.runs.evaluation.median_ms", lambda work: (work(), 1.0)[1])
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def composed_once():
-    """Copies of a configuration for the same words, while no file and no component changes: Hydra takes 0.2 s for it."""
+    """Copies of a configuration for the same words, while no file and no component changes; Hydra takes 0.2 s."""
     import hydra
     from hydra.core.global_hydra import GlobalHydra
 
@@ -49,7 +58,7 @@ def composed_once():
         folders = [element.path for element in GlobalHydra.instance().config_loader().get_search_path().get_path()]
         files = [(file, file.stat().st_mtime_ns) for file in Path.cwd().glob("plugins/**/*")]
         held = [(kind, *item) for kind in KINDS for item in registry(kind)._registered.items()]
-        invented = [item for item in held if not item[2].__module__.startswith(("gaigs", "plugins"))]
+        invented = [item for item in held if not str(item[2].__module__).startswith(("gaigs", "plugins"))]
         state = (*folders, *sys.path, *files, *invented, Path.cwd(), *words)
         if state not in found:
             found[state] = compose(name, words)

@@ -43,7 +43,7 @@ def wait_for(process, found):
     assert process.poll() is None, process.communicate()
 
 
-def test_two_processes_train_as_one_though_they_are_stopped(tmp_path, monkeypatch):
+def test_two_processes_train_as_one_though_they_are_stopped(tmp_path):
     """40 steps in float64, with batches of odd sizes; SIGTERM to the first process alone."""
     folder = tmp_path / "two"
     command = (folder, "trainer.devices=2", "trainer.strategy=ddp", f"hydra.run.dir={folder}")
@@ -61,7 +61,6 @@ def test_two_processes_train_as_one_though_they_are_stopped(tmp_path, monkeypatc
     assert process.returncode == 0, err
     assert out.count("data: synthetic") == 1, "the first process logs for all"
 
-    monkeypatch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
     metrics, others = (
         gaigs.run(gaigs.compose(*SMALL), tmp_path / "one"),
         json.loads((folder / "metrics.json").read_text()),

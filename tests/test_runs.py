@@ -76,15 +76,6 @@ def configure(*overrides):
     return gaigs.compose(*SMALL, *overrides)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick():
-    """Figures and times take longer than all else; the tests of gaigs.report and of the command line have them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
-        patch.setattr(evaluation, "median_ms", lambda work: (work(), 1.0)[1])
-        yield
-
-
 @pytest.fixture(scope="module", params=CASES)
 def case(request, tmp_path_factory):
     """A step, a configuration, and the folder of its run, which nothing interrupted."""

@@ -63,8 +63,6 @@ def fake(monkeypatch):
 
 
 def test_a_system_is_trained_once_and_its_run_is_read_again(tmp_path, monkeypatch):
-    monkeypatch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
-    monkeypatch.setattr("gaigs.runs.evaluation.median_ms", lambda work: (work(), 1.0)[1])
     accuracy(systems=["gaigs", "friis"]).run(tmp_path, TINY)
     rows = read(tmp_path)
     assert [*rows] == [("look-up", "mean"), ("system", "gaigs"), ("system", "friis")]

@@ -174,8 +174,7 @@ def test_impossible_exports_are_refused(file, options, message, rssi, tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-def test_the_command_exports_a_run(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
+def test_the_command_exports_a_run(tmp_path, capsys):
     words = ("+experiment=rssi", "model=path_loss", "data.transmitters=30", "data.order=0", "baselines=[]")
     gaigs.run(gaigs.compose(*words), tmp_path / "run")
     command = ("command=export", f"folder={tmp_path / 'run'}", "export.pitch=1")

@@ -229,16 +229,21 @@ def test_intervals_that_the_links_cannot_give_are_refused():
             model.predict([1.0, 1.0, 1.0], interval=wrong)
 
 
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(scalar, "NEAREST", 4)
+    monkeypatch.setattr(scalar, "ITERATIONS", 2)
+
+
 def barely_trained(links):
     return gaigs.train(
         "gaigs", links, enable_progress_bar=False, max_steps=1, count=10, accelerator="cpu", kriging=False
     )
 
 
+@pytest.mark.usefixtures("quick")
 def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch):
-    monkeypatch.setattr(scalar, "NEAREST", 4)
-    monkeypatch.setattr(scalar, "ITERATIONS", 2)
-    links = gaigs.links("synthetic_rssi", transmitters=100, order=0, validation=0.3)
+    links = gaigs.links("synthetic_rssi", transmitters=60, order=0, validation=0.3)
     trend = barely_trained(links)
     chosen, predicted = [], []
     krige, predict = Kriging.krige, evaluation.predicted
@@ -279,6 +284,7 @@ def test_a_receiver_that_one_place_hears_leaves_the_others_their_intervals():
     assert calibration.counts.sum() == len(links) - 1
 
 
+@pytest.mark.usefixtures("quick")
 def test_kriging_does_not_know_a_single_group_of_validation_links():
     links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
     alone = (links.query.transmitters == links.query.transmitters[links.split.validation[0]]).all(1).nonzero()[:, 0]

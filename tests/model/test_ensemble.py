@@ -8,6 +8,7 @@ import gaigs
 from gaigs import checkpoint
 from gaigs.kriging import scalar
 from gaigs.model.ensemble import Ensemble
+from gaigs.model.gaigs import GaussianSplatting
 
 FEW = {"max_steps": 2, "count": 20, "enable_progress_bar": False}
 
@@ -30,9 +31,8 @@ def model(links, folder):
 def test_members_are_the_models_of_successive_seeds(links, model):
     places = [[1.0, 2.0, 1.5], [2.0, 1.0, 1.0]]
     assert len(model.members) == 3
-    for seed, member in ((4, model.members[0]), (6, model.members[2])):
-        alone = gaigs.train("gaigs", links, seed=seed, **FEW)
-        torch.testing.assert_close(member.predict(places), alone.predict(places))
+    alone = gaigs.train("gaigs", links, seed=6, **FEW)
+    torch.testing.assert_close(model.members[2].predict(places), alone.predict(places))
     values = np.stack([member.predict(places).numpy() for member in model.members])
     np.testing.assert_allclose(model.predict(places), values.mean(0), rtol=1e-5)
     assert (values.std(0) > 0).all()
@@ -75,7 +75,7 @@ def test_channels_deviate_by_the_size_of_their_complex_difference():
 def test_kriging_has_the_ensemble_as_its_trend(tmp_path, monkeypatch):
     monkeypatch.setattr(scalar, "NEAREST", 4)
     monkeypatch.setattr(scalar, "ITERATIONS", 2)
-    links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
+    links = gaigs.links("synthetic_rssi", transmitters=20, order=0)
     model = gaigs.train("gaigs", links, ensemble=2, kriging=True, folder=tmp_path, **FEW)
     assert isinstance(gaigs.load(tmp_path / "best.ckpt").trend, Ensemble)
     weights = checkpoint.trained_weights(checkpoint.read(tmp_path / "best.ckpt"))
@@ -90,9 +90,9 @@ def test_an_ensemble_has_a_member(links):
 
 def test_deviations_do_not_depend_on_the_asked_directions():
     links = gaigs.links("synthetic", transmitters=30, order=0)
-    options = {"max_steps": 1, "count": 20, "enable_progress_bar": False}
-    model = gaigs.train("gaigs", links, ensemble=2, **options)
+    model = Ensemble(links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20}) for _ in range(2)])
     batch = links.batch(links.split.test[:2])
     few = gaigs.Grid.degrees([30], [40])
     expected = model.deviations(batch)
+    assert (expected > 0).all()
     torch.testing.assert_close(model.deviations(replace(batch, directions=few)), expected)

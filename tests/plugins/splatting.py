@@ -60,8 +60,7 @@ def links_of(task, carriers=()):
 
 def run(folder, monkeypatch, *overrides):
     """A short training on the built-in room: its configuration, its metrics, and the model of its checkpoint."""
-    monkeypatch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)  # they take longer than all else
-    monkeypatch.setattr("gaigs.runs.evaluation.median_ms", lambda work: (work(), 1.0)[1])
+    monkeypatch.setattr(runs, "has_radio_map", lambda _: False)
     few = [] if any(word.startswith("data.root=") for word in overrides) else ["data.transmitters=30"]
     config = composed(*overrides, *few, *RUN)
     with repository():
