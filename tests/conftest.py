@@ -69,6 +69,24 @@ def composed_once():
         yield
 
 
+@pytest.fixture(scope="module")
+def files_read_once():
+    """For modules that compose many different words and change no file: reading takes a third of a composition."""
+    from hydra._internal.config_repository import ConfigRepository
+
+    read, found = ConfigRepository.load_config, {}
+
+    def once(self, config_path):
+        key = (*(source.path for source in self.sources), config_path)
+        if key not in found:
+            found[key] = read(self, config_path)
+        return copy.deepcopy(found[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ConfigRepository, "load_config", once)
+        yield
+
+
 @pytest.fixture(scope="session")
 def tracer(tmp_path_factory):
     """Sionna RT with few rays and a cache of its own, or the test is skipped."""

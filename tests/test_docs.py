@@ -1,7 +1,6 @@
 """Names in the documentation exist, its commands compose, and its plug-ins train by its commands."""
 
 import contextlib
-import copy
 import functools
 import json
 import os
@@ -21,8 +20,6 @@ import pytest
 import torch
 from hatchling.builders.wheel import WheelBuilder
 from hydra import compose, initialize_config_dir
-from hydra._internal.config_repository import ConfigRepository
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
@@ -109,19 +106,15 @@ def place(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def composed(place):
-    """Composes gaigs's configuration where the documentation's plug-ins are found; each file is read once."""
+def composed(place, files_read_once):
+    """Composes gaigs's configuration where the documentation's plug-ins are found."""
 
     @functools.cache
     def composed(*words):
         with contextlib.chdir(place), initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
             return OmegaConf.to_container(compose("config", list(words), return_hydra_config=True))
 
-    with pytest.MonkeyPatch.context() as patch:
-        with contextlib.chdir(place), initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-            read = functools.cache(GlobalHydra.instance().config_loader().repository.load_config)
-        patch.setattr(ConfigRepository, "load_config", lambda _, config_path: copy.deepcopy(read(config_path)))
-        yield composed
+    return composed
 
 
 page_by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

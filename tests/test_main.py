@@ -25,6 +25,8 @@ from gaigs.processes import Stopped
 from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
 
+pytestmark = pytest.mark.usefixtures("files_read_once")
+
 SMALL = (
     "tokenizer=euclidean",
     "data.transmitters=30",
