@@ -59,7 +59,7 @@ def composed_once():
         files = [(file, file.stat().st_mtime_ns) for file in Path.cwd().glob("plugins/**/*")]
         held = [(kind, *item) for kind in KINDS for item in registry(kind)._registered.items()]
         invented = [item for item in held if not str(item[2].__module__).startswith(("gaigs", "plugins"))]
-        state = (*folders, *sys.path, *files, *invented, Path.cwd(), *words)
+        state = (*folders, *sys.path, *files, *invented, Path.cwd() if files else None, *words)
         if state not in found:
             found[state] = compose(name, words)
         return copy.deepcopy(found[state])

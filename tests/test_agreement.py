@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from gaigs import agreement, configuration
+import gaigs
+from gaigs import agreement
 from gaigs.agreement import measure, on_split, run, visits
 from gaigs.data import Split
 from gaigs.query import Query
@@ -49,11 +48,6 @@ def two_passes():
 
 def by_bounds(found, monitor="mae_db"):
     return {(cell.distance, cell.separation): cell for cell in found.cells(monitor)}
-
-
-def composed(*overrides):
-    with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
 
 
 # --- cells ---
@@ -199,7 +193,7 @@ def test_links_without_a_pair_are_refused(n):
 @pytest.mark.parametrize("task", TASKS)
 def test_any_task(task, tmp_path, capsys):
     small = ["data.transmitters=40", "data.order=1", *MORE.get(task, [])]
-    config = composed(f"data={SIMULATED[task]}", *small, "baselines=[{name: mean}]")
+    config = gaigs.compose(f"data={SIMULATED[task]}", *small, "baselines=[{name: mean}]")
     score = example_links(task).task.pair_score
     run(config, tmp_path / "run")
     folder = tmp_path / "run"

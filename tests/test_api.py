@@ -31,7 +31,7 @@ PUBLIC = [name for name in gaigs.__all__ if name != "__version__"]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quick():
+def quick(files_read_once):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gaigs.runs.has_radio_map", lambda _: False)
         patch.setattr("gaigs.kriging.scalar.NEAREST", 4)

@@ -11,11 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs import configuration
 from gaigs.data import deepmimo, load, nerf2_spectrum
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.pooling.softmax_attention import SoftmaxAttention
@@ -86,11 +84,7 @@ def seed():
     torch.manual_seed(0)
 
 
-@functools.cache
-def composed(*overrides):
-    """The configuration of a command line; composed once."""
-    with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+composed = functools.cache(gaigs.compose)
 
 
 def configured(kind, name, *overrides):

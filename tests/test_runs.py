@@ -29,6 +29,8 @@ from gaigs.runs import evaluation
 from gaigs.testing import example_links
 from gaigs.training.descent import Descent
 
+pytestmark = pytest.mark.usefixtures("files_read_once")
+
 SMALL = (
     "data.transmitters=30",
     "tokenizer=euclidean",

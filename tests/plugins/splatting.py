@@ -7,11 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 import gaigs
-from gaigs import configuration, runs
+from gaigs import runs
 from gaigs.registry import registry
 from gaigs.testing import example_links
 
@@ -38,8 +36,8 @@ def repository():
 @functools.cache
 def composed(*overrides):
     """The whole configuration, as the command line would have it."""
-    with repository(), initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
-        return OmegaConf.to_container(compose("config", list(overrides)), resolve=True)
+    with repository():
+        return gaigs.compose(*overrides)
 
 
 def build(kind, config, seed=0, **context):
