@@ -303,8 +303,8 @@ def without(
     measured = [process.places[own, :3] for process, own in zip(processes, rows, strict=True)]
     known = torch.cat(measured).unique(dim=0)
     which = [distances(places, known).argmin(1) for places in measured]
-    one_by_one = lambda process: torch.cat([process.covariances(x, x).diagonal() for x in asked.split(1)])
-    prior = [one_by_one(process) for process in processes]
+    variances = lambda process: torch.cat([process.covariances(x, x).diagonal() for x in asked.split(16)])
+    prior = [variances(process) for process in processes]
 
     def error(kept: Bool[Tensor, " k"]) -> float:
         parts = []
