@@ -23,6 +23,7 @@ from gaigs.propagation import NEAREST, fresnel, slab
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene, carriers
+from gaigs.task.csi import Csi
 
 log = logging.getLogger(__name__)
 
@@ -64,10 +65,9 @@ class Mirrored(Placement):
     with the element's pattern F towards the image, times a learnt power of the cosine; the gain g of a path and, except
     of channels, its phase phi; the gain g_r and, of channels, the phase phi_r of a receiver; the gain g_w of a plane,
     which falls off as a Gaussian about the plane's middle; Fresnel's reflection Gamma_w with a learnt permittivity, of
-    channels that of a slab with a learnt thickness; and the depth tau_k of the obstacles along the folded path, which of
-    channels has a phase.
-    Polarisation is vertical: TE at upright planes, TM at level ones, weighted by n_z² in between. A path that does not
-    meet its planes in their order does not exist.
+    channels that of a slab with a learnt thickness; and the depth tau_k of the obstacles along the folded path, of
+    channels with a phase. Polarisation is vertical: TE at upright planes, TM at level ones, weighted by n_z² between. A
+    path that does not meet its planes in their order does not exist.
 
     Paths add as powers until ``enable_phases``. Channels start from free space until ``enable_reflections``.
 
@@ -170,8 +170,9 @@ class Mirrored(Placement):
             self.log_bandwidth = filled(math.log(scene.bandwidth or speed_of_light / self.diagonal))
         self.obstacles = Obstacles(obstacles, -half, half, is_complex) if obstacles else None
         self.boresights = [torch.tensor([0.0, 0.0, 1.0])] * antennas
+        task = scene.task
+        self.carrier = task.frequencies.mean().item() if isinstance(task, Csi) else None  # of the obstacles' turns [Hz]
         if is_complex:
-            self.carrier = scene.task.frequencies.mean().item()  # of the turns of obstacles [Hz]
             self.boresights = [boresight(receiver, self.middle) for receiver in scene.receivers]
         # Of a spectrum even faint paths show: where obstacles block the others.
         self.skips_faint = not is_complex and scene.task.directions is None
@@ -327,7 +328,7 @@ class Mirrored(Placement):
         left = folded.reflected(left, self.responses(query))
         if blocked and self.obstacles is not None and not self.is_bare:
             depths = self._depths(self.obstacles, folded, left)
-            if depths.is_complex():  # matter delays: its phases are in proportion to the frequency
+            if self.carrier is not None:  # matter delays: its phases are in proportion to the frequency
                 stretch = carriers(self.scene, query).to(depths.real) / self.carrier
                 depths = torch.complex(depths.real, depths.imag * stretch[:, None])
             left = left * (-depths).exp()
@@ -350,7 +351,9 @@ class Mirrored(Placement):
 
         return response
 
-    def _depths(self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]) -> Inexact[Tensor, "b n"]:
+    def _depths(
+        self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]
+    ) -> Inexact[Tensor, "b n"]:
         """Depth of each path through the obstacles; 0 for no path and, of levels, for a ``FAINT`` one."""
         depths = torch.zeros_like(strengths.real if obstacles.turns is None else strengths)
         with torch.no_grad():
