@@ -23,7 +23,6 @@ from gaigs.propagation import NEAREST, fresnel, slab
 from gaigs.query import Query
 from gaigs.registry import register
 from gaigs.scene import Scene, carriers
-from gaigs.task.csi import Csi
 
 log = logging.getLogger(__name__)
 
@@ -170,8 +169,6 @@ class Mirrored(Placement):
             self.log_bandwidth = filled(math.log(scene.bandwidth or speed_of_light / self.diagonal))
         self.obstacles = Obstacles(obstacles, -half, half, is_complex) if obstacles else None
         self.boresights = [torch.tensor([0.0, 0.0, 1.0])] * antennas
-        task = scene.task
-        self.carrier = task.frequencies.mean().item() if isinstance(task, Csi) else None  # of the obstacles' turns [Hz]
         if is_complex:
             self.boresights = [boresight(receiver, self.middle) for receiver in scene.receivers]
         # Of a spectrum even faint paths show: where obstacles block the others.
@@ -327,11 +324,7 @@ class Mirrored(Placement):
         left = torch.complex(left.exp() * folded.exists, torch.zeros_like(left))
         left = folded.reflected(left, self.responses(query))
         if blocked and self.obstacles is not None and not self.is_bare:
-            depths = self._depths(self.obstacles, folded, left)
-            if self.carrier is not None:  # matter delays: its phases are in proportion to the frequency
-                stretch = carriers(self.scene, query).to(depths.real) / self.carrier
-                depths = torch.complex(depths.real, depths.imag * stretch[:, None])
-            left = left * (-depths).exp()
+            left = left * (-self._depths(self.obstacles, folded, left)).exp()
         return left
 
     def responses(self, query: Query) -> Callable[[Bounces], Complex[Tensor, "b w"]]:
