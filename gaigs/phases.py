@@ -29,11 +29,11 @@ def phase_sign(
     times that of chance: never with fewer than ``TELLING`` links a receiver. ``waves`` are ``direct_waves`` of the same
     links with the sign -1.
     """
-    kept = {}
+    kept, heard = {}, max(1, int((channels.abs().amax((1, 2)) > 0).sum()))
     for sign in (-1, 1):
         responses = common_responses(channels, waves, receivers, sign)
         powers = [(receivers == k).sum() * response.abs().square().mean() for k, response in responses.items()]
-        kept[sign] = float(sum(powers)) / len(receivers)
+        kept[sign] = float(sum(powers)) / heard
     best = max(kept, key=kept.__getitem__)
     chance = len(receivers.unique()) / len(receivers)
     return best if kept[best] > LEAST + 4 * chance else 0
@@ -155,8 +155,8 @@ def unknown_phase(
     A link's likeness is the share of its power that the direct wave explains after the best phase, at chance one over
     the numbers of a channel. If its mean is at least a half, 3 dB, and the phases of a receiver's links are as random
     as by chance, this is ``per_link``; after the best phase and delay ``per_link_and_delay``. None if the phases agree,
-    if the direct wave explains too little to say, or with fewer than 30 links a receiver. ``waves`` are
-    ``direct_waves`` of the same links.
+    if the direct wave explains too little to say, or with fewer than 30 links a receiver. With the ``declared`` phase a
+    quarter is enough: it stays. ``waves`` are ``direct_waves`` of the same links.
     """
     chance = len(receivers.unique()) / max(len(receivers), 1)
     if chance > 1 / MANY:

@@ -76,7 +76,7 @@ def test_random_delays_declared_as_phases_alone_are_noticed():
     [
         ("delay", "take a delay of 4.99 ns off h"),
         ("elements", "the elements of gateway1 have phases that geometry does not explain"),
-        ("order", "phases of the channels follow the direct distance at no receiver"),
+        ("order", "phases of the channels do not follow the direct distance"),
     ],
 )
 def test_phases_that_geometry_does_not_explain_are_noticed(what, words, caplog):

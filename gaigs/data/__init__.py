@@ -215,7 +215,9 @@ def _phase_remarks(links: Links, task: Csi) -> list[str]:
         found.append(f"{unknown} of each link unknown, and removed in every score")
     if task.phase == "per_link_and_delay":
         return found
-    train = links.split.train[:: max(1, len(links.split.train) // 256)]
+    train, every = links.split.train, links.query.receivers[links.split.train]
+    own = (train[every == receiver] for receiver in range(len(links.receivers)))
+    train = torch.cat([part[:: max(1, len(part) // 64)] for part in own])
     receivers, labels = links.query.receivers[train], links.labels[train].to(torch.complex128)
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     waves, doubts = direct_waves(everywhere, links.query[train], task.frequencies), []
@@ -230,7 +232,7 @@ def _phase_remarks(links: Links, task: Csi) -> list[str]:
         strange = {}
     elif is_known and not sign and len(train) >= MANY * len(receivers.unique()):
         doubts.append(
-            "phases of the channels follow the direct distance at no receiver; unless walls block all direct waves, "
+            "phases of the channels do not follow the direct distance; unless walls block most direct waves, "
             "check units and order of tx, rx, elements and h, and the frequencies"
         )
     for receiver, (elements, subcarriers, delay) in strange.items():

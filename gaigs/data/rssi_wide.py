@@ -109,7 +109,7 @@ def read(
         coordinates: Columns of x, y and optionally z or floor; longitude and easting come first. None: by their names.
         ignore: Columns that are no gateways.
         not_heard: Values that mean "not heard"; None: those that ``gaigs.data.readings.marks_of`` finds.
-        height: Height of all places without a column of it, and of floor 0 [m].
+        height: Height of all places and gateways without one, and of floor 0 [m].
         storey: Height of a storey [m], for a column ``floor``.
         epsg: System of the coordinates, e.g. 32632 or 3857; None: WGS 84 for degrees, none for metres. Coordinates of
             another system than UTM are converted to it, which takes ``gaigs[maps]``.
@@ -155,7 +155,8 @@ def read(
     silent = columns.silent + [table.names[k] for k in columns.gateways if table.names[k] not in names]
     marks = " and ".join(f"{mark:g}" for mark in sorted(columns.marks))
     unplaced = [name for name in names if name not in stands]
-    level = [name for name, place in placed.items() if place[2] == height]  # the file may have no height of theirs
+    # The file may have no height of theirs.
+    level = [name for name, place in placed.items() if axes.z >= 0 and not axes.is_floor and place[2] == height]
     empty = len(places) - some
     remarks = [
         f"{len(rows)} readings of {some} places at {len(names)} gateways",
@@ -168,7 +169,10 @@ def read(
         unused and f"gateways of {Path(gateways).name} without a column: {shortened(unused)}",
         not is_placed.all() and f"{int((~is_placed).sum())} rows without coordinates are left out",
         axes.z < 0 and f"all places are {height:g} m high (data.height)",
-        axes.z >= 0 and level and f"gateways that are {height:g} m high (data.height): {shortened(level)}",
+        axes.z >= 0
+        and not axes.is_floor
+        and level
+        and f"gateways that are {height:g} m high (data.height): {shortened(level)}",
         axes.is_floor and f"heights are those of floors, {storey:g} m each (data.storey)",
         moved,
         columns.ignored and f"columns ignored: {shortened(columns.ignored)}",

@@ -130,7 +130,7 @@ class ScalarProcess(nn.Module):
         return means
 
     def deviations(self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]) -> Float[Tensor, " b"]:
-        """Standard deviations of readings at some places: of z given the readings around, and of the noise."""
+        """Standard deviations of readings at some places: of z given the readings, and of the noise."""
         choice, found = Choice(*self.choice.tolist()), places.new_zeros(len(places))
         for receiver in receivers.unique().tolist():
             rows, process = (receivers == receiver).nonzero()[:, 0], self.at(receiver)
@@ -240,7 +240,8 @@ class ScalarProcess(nn.Module):
 
     def take(self, other: "ScalarProcess") -> None:
         """Takes the hyperparameters of another process for ``deviations``; means need ``solve`` again."""
-        self.logarithms, self.choice = other.logarithms, other.choice
+        noises = (2 * (other.logarithms - self.logarithms)[self.receivers, 2]).exp()
+        self.variances, self.logarithms, self.choice = self.variances * noises, other.logarithms, other.choice
 
     def _maximise(
         self,

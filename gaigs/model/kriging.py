@@ -97,7 +97,8 @@ class Kriging(Model):
     def _make_fields(self, by_paths: bool) -> None:
         self.by_paths = by_paths
         if not self.is_scalar:
-            self.fields = nn.ModuleList(PathField() if by_paths else Field(self.scene) for _ in self.scene.receivers)
+            fields = (PathField() if by_paths else Field(self.scene) for _ in self.scene.receivers)
+            self.fields = nn.ModuleList(fields).to(self.weight.device)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
         self._make_fields(f"{prefix}fields.0.precisions" in state_dict)
@@ -108,22 +109,23 @@ class Kriging(Model):
         self.krige(links)
 
     @torch.no_grad()
-    def krige(self, links: Links, is_final: bool = True) -> "Kriging":
+    def krige(self, links: Links, is_final: bool = True, by_paths: bool | None = None) -> "Kriging":
         """Fits, and gives the validation model: the same weights and hyperparameters on the training links alone.
 
-        If not ``is_final``, only the validation model is fitted, without a word.
+        If not ``is_final``, only the validation model is fitted, without a word. ``by_paths`` says if strengths of
+        paths are kriged, or whole labels; None: ``FEWEST`` validation links or more choose.
         """
         links = thinned(links, LIMIT)
         values, held = predicted(self.trend, links, known(links)), links.split.validation
         self.fallback.fit(links)
-        if getattr(self.trend, "has_margins", False):
-            whole = self._krige_labels(links, values, False) if len(held) else None
-            by_paths = self._krige_paths(links, values, is_final)
-            if whole is None:
-                return by_paths
-            scores = self._validation_scores(links, (predicted(model, links, held) for model in (whole, by_paths)))
+        has_paths = getattr(self.trend, "has_margins", False)
+        if by_paths or (has_paths and by_paths is None and len(held) < FEWEST):
+            return self._krige_paths(links, values, is_final)
+        if has_paths and by_paths is None:
+            models = self._krige_labels(links, values, False), self._krige_paths(links, values, is_final)
+            scores = self._validation_scores(links, (predicted(model, links, held) for model in models))
             if not is_surely_better(*scores):
-                return by_paths
+                return models[1]
             if is_final:
                 log.warning(
                     "paths do not explain the channels: %s on validation links is %.3g, of kriged labels %.3g\n"

@@ -50,9 +50,9 @@ class PathLoss(Model):
             weight = steps.square().sum() * is_spread
             exponent = steps @ labels / weight if is_spread else weight
             errors = (labels - exponent * steps).square().sum()
-            lines.append(torch.stack((level, centre, exponent, weight, errors, weight.new_tensor(len(index) - 2))))
+            lines.append(torch.stack((level, centre, exponent, weight, errors, len(index) - 1 - is_spread.to(weight))))
         levels, centres, exponents, weights, errors, freedom = torch.stack(lines, 1)
-        exponents = shrunk(exponents, weights, errors.sum() / freedom.clamp_min(0).sum().clamp_min(1))
+        exponents = shrunk(exponents, weights, errors.sum() / freedom.sum())
         self.exponents.copy_(exponents)
         self.levels.copy_(levels + 10 * exponents * centres)
 
@@ -74,11 +74,14 @@ def shrunk(
     Args:
         exponents: Of least squares.
         weights: Inverse variances of their errors, for noise of variance 1; 0 without an exponent.
-        noise: Variance of the labels about the law.
+        noise: Variance of the labels about the law; NaN if too few of them say it, and the mean counts alone.
     """
-    total, noise = weights.sum(), noise.clamp_min(1e-12)
+    total = weights.sum()
     if not total:
         return torch.full_like(exponents, 2)
+    if noise.isnan():
+        return torch.full_like(exponents, (weights @ exponents / total).item())
+    noise = noise.clamp_min(1e-12)
     squares = weights @ (exponents - weights @ exponents / total).square()
     chance = ((weights > 0).sum() - 1) * noise
     scatter = ((squares - chance) / (total - weights.square().sum() / total)).nan_to_num(0, posinf=0).clamp_min(0)

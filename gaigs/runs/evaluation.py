@@ -142,7 +142,8 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
         return
     for own, other in (parts, parts[::-1]) if all(map(len, parts)) else ((validation, validation),):
         kriged = Kriging(links.scene, model.trend, model.fallback_options).to(device_of(model))
-        yield kriged.krige(replace(links, split=split.choosing(own)), is_final=False), other, split.train
+        kind = {"is_final": False, "by_paths": model.by_paths}
+        yield kriged.krige(replace(links, split=split.choosing(own)), **kind), other, split.train
 
 
 @dataclass(frozen=True)

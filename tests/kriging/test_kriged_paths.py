@@ -15,6 +15,7 @@ from gaigs.kriging.paths import Equations, PathField, conjugate_gradients
 from gaigs.model.kriging import Kriging
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.query import Query
+from gaigs.runs.evaluation import unseen
 from gaigs.task.csi import Csi
 from gaigs.testing import example_links
 
@@ -166,3 +167,12 @@ def test_labels_are_kriged_where_paths_explain_less(caplog):
     fresh.load_state_dict(model.state_dict())
     assert torch.equal(fresh.predict(links.query), model.predict(links.query))
     assert model.deviations(links.batch(torch.arange(5))).shape == (5,)
+
+
+@pytest.mark.parametrize("by_paths", [True, False])
+def test_halves_of_the_validation_links_keep_what_all_of_them_chose(by_paths, monkeypatch):
+    links, trend = made()
+    model = Kriging(links.scene, trend, {"name": "friis"})
+    model.krige(links, by_paths=by_paths)
+    monkeypatch.setattr("gaigs.model.kriging.is_surely_better", lambda *_: by_paths)  # each half would choose the other
+    assert [one.by_paths for one, *_ in unseen(model, links)] == [by_paths] * 2

@@ -101,6 +101,11 @@ def test_slopes_of_few_readings_are_drawn_towards_the_mean():
     assert found.tolist() == pytest.approx([1.5, 2.5])
 
 
+def test_slopes_of_two_readings_each_are_one():
+    slopes, weights = torch.tensor([-1.0, 5.0]), torch.tensor([1.0, 3.0])
+    torch.testing.assert_close(shrunk(slopes, weights, torch.tensor(torch.nan)), torch.tensor([3.5, 3.5]))
+
+
 @pytest.mark.parametrize("task", ["spectrum", "csi"])
 def test_more_than_a_real_number_is_refused(task):
     with pytest.raises(ValueError, match=f"predicts one real number a link, not labels of task '{task}'"):

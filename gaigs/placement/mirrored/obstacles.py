@@ -16,7 +16,8 @@ class Obstacles(nn.Module):
         depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B / sqrt(2 A)))
 
     Matter also slows waves. With ``has_phases`` each obstacle has a learnt ratio of phase lag to attenuation, its turn
-    at all frequencies, and the depth is complex. ``lower`` and ``upper`` are corners of the box around transmitters and receivers [m].
+    at all frequencies, and the depth is complex. ``lower`` and ``upper`` are corners of the box around transmitters and
+    receivers [m].
 
     Source: Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
     """
