@@ -220,7 +220,7 @@ def _phase_remarks(links: Links, task: Csi) -> list[str]:
     train = torch.cat([part[:: max(1, len(part) // 64)] for part in own])
     receivers, labels = links.query.receivers[train], links.labels[train].to(torch.complex128)
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
-    waves, doubts = direct_waves(everywhere, links.query[train], task.frequencies), []
+    waves, warnings = direct_waves(everywhere, links.query[train], task.frequencies), []
     is_known, strange = task.phase == "known", {}
     sign = phase_sign(labels, waves, receivers) if is_known else 0
     if sign:
@@ -228,17 +228,17 @@ def _phase_remarks(links: Links, task: Csi) -> list[str]:
     is_fixed = any(elements or delay is not None for elements, _, delay in strange.values())
     if not is_fixed and (phase := unknown_phase(labels, waves, receivers, task.frequencies, task.phase)):
         common = "phase" if is_known else "delay"
-        doubts.append(f"channels have no {common} in common, as if each packet had its own; set data.phase={phase}")
+        warnings.append(f"channels have no {common} in common, as if each packet had its own; set data.phase={phase}")
         strange = {}
     elif is_known and not sign and len(train) >= MANY * len(receivers.unique()):
-        doubts.append(
+        warnings.append(
             "phases of the channels do not follow the direct distance; unless walls block most direct waves, "
             "check units and order of tx, rx, elements and h, and the frequencies"
         )
     for receiver, (elements, subcarriers, delay) in strange.items():
         unexplained = "have phases that geometry does not explain, the same at all links"
         if elements:
-            doubts.append(
+            warnings.append(
                 f"the elements of {links.receivers[receiver].name} {unexplained}; check order, axes and unit of "
                 "elements and tx, or calibrate the array"
             )
@@ -246,10 +246,10 @@ def _phase_remarks(links: Links, task: Csi) -> list[str]:
             late = "check their order"
             if delay is not None:
                 late = f"take a delay of {1e9 * delay:.3g} ns off h, or set data.phase=per_link_and_delay"
-            doubts.append(f"the subcarriers of {links.receivers[receiver].name} {unexplained}; {late}")
-    for doubt in doubts:
-        log.warning(doubt)
-    return found + doubts
+            warnings.append(f"the subcarriers of {links.receivers[receiver].name} {unexplained}; {late}")
+    for warning in warnings:
+        log.warning(warning)
+    return found + warnings
 
 
 def only_trained(links: Links) -> Links:

@@ -169,10 +169,7 @@ def read(
         unused and f"gateways of {Path(gateways).name} without a column: {shortened(unused)}",
         not is_placed.all() and f"{int((~is_placed).sum())} rows without coordinates are left out",
         axes.z < 0 and f"all places are {height:g} m high (data.height)",
-        axes.z >= 0
-        and not axes.is_floor
-        and level
-        and f"gateways that are {height:g} m high (data.height): {shortened(level)}",
+        level and f"gateways that are {height:g} m high (data.height): {shortened(level)}",
         axes.is_floor and f"heights are those of floors, {storey:g} m each (data.storey)",
         moved,
         columns.ignored and f"columns ignored: {shortened(columns.ignored)}",
