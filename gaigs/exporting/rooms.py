@@ -8,7 +8,7 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,8 +21,6 @@ from gaigs.data.sionna.meshes import Mesh
 from gaigs.data.synthetic.image_source import TABULATED, conductivity
 from gaigs.io.files import atomic_write, write_text
 from gaigs.model import Model
-from gaigs.model.ensemble import Ensemble
-from gaigs.model.kriging import Kriging
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.placement.learnt_room import LearntPlane
 from gaigs.placement.mirrored import export
@@ -86,8 +84,9 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
 
 def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
     """The mirrored Gaussians of a model, without its kriging, of an ensemble those of its first member."""
-    own: Any = model.members[0] if isinstance(model, Ensemble) else model
-    own = own.trend if isinstance(own, Kriging) else own
+    own = model
+    while own.inner is not None:
+        own = own.inner
     if not isinstance(own, MirroredSplatting):
         raise ValueError(f"{kind} takes a model 'mirrored', got {name_of(own)!r}; train it on the same data")
     return own

@@ -49,7 +49,7 @@ class Field(nn.Module):
         self.components = like_loaded(self.components, components.reshape(shape))
         self._widen()
         # Scores of the rounded components, so that each component corrects the rounding of the others.
-        kept = self.widened.cpu().reshape(len(components), -1)
+        kept = self.widened.cpu().flatten(1)
         wide = torch.promote_types(kept.dtype, torch.float64)
         gram, cross = (kept @ kept.mH).to(wide), (residuals @ kept.mH).to(wide)
         scores = torch.linalg.solve(gram, cross, left=False)
@@ -72,7 +72,7 @@ class Field(nn.Module):
         if self.signal is None:
             covariances = kernel(self.places, self.places, process.length)
             covariances.diagonal().add_(process.nugget)
-            kept = self.widened.reshape(len(self.components), -1)
+            kept = self.widened.flatten(1)
             products = self.weights.mH @ covariances.to(self.weights) @ self.weights
             squares = (products.mT * (kept @ kept.mH).to(products)).sum().real / (len(self.places) * kept.shape[1])
             self.signal = squares.clamp_min(0).sqrt()
@@ -100,7 +100,10 @@ EXACT = 512
 
 
 def principal_components(residuals: Inexact[Tensor, "k m"]) -> Inexact[Tensor, "q m"]:
-    """The fewest principal components that leave out at most ``LEFT`` of the energy, each scaled to a maximum of 1."""
+    """The fewest principal components that leave out at most ``LEFT`` of the energy, each scaled to a maximum of 1.
+
+    Residuals of 0 have none.
+    """
     if min(residuals.shape) <= EXACT:
         # By the smaller matrix of products: a decomposition of the residuals themselves takes ten times as long.
         wide = residuals.to(torch.promote_types(residuals.dtype, torch.float64))
@@ -115,5 +118,5 @@ def principal_components(residuals: Inexact[Tensor, "k m"]) -> Inexact[Tensor, "
         components = columns.mH
     energy = residuals.abs().square().sum()
     left = energy - values.square().cumsum(0)
-    components = components[: min(int((left > LEFT * energy).sum()) + 1, MOST)]
+    components = components[: min(int((left > LEFT * energy).sum()) + 1, MOST) if energy > 0 else 0]
     return components / components.abs().amax(1, keepdim=True)

@@ -11,8 +11,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.kriging.kernel import kriging_weights
-from gaigs.kriging.links import PART, coordinates, distances, evenly, known_links, scale_bounds
+from gaigs.kriging.kernel import Process, kernel, kriging_weights
+from gaigs.kriging.links import PART, coordinates, distances, evenly, known_links, scale_bounds, scaled
 from gaigs.query import Query
 from gaigs.scene import Scene
 
@@ -28,6 +28,15 @@ class Hyperparameters(NamedTuple):
         """Entries of ``metrics.json``."""
         facts = {"length_m": self.length, "nugget": self.nugget}
         return facts if math.isnan(self.scale) else {**facts, "frequency_scale_m": self.scale}
+
+    def at(self, places: Float[Tensor, "k d"], signal: float) -> Process:
+        """The process of known labels at ``coordinates`` of scale 1, with the signal's variance."""
+        noise = self.nugget * signal
+
+        def covariances(a: Float[Tensor, "m d"], b: Float[Tensor, "n d"]) -> Float[Tensor, "m n"]:
+            return signal * kernel(scaled(a, self.scale), scaled(b, self.scale), self.length)
+
+        return Process(covariances, places, places.new_full((len(places),), noise), noise)
 
 
 class HeldOut(NamedTuple):

@@ -16,7 +16,7 @@ class Process:
 
     Attributes:
         covariances: Of the process at two sets of places (m, d) and (n, d), in the label's unit squared.
-        places: Of the known readings, see ``coordinates`` (k, d) [m].
+        places: Of the known readings, ``coordinates`` of scale 1 (k, d) [m].
         noises: Variances of the noise of the known readings (k,).
         noise: Variance of the noise of a new reading.
     """
@@ -66,7 +66,7 @@ def kriging_weights(
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 2.2.
     """
-    identity = torch.eye(around.shape[1], dtype=around.dtype)
+    identity = torch.eye(around.shape[1], dtype=around.dtype, device=around.device)
     covariances = kernel(around, around, length) + nugget * identity
     towards = kernel(around, asked[:, None], length)
     weights = torch.linalg.solve(covariances, towards)[..., 0]  # its gradient takes a third of the Cholesky factor's

@@ -66,6 +66,11 @@ def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tens
     return torch.cat((positions, scale * half * scene.band_positions(query).double()[:, None]), 1)
 
 
+def scaled(places: Float[Tensor, "k d"], scale: float) -> Float[Tensor, "k d"]:
+    """The ``coordinates`` of a scale, from those of scale 1."""
+    return torch.cat((places[:, :3], scale * places[:, 3:]), 1)
+
+
 def distances(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"]) -> Float[Tensor, "*c m n"]:
     """Distances of all pairs [m].
 

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
-from gaigs.kriging.fit import Hyperparameters
+from gaigs.kriging.fit import AROUND, Hyperparameters
 from gaigs.kriging.kernel import kernel
+from gaigs.kriging.links import distances
 
 JITTER = 1e-6
 """Variance of the processes that is not shared by places, over their variance: for places that are measured twice."""
@@ -100,14 +101,21 @@ class PathField(nn.Module):
         return kernel(places, self.places, process.length).to(self.weights) @ self.weights
 
     def variances(self, places: Float[Tensor, "b d"], process: Hyperparameters) -> Float[Tensor, "b n"]:
-        """Variances of the processes at some places, as if the elements resolved all paths: a lower bound."""
-        own, towards = (kernel(self.places, other, process.length) for other in (self.places, places))
+        """Variances of the processes at some places, as if the elements resolved all paths: a lower bound.
+
+        Given the ``AROUND`` nearest known links of each place: this kernel hides those behind them.
+        """
+        near = distances(places, self.places).topk(min(AROUND, len(self.places)), largest=False).indices
+        around = self.places[near]
+        own, towards = (kernel(around, other, process.length) for other in (around, places[:, None]))
         found = []
         for precisions in self.precisions.unbind(1):
-            roots = (precisions * process.scale**2).sqrt()
-            matrix = roots[:, None] * own * roots + torch.eye(len(own), dtype=own.dtype)
-            known = torch.linalg.solve_triangular(torch.linalg.cholesky(matrix), roots[:, None] * towards, upper=False)
-            found.append(1 - known.square().sum(0))
+            roots = (precisions[near] * process.scale**2).sqrt()[..., None]
+            matrix = roots * own * roots.mT
+            matrix.diagonal(dim1=1, dim2=2).add_(1)
+            factor = torch.linalg.cholesky(matrix)
+            known = torch.linalg.solve_triangular(factor, roots * towards, upper=False)
+            found.append(1 - known.square().sum((1, 2)))
         return process.scale**2 * torch.stack(found, 1)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from gaigs.kriging.fit import EDGES
 from gaigs.kriging.kernel import Process
-from gaigs.kriging.links import distances, evenly, scale_bounds
+from gaigs.kriging.links import distances, evenly, scale_bounds, scaled
 from gaigs.scene import Scene
 
 NEAREST = 32
@@ -399,11 +399,6 @@ class ScalarProcess(nn.Module):
 def is_scalar(scene: Scene) -> bool:
     """True if a label is one real number."""
     return scene.task.shape == () and not scene.task.dtype.is_complex
-
-
-def scaled(places: Float[Tensor, "k d"], scale: float) -> Float[Tensor, "k d"]:
-    """Coordinates whose Euclidean distance is that of links, from those of scale 1."""
-    return torch.cat((places[:, :3], scale * places[:, 3:]), 1)
 
 
 def covariances(around: Around, hyperparameters: Float[Tensor, "r 3"], choice: Choice) -> Float[Tensor, "m i i"]:

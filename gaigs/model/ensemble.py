@@ -1,17 +1,14 @@
 """Ensembles: models that differ by their seed alone, whose differences show how certain they are."""
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.gaussians import Gaussians
 from gaigs.kriging.links import evenly
-from gaigs.model import Model, Prediction, call_optional
-from gaigs.placement.learnt_room import LearntPath, LearntRoom
-from gaigs.query import Batch, Query
+from gaigs.model import Model, Prediction
+from gaigs.query import Batch
 from gaigs.registry import register, registry
 from gaigs.scene import Scene
 
@@ -47,18 +44,9 @@ class Ensemble(Model):
         self.register_buffer("typical", torch.tensor(0.0))
 
     @property
-    def primitives(self) -> Gaussians | None:  # type: ignore[override]
-        """Of the first member."""
-        first: Any = self.members[0]
-        return first.primitives
-
-    def learnt_room(self, links: Links | None = None) -> LearntRoom | None:
-        """Of the first member."""
-        return call_optional(self.members[0], "learnt_room", links)
-
-    def learnt_paths(self, query: Query) -> list[LearntPath] | None:
-        """Of the first member."""
-        return call_optional(self.members[0], "learnt_paths", query)
+    def inner(self) -> Model:  # type: ignore[override]
+        """The first member, whose room and Gaussians stand for those of all."""
+        return self.members[0]  # type: ignore[return-value]
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:

@@ -149,20 +149,19 @@ class GaussianProcess(Model):
         query = batch.query
         if self.scalar:
             return self.scalar[0].deviations(coordinates(self.scene, query, 1.0), query.receivers)
-        found = torch.zeros(len(query), dtype=torch.float64)
+        places = self._places(query)
+        found = torch.zeros_like(places[:, 0])
         for receiver in query.receivers.unique().tolist():
             own, known = query.receivers == receiver, self._places(self.links.query[self.known[receiver]])
-            found[own] = self.signals[receiver] * local_deviations(self._places(query[own]), known, self.process)
+            found[own] = self.signals[receiver] * local_deviations(places[own], known, self.process)
         return found
 
     def process_at(self, receiver: int) -> Process:
         """The process of one receiver."""
         if self.scalar:
             return self.scalar[0].at(receiver)
-        places, signal = self._places(self.links.query[self.known[receiver]]), self.signals[receiver] ** 2
-        noise = self.process.nugget * signal
-        covariances = lambda a, b: signal * kernel(a, b, self.process.length)
-        return Process(covariances, places, places.new_full((len(places),), noise), noise)
+        places = coordinates(self.scene, self.links.query[self.known[receiver]], 1.0)
+        return self.process.at(places, self.signals[receiver] ** 2)
 
     def _places(self, query: Query) -> Tensor:
         return coordinates(self.scene, query, self.process.scale)

@@ -2,9 +2,8 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,7 +11,6 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.gaussians import Gaussians
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import (
     FEWEST,
@@ -21,13 +19,12 @@ from gaigs.kriging.fit import (
     fit_hyperparameters,
     thin_labels,
 )
-from gaigs.kriging.kernel import LIMIT, Process, kernel
-from gaigs.kriging.links import PART, coordinates, folds_of, thinned
+from gaigs.kriging.kernel import LIMIT, Process
+from gaigs.kriging.links import PART, coordinates, folds_of, scaled, thinned
 from gaigs.kriging.paths import Equations, PathField, usual_process
 from gaigs.kriging.scalar import ScalarProcess, is_scalar
 from gaigs.model import Model, Prediction, call_optional
-from gaigs.placement.learnt_room import LearntPath, LearntRoom
-from gaigs.query import Batch, Query
+from gaigs.query import Batch
 from gaigs.registry import name_of, register, registry
 from gaigs.scene import Scene
 from gaigs.task import Task
@@ -146,7 +143,7 @@ class Kriging(Model):
         self._make_fields(False)
         held, trend = links.split.validation, values[len(links.split.train) :]
         model = self._validation_model(links, values)
-        if len(held) and self._is_unlearnt(links, trend, model.fallback) and not self.is_scalar:
+        if len(held) and not self.is_scalar and self._is_unlearnt(links, trend, model.fallback):
             # The likelihood may still mix it in: where the score is higher without it, it is left out.
             models = model, self._validation_model(links, values, (0.0,))
             scores = self._validation_scores(links, (predicted(one, links, held) for one in models))
@@ -231,10 +228,7 @@ class Kriging(Model):
         if self.by_paths:
             return None
         field, process = self.fields[receiver], Hyperparameters(*self.hyperparameters.tolist())
-        signal = field.size(process).item() ** 2
-        noises = field.places.new_full((len(field.places),), process.nugget * signal)
-        covariances = lambda a, b: signal * kernel(a, b, process.length)
-        return Process(covariances, field.places, noises, process.nugget * signal)
+        return process.at(scaled(field.places, 1 / process.scale), field.size(process).item() ** 2)
 
     def _log(self) -> None:
         log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))
@@ -382,8 +376,8 @@ class Kriging(Model):
         return self.trend if self.trend_weight > 0 else self.fallback
 
     @property
-    def primitives(self) -> Gaussians | None:  # type: ignore[override]
-        return self.trend.primitives
+    def inner(self) -> Model:  # type: ignore[override]
+        return self.trend
 
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
@@ -399,18 +393,6 @@ class Kriging(Model):
         else:
             facts["components"] = max(len(field.components) for field in self.fields)
         return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
-
-    def rendering(self, batch: Batch) -> Callable[[], object] | None:
-        return call_optional(self.trend, "rendering", batch)
-
-    def learnt_room(self, links: Links | None = None) -> LearntRoom | None:
-        return call_optional(self.trend, "learnt_room", links)
-
-    def learnt_paths(self, query: Query) -> list[LearntPath] | None:
-        return call_optional(self.trend, "learnt_paths", query)
-
-    def export(self, folder: Path) -> None:
-        call_optional(self.trend, "export", folder)
 
 
 def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -> Tensor:

@@ -52,7 +52,8 @@ class PathLoss(Model):
             errors = (labels - exponent * steps).square().sum()
             lines.append(torch.stack((level, centre, exponent, weight, errors, len(index) - 1 - is_spread.to(weight))))
         levels, centres, exponents, weights, errors, freedom = torch.stack(lines, 1)
-        exponents = shrunk(exponents, weights, errors.sum() / freedom.sum())
+        noise = errors.sum() / freedom.sum() if freedom.sum() else errors.new_tensor(torch.nan)
+        exponents = shrunk(exponents, weights, noise)
         self.exponents.copy_(exponents)
         self.levels.copy_(levels + 10 * exponents * centres)
 

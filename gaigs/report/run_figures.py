@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from gaigs.data import Links
-from gaigs.model import Model
+from gaigs.model import Model, call_optional
 from gaigs.report import figures, style
 from gaigs.report.csi import CsiFigures
 from gaigs.report.curves import loss_curves, read_log
@@ -30,9 +30,8 @@ def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
 
     The model's ``primitives`` and ``learnt_room`` are drawn if it has them.
     """
-    learnt_room = getattr(model, "learnt_room", None)
-    learnt = learnt_room(links) if learnt_room else None
-    drawn = {"room": room(links, getattr(model, "primitives", None), learnt)}
+    learnt = call_optional(model, "learnt_room", links)
+    drawn = {"room": room(links, model.primitives, learnt)}
     if learnt is not None and learnt.paths:
         drawn["paths"] = paths(links, learnt)
     if losses := read_log(folder):

@@ -128,7 +128,7 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
             known, part = index[is_known], index[~is_known & torch.isin(index, asked)]
             if len(part):
                 rest = replace(links, split=split.only(known))
-                copied = copy.deepcopy(model)
+                copied = copy.deepcopy(model, {id(model.links): model.links} if hasattr(model, "links") else None)
                 (copied.refit if hasattr(copied, "refit") else copied.fit)(rest)
                 yield copied, part, known
         return
@@ -265,17 +265,22 @@ def score(
         calibration = model.calibration if key in models or not has_intervals else calibrated(model, links)
         if has_intervals and frequencies is None and calibration is not None and calibration.gives(0.9):
             deviations = spreads(model, links, index, values)
-            estimates = [calibration.estimate(values, deviations, query, level) for level in (0.5, 0.9)]
-            found = interval_scores(task, labels, *estimates)
+            parts, stated = [], []
+            for some in torch.arange(len(index)).split(BATCH):  # estimates take ten times the memory of labels
+                own = values[some], deviations[some], query[some]
+                half, most = (calibration.estimate(*own, level) for level in (0.5, 0.9))
+                parts.append(interval_scores(task, labels[some], half, most))
+                stated.append(task.packed(most.std))
+            found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
             found["calibration_links"] = torch.full((len(index),), float(calibration.counts.sum()))
             scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
             if key == next(iter(models), None):
-                content["deviation"] = task.packed(estimates[-1].std)
+                content["deviation"] = np.concatenate(stated)
             content[f"shares_{key}"] = shares(calibration, task, labels, values, deviations, query)
     if links.held_out is not None:
-        own: Any = links.task
-        nearest = (own.frequencies - frequencies[:, None]).abs().argmin(1)
-        add("nearest_frequency", links.labels[index][..., nearest])
+        known: Any = links.task
+        closest = (known.frequencies - frequencies[:, None]).abs().argmin(1)
+        add("nearest_frequency", links.labels[index][..., closest])
     if folder is not None:
         with atomic_write(folder / "predictions.npz") as part:
             np.savez_compressed(part, **content)

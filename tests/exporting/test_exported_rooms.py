@@ -12,8 +12,11 @@ import torch
 
 import gaigs
 from gaigs.data.sionna.meshes import Mesh
-from gaigs.exporting.rooms import itu_bsdf, sheet_bsdf, write_scene
+from gaigs.exporting.rooms import itu_bsdf, mirrored_of, sheet_bsdf, write_scene
 from gaigs.io.meshes import positions, read_obj, read_ply
+from gaigs.model import call_optional
+from gaigs.model.ensemble import Ensemble
+from gaigs.model.kriging import Kriging
 from gaigs.placement.mirrored import sheets
 from gaigs.placement.mirrored.materials import Material
 from gaigs.placement.mirrored.obstacles import Obstacles
@@ -55,6 +58,12 @@ def test_gltf_has_the_room_with_y_up(mirrored, tmp_path):
     corners = np.concatenate(corners) @ turn.T
     np.testing.assert_allclose(corners.min(0), [0, 0, -SIZE[1]], atol=1e-3)
     np.testing.assert_allclose(corners.max(0), [SIZE[0], SIZE[2], 0], atol=1e-3)
+
+
+def test_a_kriged_ensemble_has_the_room_of_its_first_member(mirrored):
+    model = Kriging(mirrored.scene, Ensemble(mirrored.scene, [mirrored, mirrored]))
+    assert mirrored_of("a room", model) is mirrored
+    assert len(call_optional(model, "learnt_room").planes) == 6
 
 
 def test_a_scene_has_a_material_and_a_mesh_for_each_plane(mirrored, tmp_path):

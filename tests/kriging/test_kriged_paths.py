@@ -59,7 +59,9 @@ def test_variances_of_resolved_paths_are_the_dense_ones():
     places, asked = np.random.default_rng(0).uniform(0, 5, (20, 3)), np.random.default_rng(1).uniform(0, 5, (4, 3))
     fields = np.linalg.qr(draw(20, 8, 3))[0].swapaxes(1, 2) * np.array([2, 1, 0.3])[:, None]
     labels = draw(20, 8, seed=1)
-    found = solved(places, fields, labels, labels).variances(torch.from_numpy(asked), PROCESS)
+    field = solved(places, fields, labels, labels)
+    with torch.device("meta"):  # all that is made must stand where the places are, as on a GPU
+        found = field.variances(torch.from_numpy(asked), PROCESS)
     towards, covariances = dense(places, asked, fields, labels, labels)
     known = np.einsum("ij,ji->i", towards, np.linalg.solve(covariances, towards.conj().T)).real
     np.testing.assert_allclose(found, (PROCESS.scale**2 - known).reshape(4, 3), rtol=1e-4)

@@ -13,13 +13,14 @@ from gaigs.data import Split
 from gaigs.kriging import field, fit, scalar
 from gaigs.kriging.field import principal_components
 from gaigs.kriging.fit import Hyperparameters
-from gaigs.kriging.links import at_directions, thinned
+from gaigs.kriging.links import at_directions, coordinates, thinned
 from gaigs.kriging.scalar import Choice, ScalarProcess
-from gaigs.model import Model, Prediction, kriging
+from gaigs.model import Model, Prediction, call_optional, kriging
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging, known
-from gaigs.query import Query
+from gaigs.query import Batch, Query
 from gaigs.registry import registry
+from gaigs.surveying import posterior
 from gaigs.testing import check_model, example_links
 
 TASKS = pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
@@ -172,8 +173,7 @@ def test_facts_of_trend_and_kriging_are_reported(half):
     facts = {"weight": 1.0, "trend_weight": 0.5, "length_m": 2.0, "nugget": 0.1, "links": 80, "components": components}
     assert model.facts() == {"kriging": facts}
     assert model.primitives is None
-    assert model.rendering(links.batch(links.split.test)) is None
-    assert model.learnt_room(links) is None
+    assert call_optional(model, "rendering", links.batch(links.split.test)) is None
 
 
 def test_many_links_are_thinned_evenly(half, monkeypatch):
@@ -283,6 +283,23 @@ def test_where_kriging_does_harm_its_weight_is_zero(half):
     assert torch.equal(model.predict(links.query), model.trend.predict(links.query))
 
 
+@pytest.mark.parametrize("carriers", [(), (2.4e9, 5e9)])
+@pytest.mark.parametrize("kind", [GaussianProcess, Kriging])
+def test_surveys_see_the_process_of_the_predictions(kind, carriers, monkeypatch):
+    monkeypatch.setattr(fit, "AROUND", 100)
+    links = make("spectrum", carriers=carriers, smooth=1.0)
+    model = GaussianProcess(links.scene) if kind is GaussianProcess else Kriging(links.scene, Trained(links.scene))
+    model.fit(links)
+    query = links.query[links.split.test]
+    query = query[query.receivers == 0]
+    batch = Batch(query, links.task.directions)
+    process = model.process_at(0)
+    variances = posterior(process, coordinates(links.scene, query, 1.0)).diagonal() + process.noise
+    with torch.device("meta"):  # all that is made must stand where the places are, as on a GPU
+        expected = model.deviations(batch).square()
+    torch.testing.assert_close(variances, expected.to(variances), rtol=1e-5, atol=0)
+
+
 # --- components ---
 
 
@@ -308,6 +325,16 @@ def test_components_are_the_fewest_that_leave_little_out(dtype, exact, monkeypat
     monkeypatch.setattr(field, "MOST", 3)
     monkeypatch.setattr(field, "LEFT", 0.0)
     assert len(principal_components(residuals)) == 3
+
+
+def test_residuals_of_zero_are_kriged_to_zero():
+    """As where a receiver's only known link is its mean."""
+    scene = example_links("spectrum").scene
+    own, places = field.Field(scene), torch.rand(1, 3, dtype=torch.float64)
+    own.solve(places, torch.zeros(1, *scene.task.shape), PROCESS)
+    batch = example_links("spectrum").batch(torch.arange(2))
+    assert not own(batch.query.transmitters.double(), torch.tensor(2.0), batch).any()
+    assert own.size(PROCESS) == 0
 
 
 # --- faults ---

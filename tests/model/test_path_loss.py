@@ -1,5 +1,7 @@
 """Log-distance path loss: exact on its own law, defined where links are too few or equally long."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -104,6 +106,16 @@ def test_slopes_of_few_readings_are_drawn_towards_the_mean():
 def test_slopes_of_two_readings_each_are_one():
     slopes, weights = torch.tensor([-1.0, 5.0]), torch.tensor([1.0, 3.0])
     torch.testing.assert_close(shrunk(slopes, weights, torch.tensor(torch.nan)), torch.tensor([3.5, 3.5]))
+
+
+def test_lines_through_two_readings_leave_no_noise_to_estimate(places):
+    """Their residuals are 0 but for rounding, and no reading is left over."""
+    for seed in range(20):
+        labels = -50 + 9 * torch.randn(60, generator=torch.Generator().manual_seed(seed))
+        few = Split("few", torch.tensor([0, 1, 58, 59]), torch.arange(0), torch.arange(3))
+        model = fitted(replace(make(places, labels), split=few))
+        assert model.exponents.isfinite().all()
+        assert model.levels.isfinite().all()
 
 
 @pytest.mark.parametrize("task", ["spectrum", "csi"])
