@@ -66,12 +66,12 @@ class Model(nn.Module):
         ...
         ...     def forward(self, batch):
         ...         near = torch.cdist(batch.query.transmitters, self.places).argmin(1)
-        ...         return self.values[near], {}
+        ...         return gaigs.model.Prediction(self.values[near], {})
         >>> links = gaigs.links("synthetic", transmitters=20, order=0)
         >>> model = Nearest(links.scene)
         >>> model.fit(links)
-        >>> model(links.batch(links.split.test))[0].shape
-        torch.Size([4, 90, 360])
+        >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape
+        torch.Size([2, 90, 360])
     """
 
     trained_by = "descent"
