@@ -74,8 +74,9 @@ class Contents:
     @cached_property
     def compared(self) -> tuple[Tensor, Tensor]:
         """Labels and predictions of the shown test links."""
-        batches = self.model.predict_batches(self.links.query[self.tests])
-        return self.links.labels[self.tests], torch.cat([part.cpu() for part in batches])
+        with self.lock:
+            batches = self.model.predict_batches(self.links.query[self.tests])
+            return self.links.labels[self.tests], torch.cat([part.cpu() for part in batches])
 
     def facts(self) -> dict:
         """All that does not depend on the transmitter: axes and units, room, Gaussians, receivers, errors of links."""
@@ -101,7 +102,8 @@ class Contents:
         if self.links is not None:
             known = self.links.query.transmitters[evenly(self.links.split.train, 1000)].unique(dim=0)
             facts |= {"edges": plain(self.links.edges), "places": plain(known)}
-        gaussians, learnt = self.model.primitives, call_optional(self.model, "learnt_room")
+        with self.lock:
+            gaussians, learnt = self.model.primitives, call_optional(self.model, "learnt_room")
         if gaussians is not None:
             with torch.no_grad():
                 strengths = gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)
@@ -157,7 +159,8 @@ class Contents:
             answer["std"] = None if std is None else plain(level(std)[0])
             answer["snr"] = None if snr is None else plain(snr[0].clamp_max(140))
         query, _ = Query.from_positions([place], receiver, self.frequency, self._names, self.scene.frequencies)
-        paths = call_optional(self.model, "learnt_paths", query) or []
+        with self.lock:
+            paths = call_optional(self.model, "learnt_paths", query) or []
         answer["paths"] = [{"points": plain(path.points), "power": plain(path.power_db)} for path in paths]
         return answer | {"place": plain(place)}
 

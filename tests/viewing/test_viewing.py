@@ -92,6 +92,18 @@ def test_levels_deviations_and_map_are_the_models(levels):
     assert values[row * len(x) + column] == pytest.approx(levels.predict(asked, names[1]).item(), abs=0.05)
 
 
+def test_one_thread_at_a_time_uses_the_model(mirrored, monkeypatch):
+    links, uses = gaigs.links("synthetic", transmitters=20, order=0), []
+    shown = Contents(mirrored, links)
+    for name in ("learnt_room", "learnt_paths", "evaluate"):
+        own = getattr(type(mirrored), name)
+        watched = lambda *given, own=own, name=name: uses.append((name, shown.lock.locked())) or own(*given)
+        monkeypatch.setattr(type(mirrored), name, watched)
+    shown.answer([1.0, 1.2, 1.1], 0)
+    shown.facts()
+    assert {*uses} == {("learnt_room", True), ("learnt_paths", True), ("evaluate", True)}
+
+
 def test_a_channels_impulse_response_peaks_at_the_direct_path(links):
     model = gaigs.train("friis", links["csi"])
     place, receiver = torch.tensor([1.0, 1.2, 1.1]), model.scene.receivers[0].pose.position
