@@ -68,7 +68,8 @@ def from_arrays(
         receivers: ``Receiver`` or several, or positions (3,) or (k, 3) [m] of single antennas that look along the axes.
         labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver, (n, k, ...).
             Readings of NaN and channels of zeros were not heard, and are left out.
-        index: Receiver of each link (n,), from 0; not needed with one receiver, n positions, or labels (n, k, ...).
+        index: Receiver of each link (n,), or of all, from 0; not needed with one receiver, n positions, or labels
+            (n, k, ...).
         frequency: Carrier, one or one a link [Hz]; None if unknown, for channels the middle of the subcarriers.
         split: Name of a registered split; ``options`` are its own.
 
@@ -101,7 +102,8 @@ def from_arrays(
         rows, index = rows.repeat_interleave(most), torch.arange(most).repeat(count)
         labels = labels.flatten(0, 1)
     elif tuple(labels.shape) == (count, *shape) and (index is not None or most == 1):
-        index = as_tensor("index", [0] * count if index is None else index, "numbers of receivers")
+        index = as_tensor("index", 0 if index is None else index, "numbers of receivers")
+        index = index if index.ndim else index.expand(count)
     else:
         raise ValueError(
             f"labels of task {task.name!r} must be {(count, *shape)} with the receiver of each link in index, or "

@@ -35,9 +35,10 @@ def test_each_link_has_a_receiver_of_its_own():
     placed = gaigs.links(task="rssi", transmitters=PLACES, receivers=stands, labels=np.zeros(12) - 50)
     assert torch.equal(given.query.receivers, placed.query.receivers)
     assert len(placed.receivers) == 2
-    alone = gaigs.links(task="rssi", transmitters=PLACES, receivers=[0, 0, 2], labels=np.zeros(12) - 50, test=0.5)
-    assert len(alone.receivers) == 1
-    assert len(alone.split.test) == 6
+    alone = {"task": "rssi", "transmitters": PLACES, "receivers": [0, 0, 2], "labels": np.zeros(12) - 50, "test": 0.5}
+    for links in (gaigs.links(**alone), gaigs.links(**alone, index=np.int64(0))):
+        assert len(links.receivers) == 1
+        assert len(links.split.test) == 6
 
 
 @pytest.mark.parametrize(
