@@ -2,12 +2,14 @@
 
 import itertools
 import logging
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from gaigs.data.doubts import walls_doubt
 from gaigs.io.meshes import Face, read_obj, triangles
@@ -66,17 +68,17 @@ def _faces(
 def _merged(
     normals: Float[Tensor, "f 3"], points: Float[Tensor, "f 3"], sizes: Float[Tensor, " f"]
 ) -> Float[Tensor, "k 4"]:
-    """Planes through points by falling size; planes within 0.02 rad and 0.02 m are one."""
-    normals = normals / normals.norm(dim=1, keepdim=True)
-    rows: list[list] = []  # normal, offset, size
-    for normal, point, size in zip(normals, points, sizes, strict=True):
-        offset = normal @ point
-        for row in rows:
-            turned = 1.0 if row[0] @ normal > 0 else -1.0
-            if (row[0] - turned * normal).norm() < 0.02 and abs(row[1] - turned * offset) < 0.02:
-                row[2] += size
-                break
-        else:
-            rows.append([normal, offset, size])
-    rows.sort(key=lambda row: -row[2])
-    return torch.stack([torch.cat((normal, offset[None])) for normal, offset, _ in rows]) if rows else torch.zeros(0, 4)
+    """Coplanar faces (within 0.02 rad and 0.02 m) as the plane of the largest of them, largest total area first."""
+    sizes, order = sizes.sort(descending=True, stable=True)
+    normals = functional.normalize(normals[order], dim=1)
+    offsets = (normals * points[order]).sum(1)
+    rows: list[list[float]] = []
+    totals: list[float] = []
+    while len(sizes):
+        cosines = normals @ normals[0]
+        near = (cosines.abs() > math.cos(0.02)) & ((offsets * cosines.sign() - offsets[0]).abs() < 0.02)
+        rows.append([*normals[0].tolist(), offsets[0].item()])
+        totals.append(sizes[near].sum().item())
+        far = slice(1, None) if near.sum() == 1 else ~near  # a slice is no copy
+        normals, offsets, sizes = normals[far], offsets[far], sizes[far]
+    return torch.tensor(rows).reshape(-1, 4)[torch.tensor(totals).argsort(descending=True, stable=True)]

@@ -82,6 +82,13 @@ def test_furniture_adds_its_faces_to_the_walls_it_stands_at(tmp_path):
     assert sizes == pytest.approx(sorted(sizes, reverse=True))
 
 
+def test_the_largest_face_sets_the_normal(tmp_path):
+    sliver = "v 0 0 0\nv 1 0 0\nv 0 1 0.015\n"
+    floor = "v 0 0 0\nv 9 0 0\nv 0 9 0\n"
+    planes = read_planes(write(tmp_path, "scan.obj", f"{sliver}{floor}f 1 2 3\nf 4 5 6\n"), LOWER, UPPER)
+    assert planes.abs().tolist() == [[0, 0, 1, 0]]
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
