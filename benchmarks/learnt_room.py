@@ -21,7 +21,8 @@ from torch import Tensor
 
 import gaigs
 from gaigs.data import Links
-from gaigs.data.sionna.tracing import open_scene, respond, trace_scene
+from gaigs.data.sionna.tracing import open_scene, trace_scene
+from gaigs.data.synthetic.image_source import respond
 from gaigs.model.kriging import Kriging
 from gaigs.placement.mirrored.export import facts
 from gaigs.placement.mirrored.materials import materials

@@ -14,7 +14,6 @@ from scipy.constants import speed_of_light
 
 from gaigs.antenna import Array, Receiver
 from gaigs.data import deepmimo, deepmimo_rssi, synthetic
-from gaigs.data.synthetic.image_source import respond
 from gaigs.testing import check_data
 
 CARRIER = 3.5e9
@@ -151,7 +150,8 @@ def test_the_built_in_room_is_written_and_read(tmp_path, monkeypatch):
     runpy.run_module("gaigs.data", run_name="__main__")
     links = deepmimo.read(tmp_path / "room", elements=[1, 1], subcarriers=1)
     receiver = Receiver("point", links.receivers[0].pose, Array.single())
-    expected = respond(synthetic.ROOM, links.query.transmitters, receiver, 6.4896e9, torch.zeros(1), 2)
+    places = links.query.transmitters
+    (expected,) = synthetic.respond_in_parts(synthetic.ROOM, places, receiver, 6.4896e9, torch.zeros(1), 2)
     torch.testing.assert_close(links.labels, expected.to(torch.complex64), rtol=1e-3, atol=1e-7)
     arrays = {
         key: np.load(tmp_path / "room" / f"{key}_t000_tx000_r001.npz")[key] for key in ("delay", "inter_pos", "rx_pos")

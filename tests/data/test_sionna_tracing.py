@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.constants import speed_of_light
-from scipy.spatial.transform import Rotation
 
-from gaigs.antenna import Array, Receiver
 from gaigs.data.sionna import cache, tracing
 from gaigs.data.sionna.meshes import THICKNESS, Cuboid, Mesh
 from gaigs.data.sionna.rooms import ROOMS
 from gaigs.data.synthetic import image_source
-from gaigs.geometry import Pose
 
 FREQUENCY = 6e9
 RECEIVER = torch.tensor([0.0, 0.0, 1.0])
@@ -103,22 +100,6 @@ def test_a_transmitter_that_no_path_leads_to_is_named(tracer):
     chest = Cuboid("chest", "metal", (1.0, 1.0, 0.5), (2.0, 2.0, 1.5)).mesh()
     with pytest.raises(ValueError, match=r"got none to \[1\.5, 1\.5, 1\.0\]; move it"):
         tracer.trace([chest], RECEIVER, torch.tensor([[1.5, 0.5, 1.0], [1.5, 1.5, 1.0]]), FREQUENCY)
-
-
-# --- responses of an array ---
-
-
-def test_responses_are_those_of_the_built_in_room_for_the_same_images():
-    room = image_source.Room((7.0, 5.0, 3.0), ("concrete", "glass", "brick", "wood", "concrete", "concrete"))
-    pose = Pose.from_xyzw((0.4, 0.5, 2.2), Rotation.from_euler("ZYX", (40, 130, 10), degrees=True).as_quat())
-    receiver = Receiver("gateway", pose, Array.planar(4, 4, 0.025, "cosine"))
-    places = torch.tensor([6.0, 4.0, 2.5]) * torch.rand(20, 3, generator=torch.Generator().manual_seed(0)) + 0.3
-    offsets = torch.tensor([-2e8, 0.0, 1e8])
-    paths = image_source.trace(room, places, pose.position, FREQUENCY, 2)
-    ours = tracing.respond(paths, receiver, FREQUENCY, offsets)
-    torch.testing.assert_close(ours, image_source.respond(room, places, receiver, FREQUENCY, offsets, 2))
-    with pytest.raises(ValueError, match="frequencies must be positive"):
-        tracing.respond(paths, receiver, FREQUENCY, torch.tensor([-7e9]))
 
 
 # --- requirements ---

@@ -8,7 +8,8 @@ import torch
 
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Split
-from gaigs.data.synthetic.image_source import Room, respond
+from gaigs.data.synthetic import respond_in_parts
+from gaigs.data.synthetic.image_source import Room
 from gaigs.geometry import Pose
 from gaigs.model.friis import Friis
 from gaigs.query import Query
@@ -30,7 +31,7 @@ def empty_room(pattern="isotropic"):
     array = Array.planar(2, 3, 0.023, pattern)
     receivers = tuple(Receiver(f"gateway{i}", pose, array) for i, pose in enumerate(POSES))
     heard_by = torch.arange(60) % 2
-    each = torch.stack([respond(EMPTY, places, receiver, CARRIER, OFFSETS, 0) for receiver in receivers])
+    each = torch.stack([next(respond_in_parts(EMPTY, places, one, CARRIER, OFFSETS, 0)) for one in receivers])
     return Links(
         query=Query(places, heard_by),
         receivers=receivers,

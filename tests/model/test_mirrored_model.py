@@ -12,8 +12,8 @@ from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Split
 from gaigs.data.nerf2_spectrum import NORMALISATION
 from gaigs.data.simulation import patch_array, rss_dbm
-from gaigs.data.synthetic import POSE, ROOM, place, spectra
-from gaigs.data.synthetic.image_source import permittivity, respond
+from gaigs.data.synthetic import POSE, ROOM, place, respond_in_parts, spectra
+from gaigs.data.synthetic.image_source import permittivity
 from gaigs.geometry import Grid
 from gaigs.model.friis import Friis
 from gaigs.model.gaigs import GaussianSplatting
@@ -72,6 +72,10 @@ def links_of(labels, task, receiver, bandwidth=None):
     )
 
 
+def simulated(places, receiver, offsets, order):
+    return torch.cat([*respond_in_parts(EMPTY, places, receiver, CARRIER, offsets, order)])
+
+
 def room_spectra(spectrum, count=12):
     grid, receiver = Grid.degrees(range(1, 91, 3), range(0, 360, 6)), patch_array(POSE, CARRIER)
     labels = spectra(EMPTY, place(count, 0), receiver, grid, spectrum, CARRIER, BANDWIDTH, 2)
@@ -103,7 +107,7 @@ def test_with_the_rooms_walls_it_predicts_channels(array):
     """Also 100 MHz away, at subcarriers that no label had."""
     receiver = Receiver("gateway1", POSE, array)
     both = FREQUENCIES, FREQUENCIES[1:] + 1e8
-    labels = [respond(EMPTY, place(12, 0), receiver, CARRIER, part - CARRIER, 2).to(torch.complex64) for part in both]
+    labels = [simulated(place(12, 0), receiver, part - CARRIER, 2).to(torch.complex64) for part in both]
     links = links_of(labels[0], Csi(4, FREQUENCIES), receiver)
     model = walled(build(links, pooling="path_csi"))
     model.placement.enable_phases(speed_of_light / CARRIER)
@@ -121,7 +125,7 @@ def test_channels_start_from_free_space(array, conjugated):
     poses = POSE, replace(POSE, position=torch.tensor([4.0, 3.0, 2.0]))
     receivers = tuple(Receiver(f"gateway{k}", pose, array) for k, pose in enumerate(poses))
     offsets, places, gains = FREQUENCIES[:1] - CARRIER, place(60, 0), (3e-3j, 50.0 - 20j)
-    each = [respond(EMPTY, places, receiver, CARRIER, offsets, 1) for receiver in receivers]
+    each = [simulated(places, receiver, offsets, 1) for receiver in receivers]
     each = [gain * waves for gain, waves in zip(gains, each, strict=True)]
     labels = torch.stack(each, 1).flatten(0, 1).to(torch.complex64)
     links = Links(
@@ -156,7 +160,7 @@ def test_with_the_rooms_walls_it_predicts_signal_strength():
     """Relative to that at a metre of free space; paths interfere by a decibel or two."""
     receiver = Receiver("gateway1", POSE)
     offsets = torch.linspace(-BANDWIDTH / 2, BANDWIDTH / 2, 201, dtype=torch.float64)
-    rss = rss_dbm(respond(EMPTY, place(12, 0), receiver, CARRIER, offsets, 2)).float()
+    rss = rss_dbm(simulated(place(12, 0), receiver, offsets, 2)).float()
     links = links_of(rss, Rssi(), receiver, BANDWIDTH)
     model = walled(build(links, pooling={"name": "path_rssi", "floor_db": -100.0}))
     at_a_metre = 20 * math.log10(speed_of_light / CARRIER / (4 * math.pi))
@@ -259,7 +263,7 @@ def test_half_precision_is_refused(dtype):
 @torch.no_grad()
 def test_phases_come_with_planes_that_move():
     receiver, offsets = Receiver("gateway1", POSE), torch.linspace(-BANDWIDTH / 2, BANDWIDTH / 2, 51).double()
-    rss = rss_dbm(respond(EMPTY, place(12, 0), receiver, CARRIER, offsets, 1)).float()
+    rss = rss_dbm(simulated(place(12, 0), receiver, offsets, 1)).float()
     links = links_of(rss - 20 * math.log10(speed_of_light / CARRIER / (4 * math.pi)), Rssi(), receiver)
     pooling = {"name": "path_rssi", "floor_db": -100.0}
     model = walled(build(links, placement=MIRRORED | {"order": 1}, pooling=pooling))
@@ -295,7 +299,7 @@ def test_tilted_plane_is_turned_square_to_the_others():
 def test_plane_of_channels_moves_to_its_phases(phase):
     """Also if their phase is unknown, one is silent, and all are faint."""
     receiver, places = Receiver("gateway1", POSE, BENT), place(24, 0)
-    labels = 1e-21 * respond(EMPTY, places, receiver, CARRIER, FREQUENCIES[:1] - CARRIER, 1)
+    labels = 1e-21 * simulated(places, receiver, FREQUENCIES[:1] - CARRIER, 1)
     if phase == "per_link":
         labels = -labels
     labels[5] = 0

@@ -13,7 +13,8 @@ import torch
 from splatting import build, composed
 
 from gaigs.antenna import Array, Receiver
-from gaigs.data.synthetic.image_source import Room, respond
+from gaigs.data.synthetic import respond_in_parts
+from gaigs.data.synthetic.image_source import Room
 from gaigs.geometry import Pose
 from gaigs.query import Batch, Query
 from gaigs.task.csi import Csi
@@ -137,7 +138,7 @@ def room_links(count, sign=-1, strength=1.0):
     array, carrier = Array.planar(1, 2, 0.03), 5e9
     offsets = torch.linspace(-5e8, 5e8, 41, dtype=torch.float64)
     receiver = Receiver("middle", POSE, array)
-    channels = strength * respond(ROOM, places, receiver, carrier, offsets, 1)
+    channels = strength * torch.cat([*respond_in_parts(ROOM, places, receiver, carrier, offsets, 1)])
     channels = channels.conj() if sign > 0 else channels
     links = replace(
         LINKS,

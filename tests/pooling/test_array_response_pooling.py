@@ -10,8 +10,8 @@ from scipy.constants import speed_of_light
 
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Split
-from gaigs.data.synthetic import ROOM, furnished_room
-from gaigs.data.synthetic.image_source import frequency_offsets, respond
+from gaigs.data.synthetic import ROOM, furnished_room, respond_in_parts
+from gaigs.data.synthetic.image_source import frequency_offsets
 from gaigs.geometry import Grid, Rays
 from gaigs.pooling.array_response import ArrayResponsePooling
 from gaigs.pooling.path_spectrum import PathSpectrum
@@ -75,7 +75,7 @@ def test_the_labels_of_the_simulated_room_follow_from_its_paths(spectrum):
     links = furnished_room(spectrum=spectrum, transmitters=6, order=1)
     receiver, carrier = links.receivers[0], links.query.frequencies[0].item()
     offsets = frequency_offsets(ROOM, 499.2e6, 1) if spectrum == "band" else torch.zeros(1)
-    responses = respond(ROOM, links.query.transmitters, receiver, carrier, offsets, 1)
+    (responses,) = respond_in_parts(ROOM, links.query.transmitters, receiver, carrier, offsets, 1)
     lags = lags_of(responses, receiver.array).to(torch.complex64)
     everything = torch.arange(6)
     scene = replace(links, split=Split("all", everything, everything[:0], everything)).scene

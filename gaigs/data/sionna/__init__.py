@@ -1,6 +1,7 @@
 """Rooms of any shape, simulated by the independent ray tracer Sionna RT."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ from gaigs.data.sionna.cache import find_paths
 from gaigs.data.sionna.meshes import MeshRoom, edges, facing
 from gaigs.data.sionna.rooms import ROOMS
 from gaigs.data.sionna.scenes import SceneFile, check_points
-from gaigs.data.sionna.tracing import frequency_offsets, respond, sample_paths
+from gaigs.data.sionna.tracing import frequency_offsets, sample_paths
+from gaigs.data.synthetic.image_source import respond
 from gaigs.registry import register
 
 HEIGHTS = 0.3, 2.0
@@ -78,17 +80,13 @@ def find_room(
         raise ValueError(f"room must be one of {', '.join(ROOMS)}, got {name!r}")
     room = ROOMS[name]
 
-    def trace(places: Tensor, receiver: Receiver, frequency: float, offsets: Tensor) -> Sequence[Tensor]:
-        paths = find_paths(room, receiver.pose.position, places, frequency)
-        return respond(paths, receiver, frequency, offsets).split(PART)
-
     return SimulatedRoom(
         pose=room.pose(),
         gateways=tuple(gateway(name, position) for name, position in room.gateways.items()),
         edges=edges(room.meshes()),
         place=lambda count, seed: place(room, count, seed),
         frequency_offsets=lambda bandwidth: frequency_offsets(room.meshes(), bandwidth),
-        respond=trace,
+        respond=partial(respond_in_parts, room),
     )
 
 
@@ -107,18 +105,22 @@ def find_scene(
     space = room.space
     middle = (space.lower + space.upper) / 2 if target is None else check_points("data.facing", [target])[0].tolist()
 
-    def trace(places: Tensor, receiver: Receiver, frequency: float, offsets: Tensor) -> Sequence[Tensor]:
-        paths = find_paths(room, receiver.pose.position, places, frequency)
-        return respond(paths, receiver, frequency, offsets).split(PART)
-
     return SimulatedRoom(
         pose=facing(positions[0].tolist(), [*middle]),
         gateways=tuple(gateway(f"rx{k}", position) for k, position in enumerate(positions)),
         edges=room.edges(),
         place=room.place,
         frequency_offsets=lambda bandwidth: sample_paths(bandwidth, float(np.linalg.norm(space.upper - space.lower))),
-        respond=trace,
+        respond=partial(respond_in_parts, room),
     )
+
+
+def respond_in_parts(
+    room: MeshRoom | SceneFile, places: Tensor, receiver: Receiver, frequency: float, offsets: Tensor
+) -> Sequence[Tensor]:
+    """``respond`` for the traced paths, ``PART`` places at a time."""
+    paths = find_paths(room, receiver.pose.position, places, frequency)
+    return respond(paths, receiver, frequency, offsets).split(PART)
 
 
 def place(room: MeshRoom, count: int, seed: int) -> Float[Tensor, "count 3"]:

@@ -1,4 +1,4 @@
-"""Paths in a room of meshes by the ray tracer Sionna RT, on the processor, and the fields of an array along them."""
+"""Paths in a room of meshes by the ray tracer Sionna RT, on the processor."""
 
 import math
 import os
@@ -12,16 +12,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from gaigs.antenna import Receiver
 from gaigs.data.simulation import sample_band
 from gaigs.data.sionna.meshes import THICKNESS, Mesh
 from gaigs.data.synthetic.image_source import MATERIALS, Paths, conductivity
-from gaigs.propagation import free_space
 
 DEPTH = 3
 """Largest number of reflections, passages through surfaces and diffractions of a path; a wardrobe is two passages."""
@@ -208,31 +206,6 @@ def _strongest(
         # The path's gain has no spreading of free space, wavelength / (4 pi length).
         found.append((images[k, order], field[order] * 4 * math.pi * lengths[k, order] / wavelength))
     return found
-
-
-def respond(
-    paths: Paths, receiver: Receiver, frequency: float, offsets: Float[Tensor, " f"]
-) -> Complex[Tensor, "b elements f"]:
-    """Field at each element of a receiver's array along paths from unit-power transmitters.
-
-    The phase is that of a spherical wave from each image to each element. Gains and the elements' pattern are those of
-    paths to the array's centre at the carrier; ``offsets`` are relative to it [Hz].
-
-    Raises:
-        ValueError: A frequency is not positive.
-    """
-    frequencies = frequency + offsets.double()
-    if frequencies.min() <= 0:
-        raise ValueError(f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth")
-    position, rotation = receiver.pose.position.double(), receiver.pose.rotation.double()
-    found = []
-    # 16 transmitters at a time, because the waves of all paths take many times the memory of their sums.
-    for images, gains in zip(paths.images.split(16), paths.gains.split(16), strict=True):
-        local = (images - position) @ rotation
-        gains = gains * receiver.array.gain(local / local.norm(dim=-1, keepdim=True))
-        distances = (local[:, :, None] - receiver.array.elements.double()).norm(dim=-1)
-        found.append(torch.einsum("bp,bpnf->bnf", gains, free_space(distances[..., None], frequencies)))
-    return torch.cat(found)
 
 
 def frequency_offsets(meshes: Sequence[Mesh], bandwidth: float) -> Float[Tensor, " f"]:

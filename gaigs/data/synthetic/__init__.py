@@ -2,16 +2,17 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from gaigs.antenna import Receiver
 from gaigs.data import Links
 from gaigs.data.readings import gateway
 from gaigs.data.simulation import PART, SimulatedRoom, draw_places, simulate_spectra, spectrum_offsets, to_spectra
-from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond
+from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond, trace
 from gaigs.geometry import Grid, Pose
 from gaigs.registry import register
 
@@ -78,18 +79,27 @@ def furnished_room(
 
 def default_room(order: int) -> SimulatedRoom:
     """The default room with paths of at most ``order`` reflections."""
-
-    def respond_in_parts(places: Tensor, receiver: Receiver, frequency: float, offsets: Tensor) -> Iterator[Tensor]:
-        return (respond(ROOM, part, receiver, frequency, offsets, order) for part in places.split(PART))
-
     return SimulatedRoom(
         pose=POSE,
         gateways=tuple(gateway(name, position) for name, position in GATEWAYS.items()),
         edges=edges(ROOM),
         place=place,
         frequency_offsets=lambda bandwidth: frequency_offsets(ROOM, bandwidth, order),
-        respond=respond_in_parts,
+        respond=partial(respond_in_parts, ROOM, order=order),
     )
+
+
+def respond_in_parts(
+    room: Room,
+    transmitters: Float[Tensor, "n 3"],
+    receiver: Receiver,
+    frequency: float,
+    offsets: Float[Tensor, " f"],
+    order: int,
+) -> Iterator[Complex[Tensor, "part elements f"]]:
+    """``respond`` for the paths of at most ``order`` reflections in any room, ``PART`` transmitters [m] at a time."""
+    for part in transmitters.split(PART):
+        yield respond(trace(room, part, receiver.pose.position, frequency, order), receiver, frequency, offsets)
 
 
 def place(count: int, seed: int) -> Float[Tensor, "count 3"]:
@@ -114,7 +124,7 @@ def spectra(
         ValueError: An option is out of range, or a transmitter does not stand free in the room.
     """
     offsets = spectrum_offsets(spectrum, lambda width: frequency_offsets(room, width, order), bandwidth)
-    responses = (respond(room, part, receiver, frequency, offsets, order) for part in transmitters.split(PART))
+    responses = respond_in_parts(room, transmitters, receiver, frequency, offsets, order)
     return to_spectra(responses, grid, receiver.array, frequency)
 
 

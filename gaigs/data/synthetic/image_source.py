@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Complex, Float, Int
-from scipy.constants import epsilon_0, speed_of_light
+from scipy.constants import epsilon_0
 from torch import Tensor
 
 from gaigs.antenna import Receiver
 from gaigs.data.simulation import sample_band
-from gaigs.propagation import fresnel
+from gaigs.propagation import free_space, fresnel
 
 MATERIALS = {
     "concrete": (5.24, 0.0462, 0.7822),
@@ -202,33 +202,26 @@ def frequency_offsets(room: Room, bandwidth: float, order: int) -> Float[Tensor,
 
 
 def respond(
-    room: Room,
-    transmitters: Float[Tensor, "b 3"],
-    receiver: Receiver,
-    frequency: float,
-    offsets: Float[Tensor, " f"],
-    order: int,
+    paths: Paths, receiver: Receiver, frequency: float, offsets: Float[Tensor, " f"]
 ) -> Complex[Tensor, "b elements f"]:
-    """Field at each element of a receiver's array from a unit-power isotropic transmitter.
+    """Field at each element of a receiver's array along paths from unit-power transmitters.
 
-    The phase is that of a spherical wave from each image to each element. Reflection, penetration and the elements'
-    pattern are those at the carrier [Hz] and the array's centre; ``offsets`` are relative to the carrier [Hz].
+    The phase is that of a spherical wave from each image to each element. Gains and the elements' pattern are those of
+    paths to the array's centre at the carrier; ``offsets`` are relative to it [Hz].
 
     Raises:
-        ValueError: A frequency is not positive, or as for ``trace``.
-
-    Source: Friis, A note on a simple transmission formula, 1946.
+        ValueError: A frequency is not positive.
     """
     frequencies = frequency + offsets.double()
     if frequencies.min() <= 0:
         raise ValueError(f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth")
-    pose, array = receiver.pose, receiver.array
-    paths = trace(room, transmitters, pose.position, frequency, order)
-    local = (paths.images - pose.position.double()) @ pose.rotation.double()
-    directions = local / local.norm(dim=-1, keepdim=True)
-    elements = pose.position.double() + array.elements.double() @ pose.rotation.double().T
-    distances = (paths.images[:, :, None] - elements).norm(dim=-1)
-    phases = distances[..., None] * (2 * math.pi * frequencies / speed_of_light)
-    # Friis: wavelength / (4 pi distance), which is 1 / (2 phase).
-    waves = torch.polar(0.5 / phases, -phases)
-    return torch.einsum("bp,bpnf->bnf", paths.gains * array.gain(directions), waves)
+    position, rotation = receiver.pose.position.double(), receiver.pose.rotation.double()
+    elements = position + receiver.array.elements.double() @ rotation.T
+    found = []
+    # 16 transmitters at a time, because the waves of all paths take many times the memory of their sums.
+    for images, gains in zip(paths.images.split(16), paths.gains.split(16), strict=True):
+        local = (images - position) @ rotation
+        gains = gains * receiver.array.gain(local / local.norm(dim=-1, keepdim=True))
+        distances = (images[:, :, None] - elements).norm(dim=-1)
+        found.append(torch.einsum("bp,bpnf->bnf", gains, free_space(distances[..., None], frequencies)))
+    return torch.cat(found)

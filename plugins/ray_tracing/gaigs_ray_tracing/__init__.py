@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from gaigs.antenna import Array
 from gaigs.data import Links
 from gaigs.data.sionna.meshes import THICKNESS, wavefront_obj
-from gaigs.data.sionna.tracing import frequency_offsets, respond
-from gaigs.data.synthetic.image_source import MATERIALS, Paths
+from gaigs.data.sionna.tracing import frequency_offsets
+from gaigs.data.synthetic.image_source import MATERIALS, Paths, respond
 from gaigs.model import Model, Prediction
 from gaigs.pooling.beamformer import Beamformer
 from gaigs.propagation import fit_gain, free_space
