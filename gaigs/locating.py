@@ -192,7 +192,8 @@ def fingerprints(
             the errors of a label's numbers are independent, which makes regions too small.
         region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m] in which transmitters are anywhere alike; None: the
             box of the training transmitters.
-        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
+        frequency: Carrier of known links, with a region any [Hz]; None: that of the training links, of several the
+            middle one.
         points: Number of candidate places; None: 20,000, fewer where the model takes more than a minute for them.
 
     Raises:
@@ -231,18 +232,21 @@ def fingerprints(
         return Fingerprints(scene.task, frequency, places, prior, density, axes, values, deviations)
 
     known = torch.zeros(0).long() if links is None else at_carrier(links, frequency, "train", "validation")
+    if links is not None and region is None and not len(known):
+        carriers = ", ".join(f"{carrier:.7g}" for carrier in scene.frequencies.tolist())
+        raise ValueError(f"frequency must be that of known links, {carriers} Hz, got {frequency:.7g}; or give a region")
     made = mapped(model, known)
     tries: list[Any] = []
     for one, part, others in unseen(model, links) if links is not None else ():
         one.calibration = model.calibration
         rows = rows_of(links)  # those known links that share a transmission with the part
         asked, truth = received(links, known[torch.isin(rows[known], rows[part])])
-        some = evenly(torch.arange(len(truth)), HELD_OUT)
-        if len(some):
+        some, others = evenly(torch.arange(len(truth)), HELD_OUT), others[torch.isin(others, known)]
+        if len(some) and (len(others) or region is not None):
             errors = asked[some] - predicted(one, truth[some], frequency)[0]
             if region is not None:  # a value from elsewhere is not like those that will be asked
                 some = some[((truth[some] >= box.amin(0)) & (truth[some] <= box.amax(0))).all(1)]
-            tries.append((mapped(one, others[torch.isin(others, known)]), asked[some], truth[some], errors))
+            tries.append((mapped(one, others), asked[some], truth[some], errors))
         if sum(min(len(places), SCORED) for _, _, places, _ in tries) >= ENOUGH:
             break
     if len(tries) == 1 and len(tries[0][1]) > 1:

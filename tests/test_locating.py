@@ -163,6 +163,17 @@ def test_held_out_fingerprints_are_located_among_the_other_places(monkeypatch):
     assert len(prints.drops()) == sum(len({links.rows[row].item() for row in part}) for part in held)
 
 
+def test_carriers_without_known_links_are_refused_and_folds_without_them_left_out():
+    links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
+    carriers = torch.full((len(links),), 900e6)
+    carriers[links.rows == links.rows[links.split.train[0]]] = 915e6
+    links = replace(links, query=replace(links.query, frequencies=carriers))
+    model = gaigs.train("mean", links)
+    with pytest.raises(ValueError, match=r"that of known links, 9e\+08, 9\.15e\+08 Hz, got 9\.2e\+08; or"):
+        gaigs.fingerprints(model, links, frequency=920e6, points=50)
+    assert not gaigs.fingerprints(model, links, frequency=915e6, points=50).held
+
+
 def test_channels_are_compared_without_power_phase_and_delay():
     rng = torch.Generator().manual_seed(0)
     h = torch.view_as_complex(torch.randn(2, 4, 8, 2, generator=rng))
