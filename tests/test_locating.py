@@ -118,6 +118,17 @@ def test_transmitters_are_nearer_than_their_neighbours_and_in_their_regions():
     torch.testing.assert_close(prints.prior.exp().sum(), torch.tensor(1.0))
 
 
+def test_values_are_located_in_parts(rssi, monkeypatch):
+    prints, sizes = rssi[2], []
+    own = locating.squares
+    monkeypatch.setattr(locating, "squares", lambda *parts: sizes.append(len(parts[1])) or own(*parts))
+    values = torch.randn(150, 4, generator=torch.Generator().manual_seed(0)) * 10 - 60
+    found, last = gaigs.locate(prints, values), gaigs.locate(prints, values[-1])
+    assert sizes == [64, 64, 22, 1]
+    for name in ("probabilities", "mean", "likeliest", "region", "sizes"):
+        torch.testing.assert_close(getattr(found, name)[-1:], getattr(last, name), rtol=1e-4, atol=1e-4)
+
+
 def test_walks_go_to_the_nearest_place_and_stay_while_steps_would_take_them_there():
     line = torch.tensor([0.0, 2.0, 1.0, 3.0])[:, None] * torch.tensor([1.0, 0.0, 0.0])
     assert walk(line, 1.0).tolist() == [0, 2, 1, 3]
