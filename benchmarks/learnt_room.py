@@ -62,8 +62,8 @@ def main(folder: Path) -> None:
     own = model.trend if isinstance(model, Kriging) else model
     placement, query, carrier = own.placement, links.query[links.split.test], float(links.scene.frequencies[0])
     lines = [("plane", "normal", "offset [m]", "share of the power", "material", "slab")]
-    chosen = materials(placement, own.surveyed, carrier)
-    for plane in facts(placement, own.surveyed)["planes"]:
+    chosen = materials(placement, own.traced, carrier)
+    for plane in facts(placement, own.traced)["planes"]:
         material, thickness = chosen[plane["number"]]
         normal = " ".join(f"{part:.2f}" for part in plane["normal"])
         slab = f"{1e3 * thickness:.3g} mm" if thickness < 1 else "half-space"

@@ -233,7 +233,7 @@ def on_split(
 def _nearest(links: Links) -> tuple[ndarray, ndarray, int]:
     """Distance [m] and separation of test links to the nearest known link, and the number of those without one."""
     places, order, test = links.query.transmitters.double().numpy(), visits(links), links.split.test.numpy()
-    known = torch.cat((links.split.train, links.split.validation)).numpy()
+    known = links.split.known.numpy()
     found = [(np.zeros(0), np.zeros(0))]
     for group in _groups(links):
         asked, there = np.intersect1d(group, test), np.intersect1d(group, known)

@@ -216,8 +216,7 @@ def fingerprints(
     box = torch.stack((scene.lower, scene.upper)) if region is None else as_positions("region", region).reshape(-1, 3)
     if len(box) != 2:
         raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points")
-    if frequency is None and len(scene.frequencies):
-        frequency = float(scene.frequencies[len(scene.frequencies) // 2])
+    frequency = scene.middle_frequency if frequency is None else frequency
     if points is None:
         some = even_places(box[0], box[1], 512)
         predicted(model, some[:2], frequency)  # the first prediction compiles and loads

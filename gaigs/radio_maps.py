@@ -15,7 +15,6 @@ from numpy import ndarray
 
 from gaigs.geometry import ExtrapolationWarning
 from gaigs.io.files import atomic_write
-from gaigs.task import Task
 
 log = logging.getLogger(__name__)
 
@@ -89,11 +88,6 @@ def _key(unit: str) -> str:
     return f"values_{unit.lower()}" if unit.isascii() and unit.isalpha() else "values"
 
 
-def has_radio_map(task: Task) -> bool:
-    """True for a task whose label is one real number a link."""
-    return task.shape == () and not task.dtype.is_complex
-
-
 def radio_map(
     model,
     pitch: float | None = None,
@@ -131,7 +125,7 @@ def radio_map(
     if not hasattr(model, "scene"):
         raise TypeError(f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint first")
     scene = model.scene
-    if not has_radio_map(scene.task):
+    if not scene.task.is_scalar:
         raise ValueError(
             f"a radio map takes a model of one real number a link, got one of task {scene.task.name!r}, whose labels "
             f"are {tuple(scene.task.shape)} of {scene.task.dtype}; use model.predict"
@@ -165,8 +159,7 @@ def radio_map(
         )
     # All receivers of a point in one batch, so that a transmitter's excitation is computed once.
     heard = np.array([known.index(name) for name in names])
-    if frequency is None and len(scene.frequencies):
-        frequency = float(scene.frequencies[len(scene.frequencies) // 2])
+    frequency = scene.middle_frequency if frequency is None else frequency
 
     level = 0.5 if model.calibration is not None and model.calibration.gives(0.5) else None
 

@@ -63,6 +63,11 @@ class Scene:
         return float(self.floors[0] if len(self.floors) else (self.lower[2].double() + self.upper[2].double()) / 2)
 
     @property
+    def middle_frequency(self) -> float | None:
+        """The middle one of the training links' carriers [Hz]; None if they have none."""
+        return float(self.frequencies[len(self.frequencies) // 2]) if len(self.frequencies) else None
+
+    @property
     def has_band(self) -> bool:
         """True if the training links have several carriers."""
         return len(self.frequencies) > 1

@@ -17,7 +17,6 @@ from gaigs.geometry import even_places
 from gaigs.io.files import write_text
 from gaigs.kriging.kernel import LIMIT, Process, kernel
 from gaigs.kriging.links import coordinates, distances, evenly
-from gaigs.kriging.scalar import is_scalar
 from gaigs.model import Model, call_optional
 from gaigs.query import Query, as_positions
 from gaigs.registry import call, check_type
@@ -173,12 +172,11 @@ def survey(
         processes = [default_process(asked)]
     else:
         scene = model.scene
-        if frequency is None and len(scene.frequencies):
-            frequency = float(scene.frequencies[len(scene.frequencies) // 2])
+        frequency = scene.middle_frequency if frequency is None else frequency
         names = [receiver.name for receiver in scene.receivers]
         query, _ = Query.from_positions(points, 0, frequency, names, scene.frequencies)
         asked = coordinates(scene, query, 1.0).to(processes[0].places)
-        centres = scene.positions(asked) if is_scalar(scene) else [None] * len(processes)
+        centres = scene.positions(asked) if scene.task.is_scalar else [None] * len(processes)
         processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
         factor = 1.0 if model.calibration is None else model.calibration.sizes.square().mean().sqrt().item()
     posteriors = [posterior(process, asked) for process in processes]

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ PUBLIC = [name for name in gaigs.__all__ if name != "__version__"]
 @pytest.fixture(scope="module", autouse=True)
 def quick(files_read_once):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gaigs.runs.has_radio_map", lambda _: False)
+        patch.setattr("gaigs.runs.radio_map", Mock())
         patch.setattr("gaigs.kriging.scalar.NEAREST", 4)
         patch.setattr("gaigs.kriging.scalar.ITERATIONS", 2)
         yield

@@ -46,6 +46,11 @@ class Split:
         """The three parts by name."""
         return {"train": self.train, "validation": self.validation, "test": self.test}
 
+    @property
+    def known(self) -> Int[Tensor, " k"]:
+        """Training and validation links, in this order."""
+        return torch.cat((self.train, self.validation))
+
     def validating(self) -> "Split":
         """The split whose test are the validation links, for models that have not seen them."""
         return replace(self, validation=self.validation[:0], test=self.validation)
@@ -126,7 +131,7 @@ class Links:
 
     def known(self, receiver: int) -> Int[Tensor, " k"]:
         """Training and validation links to a receiver; look-ups use them all."""
-        index = torch.cat((self.split.train, self.split.validation))
+        index = self.split.known
         return index[self.query.receivers[index] == receiver]
 
     @property

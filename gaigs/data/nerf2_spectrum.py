@@ -129,7 +129,7 @@ def write(folder: str | Path, links: Links) -> None:
     quaternion = Rotation.from_matrix(receiver.pose.rotation.double().numpy()).as_quat()
     pose = {"position": receiver.pose.position.tolist(), "orientation": quaternion.tolist()}
     write_text(folder / "gateway_info.yml", yaml.safe_dump({receiver.name: pose}, default_flow_style=None))
-    for name, index in (("train", torch.cat((split.train, split.validation))), ("test", split.test)):
+    for name, index in (("train", split.known), ("test", split.test)):
         write_text(folder / f"{name}_index.txt", "".join(f"{k + 1:05d}\n" for k in index.tolist()))
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from gaigs.exporting import maps, predictions, rooms, scenarios
 from gaigs.model import Model
-from gaigs.radio_maps import has_radio_map, radio_map
+from gaigs.radio_maps import radio_map
 from gaigs.registry import call, check_type
 from gaigs.runs import links_of, model_of
 
@@ -92,7 +92,7 @@ def run(config: dict, folder: Path) -> None:
     suffix = check_suffix(Path(f"export.{form}"))
     model = model_of(config["folder"])
     takes_places = suffix in (*PREDICTIONS, SCENARIO)
-    if places is None and takes_places and (suffix not in MAPS or not has_radio_map(model.scene.task)):
+    if places is None and takes_places and (suffix not in MAPS or not model.scene.task.is_scalar):
         places = "test"
     name = "predictions" if suffix in PREDICTIONS and places else "radio_map" if suffix in MAPS else "room"
     places = links_of(config["folder"]) if places == "test" else places

@@ -53,16 +53,16 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
         ValueError: The model has no planes, or a scene's carrier is unknown or impossible.
     """
     own, suffix = mirrored_of("a learnt room", model), file.suffix.lower()
-    known = own.scene.frequencies
     if suffix == ".xml":
-        if frequency is None and not len(known):
+        frequency = own.scene.middle_frequency if frequency is None else frequency
+        if frequency is None:
             raise ValueError("materials depend on the carrier, which the data do not know; set frequency=... [Hz]")
-        frequency = float(known[len(known) // 2] if frequency is None else frequency)
+        frequency = float(frequency)
         check_carrier("frequency", frequency)
-    found = export.survey(own.placement, own.surveyed)
+    found = export.trace_paths(own.placement, own.traced)
     planes = export.outlines(own.placement, found)
     corners = np.concatenate([found.ends, *(plane.corners for plane in planes)])
-    sheets, rest = fit_sheets(own.placement, own.surveyed, corners.min(0), corners.max(0))
+    sheets, rest = fit_sheets(own.placement, own.traced, corners.min(0), corners.max(0))
     meshes = [*map(mesh_of, planes), *(mesh_of_sheet(number, sheet) for number, sheet in enumerate(sheets))]
     if suffix == ".obj":
         write_text(file, export.wavefront_obj(own.placement, found, sheets))
@@ -71,7 +71,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
         extras = [*({"share": plane.share} for plane in planes), *({"loss_db": sheet.loss_db} for sheet in sheets)]
         write_gltf(file, meshes, extras)
         return [file]
-    chosen = materials(own.placement, own.surveyed, frequency)
+    chosen = materials(own.placement, own.traced, frequency)
     bsdfs = [itu_bsdf(chosen[plane.number], frequency) for plane in planes] + [*map(sheet_bsdf, sheets)]
     comments = [f"Materials for {frequency:.7g} Hz."]
     if own.scene.task.dtype.is_complex:

@@ -53,7 +53,7 @@ def write_scenario(model: Model, folder: Path, places: object, frequency: float 
         gains = torch.cat([paths.amplitudes for paths in heard]).cpu().to(torch.complex128).numpy()
         sizes = np.abs(gains)
         gains = np.where(sizes > FAINT * sizes.max(1, keepdims=True), unit * gains, 0)
-        bounces = export.survey(own.placement, query).bounces[:, :, ::-1].astype(float)  # from the receiver on
+        bounces = export.trace_paths(own.placement, query).bounces[:, :, ::-1].astype(float)  # from the receiver on
         stations.append((receiver.pose.position.double().numpy(), gains, bounces))
     folder.mkdir(parents=True, exist_ok=True)
     deepmimo.write(folder, carrier.item(), users.double().numpy(), stations)

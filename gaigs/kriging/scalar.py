@@ -396,11 +396,6 @@ class ScalarProcess(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
-def is_scalar(scene: Scene) -> bool:
-    """True if a label is one real number."""
-    return scene.task.shape == () and not scene.task.dtype.is_complex
-
-
 def covariances(around: Around, hyperparameters: Float[Tensor, "r 3"], choice: Choice) -> Float[Tensor, "m i i"]:
     """Covariances of z at the readings around each place, and at the place itself."""
     length, signal, _ = (part[:, None, None] for part in hyperparameters[around.receivers].unbind(1))

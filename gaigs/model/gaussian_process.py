@@ -11,7 +11,7 @@ from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations, thin_labels
 from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
 from gaigs.kriging.links import PART, at_directions, coordinates, distances, evenly, folds_of, known_links, thinned
-from gaigs.kriging.scalar import ScalarProcess, is_scalar
+from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import Model, Prediction, build_trend
 from gaigs.query import Batch, Query
 from gaigs.registry import name_of, register
@@ -55,14 +55,15 @@ class GaussianProcess(Model):
 
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
-        names = ("mean", "path_loss") if is_scalar(scene) else ("friis" if isinstance(scene.task, Csi) else "mean",)
+        names = ("friis" if isinstance(scene.task, Csi) else "mean",)
+        names = ("mean", "path_loss") if scene.task.is_scalar else names
         # In plain sequences: their state is no state of this look-up.
         given = [{"name": name} for name in names] if trend is None else [trend]
         self.trends = tuple(build_trend(one, scene) for one in given)
         if any([*built.parameters()] for built in self.trends):
             raise ValueError(f"model.trend cannot be trained, got {trend['name']}; take mean, path_loss or friis")
         self.chosen = 0
-        self.scalar = [ScalarProcess(scene)] if is_scalar(scene) else []
+        self.scalar = [ScalarProcess(scene)] if scene.task.is_scalar else []
         self.factors: Tensor | None = None
         self.process = Hyperparameters()
 

@@ -22,7 +22,7 @@ from gaigs.kriging.fit import (
 from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, coordinates, folds_of, scaled, thinned
 from gaigs.kriging.paths import Equations, PathField, usual_process
-from gaigs.kriging.scalar import ScalarProcess, is_scalar
+from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import Model, Prediction, call_optional
 from gaigs.query import Batch
 from gaigs.registry import name_of, register, registry
@@ -86,7 +86,7 @@ class Kriging(Model):
         self.register_buffer("trend_weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("hyperparameters", torch.full((3,), math.nan, dtype=torch.float64))
-        self.is_scalar = is_scalar(scene)
+        self.is_scalar = scene.task.is_scalar
         if self.is_scalar:
             self.process = ScalarProcess(scene)
         self._make_fields(getattr(self.trend, "has_margins", False))
@@ -113,7 +113,7 @@ class Kriging(Model):
         paths are kriged, or whole labels; None: ``FEWEST`` validation links or more choose.
         """
         links = thinned(links, LIMIT)
-        values, held = predicted(self.trend, links, known(links)), links.split.validation
+        values, held = predicted(self.trend, links, links.split.known), links.split.validation
         self.fallback.fit(links)
         has_paths = getattr(self.trend, "has_margins", False)
         if by_paths or (has_paths and by_paths is None and len(held) < FEWEST):
@@ -186,7 +186,7 @@ class Kriging(Model):
         errors, else 0.
         """
         self._make_fields(True)
-        split, task, index = links.split, links.task, known(links)
+        split, task, index = links.split, links.task, links.split.known
         query, labels = links.query[index], links.labels[index]
         aligned = task.align(labels, values)
         residuals = aligned - values
@@ -270,7 +270,7 @@ class Kriging(Model):
 
     def _fit_trend_weight(self, links: Links, values: Tensor, weights: Sequence[float]) -> None:
         """Fits the trend weight, one of ``weights``, and the hyperparameters; ``values`` as for ``_krige_labels``."""
-        index = known(links)
+        index = links.split.known
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
         residuals: dict[float, Any] = {trend_weight: [] for trend_weight in weights}
         for part in torch.arange(len(index)).split(PART):
@@ -317,7 +317,7 @@ class Kriging(Model):
 
     def _solve(self, links: Links, values: Tensor) -> None:
         """Kriges the residuals of the known links."""
-        index, trend_weight = known(links), self.trend_weight.item()
+        index, trend_weight = links.split.known, self.trend_weight.item()
         query, labels = links.query[index], links.labels[index]
 
         def residuals(rows: Int[Tensor, " k"]) -> Tensor:
@@ -408,11 +408,6 @@ def is_surely_better(one: Float[Tensor, " k"], other: Float[Tensor, " k"]) -> bo
     """True if scores are higher by more than two standard errors; False of fewer than two."""
     gain = one - other
     return len(gain) > 1 and bool(gain.mean() > 2 * gain.std() / math.sqrt(len(gain)))
-
-
-def known(links: Links) -> Int[Tensor, " k"]:
-    """Training and validation links, in this order."""
-    return torch.cat((links.split.train, links.split.validation))
 
 
 def predicted(

@@ -233,10 +233,10 @@ class MirroredSplatting(GaussianSplatting):
         training transmitters' box.
         """
         super().export(folder)
-        export.export(self.placement, self.surveyed, folder)
+        export.export(self.placement, self.traced, folder)
 
     @property
-    def surveyed(self) -> Query:
+    def traced(self) -> Query:
         """Links whose paths show where planes end."""
         return export.all_over(self.scene) if self.places is None else self.places
 

@@ -31,7 +31,7 @@ class PathLoss(Model):
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
-        if scene.task.shape or scene.task.dtype.is_complex:
+        if not scene.task.is_scalar:
             own = f"labels of task {scene.task.name!r}"
             raise ValueError(f"model 'path_loss' predicts one real number a link, not {own}; take mean or knn")
         self.register_buffer("levels", torch.full((len(scene.receivers),), torch.nan))  # T [dBm]

@@ -13,7 +13,7 @@ from gaigs.data import Links, load
 from gaigs.io.files import write_text
 from gaigs.model import Model, call_optional
 from gaigs.processes import is_first, limited_threads, only_run
-from gaigs.radio_maps import has_radio_map, radio_map
+from gaigs.radio_maps import radio_map
 from gaigs.registry import registry
 from gaigs.report.runs import read_metrics
 from gaigs.report.table import metrics_table, verdict
@@ -146,7 +146,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     if config["kriging"]:
         metrics["kriging"]["seconds"] = fitted.kriging_seconds
     call_optional(model, "export", folder)
-    if has_radio_map(task):
+    if task.is_scalar:
         radio_map(model).save(folder / "radio_map.npz")
     from gaigs.report.run_figures import write_figures  # matplotlib is slow to import
 

@@ -106,8 +106,7 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
     index = torch.cat(asked)
     parts = links.labels[index], torch.cat(values), torch.cat(deviations), links.query[index]
     apart = None if hasattr(model, "deviations") else torch.cat(near)
-    known_ones = links.query[torch.cat((links.split.train, links.split.validation))]
-    return Calibration.of(links.task, *parts, apart, known_ones)
+    return Calibration.of(links.task, *parts, apart, links.query[links.split.known])
 
 
 def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"], Int[Tensor, " j"]]]:
@@ -119,7 +118,7 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
     """
     split, validation, receivers = links.split, links.split.validation, links.query.receivers
     if not (is_trained(model) or isinstance(model, Kriging)):
-        index = torch.cat((split.train, validation))
+        index = split.known
         folds, asked = folds_of(links, index) % CALIBRATION_FOLDS, evenly(index, MOST)
         for fold in range(CALIBRATION_FOLDS):
             is_known = folds != fold

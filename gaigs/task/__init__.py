@@ -67,6 +67,11 @@ class Task(ABC):
         """Of one label."""
 
     @property
+    def is_scalar(self) -> bool:
+        """True if a label is one real number."""
+        return self.shape == () and not self.dtype.is_complex
+
+    @property
     @abstractmethod
     def monitor(self) -> str:
         """Score whose mean over the validation links picks the best checkpoint."""

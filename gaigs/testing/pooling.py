@@ -81,7 +81,7 @@ def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch
             rays = task.directions.flatten()[1::3].to(device)
             rule = "fewer directions must get the same values"
             require_close(module(received, query, rays), value.flatten(1)[:, 1::3], PRECISION[dtype], rule)
-        if not takes_paths and task.shape == () and not task.dtype.is_complex:
+        if not takes_paths and task.is_scalar:
             _check_hard_maps(module, image.detach(), query)
 
 

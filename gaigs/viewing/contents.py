@@ -20,7 +20,6 @@ from gaigs.geometry import ExtrapolationWarning
 from gaigs.kriging.links import evenly
 from gaigs.model import Model, call_optional
 from gaigs.query import Query
-from gaigs.radio_maps import has_radio_map
 from gaigs.report.csi import decibels, impulse_response
 from gaigs.task.csi import Csi
 from gaigs.task.scalar import with_unit
@@ -55,11 +54,10 @@ class Contents:
             check_fit(links, model.scene)
         self.model, self.links, self.title, self.scene = model, links, title, model.scene
         self.task: Any = model.scene.task
-        kinds = {"spectrum": self.task.directions is not None, "level": has_radio_map(self.task)}
+        kinds = {"spectrum": self.task.directions is not None, "level": self.task.is_scalar}
         kinds["channel"] = isinstance(self.task, Csi)
         self.kind = next((kind for kind, fits in kinds.items() if fits), None)
-        carriers = self.scene.frequencies
-        self.frequency = float(carriers[len(carriers) // 2]) if len(carriers) else None
+        self.frequency = self.scene.middle_frequency
         self.interval = 0.5 if model.calibration is not None and model.calibration.gives(0.5) else None
         self.lock = threading.Lock()  # models hold what they compute for a moment
         self.tests = torch.zeros(0, dtype=torch.long)

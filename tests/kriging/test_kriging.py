@@ -17,7 +17,7 @@ from gaigs.kriging.links import at_directions, coordinates, thinned
 from gaigs.kriging.scalar import Choice, ScalarProcess
 from gaigs.model import Model, Prediction, call_optional, kriging
 from gaigs.model.gaussian_process import GaussianProcess
-from gaigs.model.kriging import Kriging, known
+from gaigs.model.kriging import Kriging
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.surveying import posterior
@@ -89,7 +89,7 @@ def half(monkeypatch):
     """Fixes the hyperparameters, and the trend weight to 0.5, for tests of what follows from them."""
 
     def fixed(scene, links, residuals, most=300):
-        residuals(known(links))
+        residuals(links.split.known)
         assert (most == 1000) == (len(costs) % 6 == 5), "the last fit looks at more links"
         costs.append(float(abs(len(costs) % 6 - 2)))  # of five candidates the third is best, and is fitted again
         return PROCESS if scene.has_band else PROCESS._replace(scale=np.nan), costs[-1]
@@ -148,7 +148,7 @@ def test_predictions_are_the_formula(task, carriers, half, monkeypatch):
     coarse, _ = kriged(links)
     monkeypatch.setattr(field, "LEFT", 0.0)
     model, validation_model = kriged(links)
-    expected = formula(model, links, query, own(links, known(links), 1))
+    expected = formula(model, links, query, own(links, links.split.known, 1))
     np.testing.assert_allclose(model.predict(query), expected, rtol=0, atol=1e-4 if task == "rssi" else 5e-3)
     added = expected - mixed(model, query).numpy()
     errors = coarse.predict(query).numpy() - expected

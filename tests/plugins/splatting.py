@@ -5,6 +5,7 @@ import functools
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import torch
 
@@ -58,7 +59,7 @@ def links_of(task, carriers=()):
 
 def run(folder, monkeypatch, *overrides):
     """A short training on the built-in room: its configuration, its metrics, and the model of its checkpoint."""
-    monkeypatch.setattr(runs, "has_radio_map", lambda _: False)
+    monkeypatch.setattr(runs, "radio_map", Mock())
     few = [] if any(word.startswith("data.root=") for word in overrides) else ["data.transmitters=30"]
     config = composed(*overrides, *few, *RUN)
     with repository():

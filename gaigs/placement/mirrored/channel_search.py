@@ -42,8 +42,8 @@ DROP = 0.5
 """Fall of the mean log of the power that is left, by a true plane behind others: false ones reach 0.3."""
 
 LITTLE = 0.1
-"""Rise of the mean log of the power that is left, without a false plane: of true ones it is 0.14 and more. Two tilted
-planes may share what one true plane explains."""
+"""A plane is false if the mean log of the power that is left rises by less than this without it; of true ones it rises
+by 0.14 and more. Two tilted planes may share what one true plane explains."""
 
 FEWEST = 8
 """Fewest numbers of a channel in which planes can be searched: one path explains any single number."""

@@ -44,7 +44,7 @@ class Planes(NamedTuple):
     extents: Float[ndarray, "w 3"]
 
 
-class Survey(NamedTuple):
+class TracedPaths(NamedTuple):
     """Powers and bounces of the kept paths of some links.
 
     ``powers`` include free space, 0 for no path; ``bounces`` are points on the planes of each sequence, NaN for a
@@ -83,7 +83,7 @@ def all_over(scene: Scene) -> Query:
 
 
 @torch.no_grad()
-def survey(placement: Mirrored, query: Query) -> Survey:
+def trace_paths(placement: Mirrored, query: Query) -> TracedPaths:
     """Powers and bounces of the kept paths of some links, without a deformation."""
     device = placement.sequences.device
     sequences = placement.sequences[placement.kept]
@@ -98,7 +98,7 @@ def survey(placement: Mirrored, query: Query) -> Survey:
             points[:, met.first :, -back] = met.points + placement.middle
         bounces.append(points)
     parts = sequences, torch.cat(powers).double(), torch.cat(bounces), query.transmitters, torch.cat(receivers)
-    return Survey(*(part.cpu().numpy() for part in parts))
+    return TracedPaths(*(part.cpu().numpy() for part in parts))
 
 
 def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
@@ -106,7 +106,7 @@ def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
 
     Shares are those of the kept paths in the received power, means over the links of the query.
     """
-    found = survey(placement, query)
+    found = trace_paths(placement, query)
     all_planes = _planes(placement, found)
     shares = _plane_shares(found)
     planes = [
@@ -130,7 +130,7 @@ def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
 
 
 @torch.no_grad()
-def _planes(placement: Mirrored, found: Survey) -> Planes:
+def _planes(placement: Mirrored, found: TracedPaths) -> Planes:
     permittivities = torch.complex(1 + placement.log_permittivities.exp(), -placement.log_conductivities.exp())
     reflected, _ = fresnel(permittivities, torch.ones_like(permittivities.real))
     gains = reflected.abs().log() + placement.plane_gains
@@ -149,7 +149,7 @@ def _planes(placement: Mirrored, found: Survey) -> Planes:
     return Planes(signs[:, None] * normals, signs * offsets, losses, middles, extents)
 
 
-def _plane_shares(found: Survey) -> dict[int, float]:
+def _plane_shares(found: TracedPaths) -> dict[int, float]:
     """Share of each used plane's paths in the power, largest first."""
     means = found.shares.mean(0)
     numbers = np.unique(found.sequences[found.sequences >= 0]).tolist()
@@ -157,11 +157,11 @@ def _plane_shares(found: Survey) -> dict[int, float]:
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-def outlines(placement: Mirrored, found: Survey) -> list[LearntPlane]:
+def outlines(placement: Mirrored, found: TracedPaths) -> list[LearntPlane]:
     """The planes as convex polygons, strongest first.
 
     A wall has all transmitters and receivers on one side. It reaches to the other walls, to the edge of its reflecting
-    area, or to the box around the surveyed points, whichever is nearest. Any other plane, such as furniture, is the
+    area, or to the box around the paths' ends, whichever is nearest. Any other plane, such as furniture, is the
     rectangle around its bounces, within walls and box. Planes without paths, or outside the box, are left out.
     """
     normals, offsets, _, middles, extents = _planes(placement, found)
@@ -237,7 +237,7 @@ def learnt_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
 
     Without links it is the room by links ``all_over`` the scene, without paths.
     """
-    found = survey(placement, all_over(placement.scene) if links is None else some(links.query[links.split.train]))
+    found = trace_paths(placement, all_over(placement.scene) if links is None else some(links.query[links.split.train]))
     matter = None
     if placement.obstacles is not None:
         blobs = placement.obstacles
@@ -255,7 +255,7 @@ def learnt_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
 
 def learnt_paths(placement: Mirrored, query: Query) -> list[LearntPath]:
     """At most 20 paths of some links together, within 30 dB of the strongest, which comes first."""
-    heard = survey(placement, query)
+    heard = trace_paths(placement, query)
     powers = heard.powers / heard.powers.max(initial=np.finfo(float).tiny)
     paths = []
     for link, path in zip(*np.unravel_index(np.argsort(-powers, axis=None)[:20], powers.shape), strict=True):
@@ -269,7 +269,7 @@ def learnt_paths(placement: Mirrored, query: Query) -> list[LearntPath]:
 @torch.no_grad()
 def export(placement: Mirrored, query: Query, folder: Path) -> None:
     """Writes ``planes.obj``, the planes as far as the query's paths reach, and ``obstacles.ply`` for any obstacles."""
-    write_text(folder / "planes.obj", wavefront_obj(placement, survey(placement, query)))
+    write_text(folder / "planes.obj", wavefront_obj(placement, trace_paths(placement, query)))
     blobs = placement.obstacles
     if blobs is None:
         return
@@ -287,7 +287,7 @@ def export(placement: Mirrored, query: Query, folder: Path) -> None:
     write_ply(folder / "obstacles.ply", parts, comment)
 
 
-def wavefront_obj(placement: Mirrored, found: Survey, sheets: Sequence[Sheet] = ()) -> str:
+def wavefront_obj(placement: Mirrored, found: TracedPaths, sheets: Sequence[Sheet] = ()) -> str:
     """The planes, and sheets of obstacles, as objects of a Wavefront OBJ file [m].
 
     A plane is one face, counterclockwise as seen from outside.

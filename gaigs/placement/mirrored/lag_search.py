@@ -135,7 +135,8 @@ class ReceiverLags:
         return (1 - alike.square() + FLOOR).log()
 
     def slopes(self, lags: Complex[Tensor, "b l"]) -> Complex[Tensor, "b e e"]:
-        """Fall of the errors by the covariances of further waves x: x' M x, with waves y of the model 2 Re x' M y."""
+        """Negative gradient M of the errors by the covariances: a further wave x lowers them by x' M x, and by
+        2 Re x' M y where it interferes with a wave y of the model."""
         with torch.enable_grad():
             lags = lags.detach().requires_grad_()
             self.errors(lags).sum().backward()

@@ -70,6 +70,17 @@ class Mirrored(Placement):
 
     Paths add as powers until ``enable_phases``. Channels start from free space until ``enable_reflections``.
 
+    Attributes:
+        middle: Of the room [m].
+        origin: Normals and offsets at the start, or at the last change of ``step`` (w, 4); ``shifts`` are added.
+        step: Size of a unit of ``shifts``; it follows the wavelength once phases count.
+        sequences: Planes of each path, -1 for none (n, order).
+        kept, most: Paths that were not dropped (n,), and their number at the start.
+        coherent: True once paths interfere.
+        is_bare: True while channels have only the direct path; ``planned`` are the paths kept after it.
+        found: True once planes were searched in channels.
+        held, tried: Strengths and offsets within ``holding``.
+
     Args:
         scene: Its box and receivers give the first planes.
         channels: Of the signal, 1 (amplitude) or 2 (complex).
@@ -368,9 +379,9 @@ class Mirrored(Placement):
         return found / self.receiver_gains[query.receivers, None].exp()
 
     def margins(self, query: Query) -> Complex[Tensor, "b n"]:
-        """Field over free space by which each kept path may deviate.
+        """Standard deviation of each kept path's field over free space before any residual is known, with its phase.
 
-        It is the path's own times the share that obstacles block, and a tenth of that without obstacles.
+        It is the path's own field times the share that obstacles block, and a tenth of the field without obstacles.
         """
         seen, receivers, folded = self.folded(query)
         own, free = self.strengths(query, folded), self.strengths(query, folded, blocked=False)

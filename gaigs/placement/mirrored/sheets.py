@@ -66,7 +66,7 @@ class Legs(NamedTuple):
     start: Float[Tensor, "s 3"]
     along: Float[Tensor, "s 3"]
     paths: Int[Tensor, " s"]
-    levels: Float[Tensor, "s k"]
+    densities: Float[Tensor, "s k"]
 
 
 class Crossings(NamedTuple):
@@ -91,13 +91,13 @@ class MatterGrid:
     ``corner`` is the grid's first point from the middle of the room, ``pitch`` the distance of its points [m].
     """
 
-    levels: Float[ndarray, "x y z"]
+    log_densities: Float[ndarray, "x y z"]
     corner: Float[ndarray, "3"]
     pitch: float
 
     def surfaces(self, density: float) -> tuple[Int[ndarray, "x y z"], int]:
         """Number of the surface around each point, 0 outside, and how many there are."""
-        return ndimage.label(self.levels > math.log(density))
+        return ndimage.label(self.log_densities > math.log(density))
 
     def surface(self, density: float, number: int) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
         """Corners, from the middle of the room [m], and triangles of one of the ``surfaces``, closed by the box.
@@ -107,9 +107,9 @@ class MatterGrid:
         least = math.log(density)
         numbers, _ = self.surfaces(density)
         # Other surfaces lie at least a point apart.
-        levels = np.where((numbers == number) | (numbers == 0), np.minimum(self.levels, least + 9), least - 1)
-        levels = np.pad(np.maximum(levels, least - 9), 1, constant_values=least - 1)
-        vertices, faces, _, _ = marching_cubes(levels, least, spacing=(self.pitch,) * 3)
+        logs = np.where((numbers == number) | (numbers == 0), np.minimum(self.log_densities, least + 9), least - 1)
+        logs = np.pad(np.maximum(logs, least - 9), 1, constant_values=least - 1)
+        vertices, faces, _, _ = marching_cubes(logs, least, spacing=(self.pitch,) * 3)
         return vertices + (self.corner - self.pitch), faces
 
 
@@ -127,15 +127,15 @@ def sample(obstacles: Obstacles, lower: Float[ndarray, "3"], upper: Float[ndarra
     shape = np.ceil((upper - corner) / pitch).astype(int) + 3
     axes = [torch.from_numpy(corner[axis] + pitch * np.arange(shape[axis])) for axis in range(3)]
     points = torch.cartesian_prod(*axes).to(obstacles.unit.device)
-    levels = torch.cat([densities(obstacles, part).sum(1) for part in points.split(65536)])
-    return MatterGrid(levels.log().view(*shape).cpu().numpy(), corner, pitch)
+    found = torch.cat([densities(obstacles, part).sum(1) for part in points.split(65536)])
+    return MatterGrid(found.log().view(*shape).cpu().numpy(), corner, pitch)
 
 
 def cross(obstacles: Obstacles, matter: MatterGrid, density: float, legs: Legs) -> Crossings:
     """Crossings of legs with the surfaces of a density, counted from 0."""
-    above = legs.levels > density
+    above = legs.densities > density
     leg, step = (above[:, 1:] != above[:, :-1]).nonzero().T
-    before, after = legs.levels[leg, step], legs.levels[leg, step + 1]
+    before, after = legs.densities[leg, step], legs.densities[leg, step + 1]
     unit = legs.along[leg] / (SAMPLES - 1)
     points = legs.start[leg] + (step + (density - before) / (after - before))[:, None] * unit
     own, weights = densities(obstacles, points), (-2 * obstacles.log_widths.double()).exp()
@@ -178,15 +178,15 @@ def fit_sheets(
     depths = obstacles(start.float(), (start + along).float()).real.double()
     left = (-fields.new_zeros(count).index_add(0, paths, depths)).exp().view_as(fields)
     steps = torch.linspace(0, 1, SAMPLES).to(along)[:, None]
-    levels = torch.stack([densities(obstacles, a + steps * b).sum(1) for a, b in zip(start, along, strict=True)])
-    legs = Legs(start, along, paths, levels)
+    met = torch.stack([densities(obstacles, a + steps * b).sum(1) for a, b in zip(start, along, strict=True)])
+    legs = Legs(start, along, paths, met)
     # Each leg's loss, spread over its matter.
-    lost = (fields * (1 - left)).flatten()[paths, None] * levels / levels.sum(1, keepdim=True).clamp_min(1e-300)
-    order = levels.flatten().argsort()
+    lost = (fields * (1 - left)).flatten()[paths, None] * met / met.sum(1, keepdim=True).clamp_min(1e-300)
+    order = met.flatten().argsort()
     shares = lost.flatten()[order].cumsum(0)
     if not shares[-1] > 0:
         return [], 0.0
-    ends = levels.flatten()[order[torch.searchsorted(shares, shares[-1] * shares.new_tensor([0.1, 0.9]))]]
+    ends = met.flatten()[order[torch.searchsorted(shares, shares[-1] * shares.new_tensor([0.1, 0.9]))]]
     low, high = ends.log().tolist()
     options = torch.linspace(low, high, CANDIDATES).exp().tolist()
     matter = sample(obstacles, lower - middle.cpu().numpy(), upper - middle.cpu().numpy())

@@ -126,7 +126,7 @@ def test_a_loss_is_that_where_the_plane_reflects_best(links, build):
 
 def test_walls_close_to_a_box(links, build):
     placement = build()
-    planes = room_export.outlines(placement, room_export.survey(placement, training(links)))
+    planes = room_export.outlines(placement, room_export.trace_paths(placement, training(links)))
     assert [plane.share for plane in planes] == sorted((plane.share for plane in planes), reverse=True)
     ends = Counter()
     for plane in planes:
@@ -138,11 +138,11 @@ def test_walls_close_to_a_box(links, build):
     assert set(ends.values()) == {2}  # each edge belongs to two walls
 
 
-def test_a_wall_without_others_ends_beyond_the_surveyed_points(links, build):
+def test_a_wall_without_others_ends_beyond_the_paths_ends(links, build):
     placement = build(order=1)
     with torch.no_grad():
         placement.kept.copy_((placement.sequences[:, 0] == 0) | (placement.sequences[:, 0] == -1))
-    found = room_export.survey(placement, training(links))
+    found = room_export.trace_paths(placement, training(links))
     (plane,) = room_export.outlines(placement, found)
     rim = plane.corners[:, 1:]
     np.testing.assert_allclose(plane.corners[:, 0], SIZE[0], atol=1e-4)
@@ -153,7 +153,7 @@ def test_a_wall_without_others_ends_beyond_the_surveyed_points(links, build):
 
 def test_a_plane_within_the_room_spans_its_bounces(links, build):
     placement = add(build(planes=7), [0.6, 0.8, 0.0], 3.2)
-    found = room_export.survey(placement, training(links))
+    found = room_export.trace_paths(placement, training(links))
     (plane,) = (plane for plane in room_export.outlines(placement, found) if plane.number == 6)
     np.testing.assert_allclose(plane.normal, [-0.6, -0.8, 0], atol=1e-6)  # away from the room's middle
     np.testing.assert_allclose(plane.corners @ plane.normal, -3.2, atol=1e-4)
@@ -175,7 +175,7 @@ def test_a_window_ends_a_wall(links, build):
     with torch.no_grad():
         placement.middles[0] = torch.tensor([6.0, 1.5, 1.0]) - placement.middle
         placement.log_extents[0, 1] = np.log(0.4)
-    planes = room_export.outlines(placement, room_export.survey(placement, training(links)))
+    planes = room_export.outlines(placement, room_export.trace_paths(placement, training(links)))
     (wall,) = (plane for plane in planes if plane.number == 0)
     np.testing.assert_allclose(wall.corners[:, 1].min(), 1.5 - 0.8, atol=1e-3)
     np.testing.assert_allclose(wall.corners[:, 1].max(), 1.5 + 0.8, atol=1e-3)
@@ -185,7 +185,7 @@ def test_a_plane_far_off_is_left_out(links, build):
     placement = add(build(planes=7), [1.0, 0.0, 0.0], 60.0)
     with torch.no_grad():
         placement.plane_gains[6] = -5
-    found = room_export.survey(placement, training(links))
+    found = room_export.trace_paths(placement, training(links))
     assert 6 in [plane["number"] for plane in room_export.facts(placement, training(links))["planes"]]
     assert {plane.number for plane in room_export.outlines(placement, found)} == set(range(6))
 
@@ -246,7 +246,7 @@ def test_planes_are_written_as_wavefront_obj(links, build, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["planes.obj"]
     text = (tmp_path / "planes.obj").read_text()
     faces = parsed(text)
-    planes = room_export.outlines(placement, room_export.survey(placement, training(links)))
+    planes = room_export.outlines(placement, room_export.trace_paths(placement, training(links)))
     assert [*faces] == [f"plane_{plane.number}" for plane in planes]
     for plane, corners in zip(planes, faces.values(), strict=True):
         np.testing.assert_allclose(corners, plane.corners, atol=1e-4)
