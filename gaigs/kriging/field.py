@@ -5,7 +5,7 @@ from jaxtyping import Float, Inexact
 from torch import Tensor, nn
 
 from gaigs.kriging.fit import Hyperparameters, local_deviations
-from gaigs.kriging.kernel import cholesky_factor, kernel
+from gaigs.kriging.kernel import cholesky_factor, kernel, resize
 from gaigs.kriging.links import at_directions
 from gaigs.query import Batch
 from gaigs.scene import Scene
@@ -57,7 +57,7 @@ class Field(nn.Module):
         self.weights = like_loaded(self.weights, torch.cholesky_solve(scores, factor.to(wide)))
         self.places, self.signal = like_loaded(self.places, places), None
 
-    def forward(self, places: Float[Tensor, "b d"], length: Tensor, batch: Batch) -> Tensor:
+    def forward(self, places: Float[Tensor, "b d"], length: float, batch: Batch) -> Tensor:
         """Kriged residuals (b, *shape) at some places, in the directions of a batch."""
         covariances = kernel(places, self.places, length)
         components = at_directions(self.widened, batch, self.scene)
@@ -83,9 +83,7 @@ class Field(nn.Module):
         self.widened = torch.view_as_complex(components) if self.weights.is_complex() else components
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        for name in ("places", "weights", "components"):
-            if f"{prefix}{name}" in state_dict:  # of any k and q
-                setattr(self, name, getattr(self, name).new_empty(state_dict[f"{prefix}{name}"].shape))
+        resize(self, state_dict, prefix, "places", "weights", "components")
         super()._load_from_state_dict(state_dict, prefix, *args)
         self.signal = None
         self._widen()

@@ -1,11 +1,11 @@
 """The Matern-1/2 kernel exp(-d / l), and kriging weights with their variance."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from gaigs.kriging.links import distances
 
@@ -36,6 +36,13 @@ class Process:
         own.diagonal().add_(self.noises[rows])
         factor = torch.linalg.cholesky(own)
         return torch.linalg.solve_triangular(factor, self.covariances(places, asked), upper=False), factor
+
+
+def resize(module: nn.Module, state: Mapping[str, Tensor], prefix: str, *names: str) -> None:
+    """Gives buffers the shapes that they have in a state, which is then loaded: they depend on the links."""
+    for name in names:
+        if f"{prefix}{name}" in state:
+            setattr(module, name, getattr(module, name).new_empty(state[f"{prefix}{name}"].shape))
 
 
 LIMIT = 6000

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
-from gaigs.kriging.fit import AROUND, Hyperparameters
-from gaigs.kriging.kernel import kernel
+from gaigs.kriging.fit import AROUND
+from gaigs.kriging.kernel import kernel, resize
 from gaigs.kriging.links import distances
 
 JITTER = 1e-6
@@ -16,6 +17,26 @@ JITTER = 1e-6
 
 LEAST = 1e-4
 """Power of a link's noise over the link's, where the fit leaves nothing."""
+
+
+class PathProcess(NamedTuple):
+    """Hyperparameters of the processes of path strengths."""
+
+    length: float  # correlation length of the kernel [m]
+    nugget: float  # variance of the noise, see ``Equations``
+    deviation: float  # standard deviation of the processes
+
+    @classmethod
+    def usual(cls, spacing: float) -> "PathProcess":
+        """Where neighbouring places are ``spacing`` apart [m].
+
+        A longer length raises the mean score further, but may lower the median.
+        """
+        return cls(spacing / 2, 1.0, 0.2)
+
+    def facts(self) -> dict[str, float]:
+        """Entries of ``metrics.json``."""
+        return {"length_m": self.length, "nugget": self.nugget, "deviation": self.deviation}
 
 
 @dataclass(frozen=True)
@@ -64,9 +85,6 @@ class Equations:
 class PathField(nn.Module):
     """Kriged strengths of the n paths to one receiver, from k known links.
 
-    Hyperparameters are a correlation length, a nugget as of ``Equations``, and as ``scale`` the standard deviation of
-    the processes.
-
     Attributes:
         places: Of the known links (k, 3) [m].
         weights: The mean of the processes at x are the covariances of x with the places times these (k, n).
@@ -83,24 +101,26 @@ class PathField(nn.Module):
         self.register_buffer("weights", torch.zeros(0, 0, dtype=torch.complex128))
         self.register_buffer("precisions", torch.zeros(0, 0, dtype=torch.float64))
 
-    def solve(self, equations: Equations, process: Hyperparameters) -> None:
+    def solve(self, equations: Equations, process: PathProcess) -> None:
         """Solves the strengths of all paths at all places together, by conjugate gradients."""
         identity = torch.eye(len(equations.places), dtype=torch.float64)
         covariances = kernel(equations.places, equations.places, process.length) + JITTER * identity
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(covariances))
-        grams, sides = equations.grams * (process.scale**2 / process.nugget), equations.sides / process.nugget
+        grams, sides = equations.grams * (process.deviation**2 / process.nugget), equations.sides / process.nugget
         own = inverse.diagonal()[:, None, None] * torch.eye(grams.shape[1], dtype=torch.float64)
         precondition, inverse = torch.linalg.inv(grams + own), inverse.to(sides.dtype)
         times = lambda u: inverse @ u + (grams @ u[..., None])[..., 0]
-        solution = conjugate_gradients(times, lambda r: (precondition @ r[..., None])[..., 0], sides * process.scale**2)
+        solution = conjugate_gradients(
+            times, lambda r: (precondition @ r[..., None])[..., 0], sides * process.deviation**2
+        )
         self.places, self.weights = equations.places.clone(), inverse @ solution
         self.precisions = equations.grams.diagonal(dim1=1, dim2=2).real / process.nugget
 
-    def forward(self, places: Float[Tensor, "b d"], process: Hyperparameters) -> Complex[Tensor, "b n"]:
+    def forward(self, places: Float[Tensor, "b d"], process: PathProcess) -> Complex[Tensor, "b n"]:
         """Mean of the processes at some places."""
         return kernel(places, self.places, process.length).to(self.weights) @ self.weights
 
-    def variances(self, places: Float[Tensor, "b d"], process: Hyperparameters) -> Float[Tensor, "b n"]:
+    def variances(self, places: Float[Tensor, "b d"], process: PathProcess) -> Float[Tensor, "b n"]:
         """Variances of the processes at some places, as if the elements resolved all paths: a lower bound.
 
         Given the ``AROUND`` nearest known links of each place: this kernel hides those behind them.
@@ -110,27 +130,17 @@ class PathField(nn.Module):
         own, towards = (kernel(around, other, process.length) for other in (around, places[:, None]))
         found = []
         for precisions in self.precisions.unbind(1):
-            roots = (precisions[near] * process.scale**2).sqrt()[..., None]
+            roots = (precisions[near] * process.deviation**2).sqrt()[..., None]
             matrix = roots * own * roots.mT
             matrix.diagonal(dim1=1, dim2=2).add_(1)
             factor = torch.linalg.cholesky(matrix)
             known = torch.linalg.solve_triangular(factor, roots * towards, upper=False)
             found.append(1 - known.square().sum((1, 2)))
-        return process.scale**2 * torch.stack(found, 1)
+        return process.deviation**2 * torch.stack(found, 1)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        for name in ("places", "weights", "precisions"):
-            if f"{prefix}{name}" in state_dict:  # of any k and n
-                setattr(self, name, getattr(self, name).new_empty(state_dict[f"{prefix}{name}"].shape))
+        resize(self, state_dict, prefix, "places", "weights", "precisions")
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-def usual_process(spacing: float) -> Hyperparameters:
-    """The process of path strengths, where neighbouring places are ``spacing`` apart [m].
-
-    A longer length raises the mean score further, but may lower the median.
-    """
-    return Hyperparameters(spacing / 2, 1.0, 0.2)
 
 
 def conjugate_gradients(

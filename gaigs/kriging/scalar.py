@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from torch import Tensor, nn
 
 from gaigs.kriging.fit import EDGES
-from gaigs.kriging.kernel import Process
+from gaigs.kriging.kernel import Process, resize
 from gaigs.kriging.links import distances, evenly, scale_bounds, scaled
 from gaigs.scene import Scene
 
@@ -390,9 +390,7 @@ class ScalarProcess(nn.Module):
         return signal**2 * matern(distances(scaled(a, scale), scaled(b, scale)), length, smoothness)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        for name in ("places", "receivers", "values", "variances", "weights"):  # of any k
-            if f"{prefix}{name}" in state_dict:
-                setattr(self, name, getattr(self, name).new_empty(state_dict[f"{prefix}{name}"].shape))
+        resize(self, state_dict, prefix, "places", "receivers", "values", "variances", "weights")
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 

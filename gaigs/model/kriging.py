@@ -21,7 +21,7 @@ from gaigs.kriging.fit import (
 )
 from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, coordinates, folds_of, scaled, thinned
-from gaigs.kriging.paths import Equations, PathField, usual_process
+from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import Model, Prediction, call_optional
 from gaigs.query import Batch
@@ -198,18 +198,14 @@ class Kriging(Model):
             equations.append(Equations.of(query.transmitters[rows], margins, aligned[rows], residuals[rows]))
         validation_model = Kriging(self.scene, self.trend, self.fallback_options)
         held = torch.arange(len(split.train), len(index))
-        plain, kriged, process = values[held], values[held].clone(), usual_process(self.scene.spacing)
+        plain, kriged, process = values[held], values[held].clone(), PathProcess.usual(self.scene.spacing)
         for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
             field.solve(known_ones[rows < len(split.train)], process)
             for row in rows[rows >= len(split.train)].tolist():
                 strengths = field(query.transmitters[row : row + 1].double(), process)[0]
                 margins = trend.margins(query[row : row + 1].to(device)).cpu()[0]
                 kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), margins, 1)
-        helps = False
-        if len(held) >= FEWEST:
-            before, after = (task.scores(labels[held], part)[task.monitor] for part in (plain, kriged))
-            gain = after - before if task.higher_is_better else before - after
-            helps = bool(gain.mean() > 1.5 * gain.std() / math.sqrt(len(gain)))
+        helps = len(held) >= FEWEST and is_surely_better(*self._validation_scores(links, (kriged, plain)), errors=1.5)
         for model in (self, validation_model) if is_final else (validation_model,):
             model.trend_weight.fill_(1)
             model.weight.fill_(helps)
@@ -227,8 +223,13 @@ class Kriging(Model):
             return self.process.at(receiver)
         if self.by_paths:
             return None
-        field, process = self.fields[receiver], Hyperparameters(*self.hyperparameters.tolist())
+        field, process = self.fields[receiver], self._process
         return process.at(scaled(field.places, 1 / process.scale), field.size(process).item() ** 2)
+
+    @property
+    def _process(self) -> Any:
+        """Hyperparameters of paths or of labels."""
+        return (PathProcess if self.by_paths else Hyperparameters)(*self.hyperparameters.tolist())
 
     def _log(self) -> None:
         log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))
@@ -238,9 +239,10 @@ class Kriging(Model):
 
         Those of kriged paths are bounds below, without noise.
         """
-        query, process = batch.query, Hyperparameters(*self.hyperparameters.tolist())
+        query = batch.query
         if self.is_scalar:
             return self.process.deviations(coordinates(self.scene, query, 1.0), query.receivers)
+        process = self._process
         places = query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
         found = places.new_zeros(len(query), *(self.scene.task.shape if self.by_paths else ()))
         trend: Any = self.trend
@@ -335,14 +337,13 @@ class Kriging(Model):
             self.process.cpu().solve(coordinates(self.scene, query, 1.0), query.receivers, left)
             self.process.to(self.weight.device)
             return
-        process = Hyperparameters(*self.hyperparameters.tolist())
+        process = self._process
         for receiver, field in enumerate(self.fields):
             rows = (query.receivers == receiver).nonzero()[:, 0]
             field.solve(coordinates(self.scene, query[rows], process.scale), residuals(rows), process)
 
     def forward(self, batch: Batch) -> Prediction:
         query, trend_weight, weight = batch.query, self.trend_weight.item(), self.weight.item()
-        length, _, scale = self.hyperparameters
         # A part without weight is not evaluated: that would cost its time, and a NaN of it would count.
         trend = self.trend(batch).value if trend_weight > 0 or weight < 1 else None
         if weight == 0:
@@ -352,15 +353,16 @@ class Kriging(Model):
         if self.is_scalar:
             levels = self.process(coordinates(self.scene, query, 1.0), query.receivers).to(value)
             return Prediction(blend(task, value + levels, trend, weight), {})
-        places = query.transmitters if self.by_paths else coordinates(self.scene, query, scale)
+        process = self._process
+        places = query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
         for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver
             if self.by_paths:
-                strengths = self.fields[receiver](query.transmitters[own].double(), Hyperparameters(length.item()))
+                strengths = self.fields[receiver](places[own].double(), process)
                 margins = self.trend.margins(query[own])
                 value[own] = value[own] + (strengths.to(value)[..., None, None] * margins).sum(1)
             else:
-                value[own] = value[own] + self.fields[receiver](places[own], length, batch)
+                value[own] = value[own] + self.fields[receiver](places[own], process.length, batch)
         return Prediction(blend(task, value, trend, weight), {})
 
     @property
@@ -385,12 +387,10 @@ class Kriging(Model):
         if self.is_scalar:
             facts |= {**self.process.facts(), "links": len(self.process.places)}
             return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
-        facts |= Hyperparameters(*self.hyperparameters.tolist()).facts()
+        facts |= self._process.facts()
         places = [len(field.places) for field in self.fields]
         facts["links"] = sum(places)
-        if self.by_paths:
-            facts["deviation"] = facts.pop("frequency_scale_m")
-        else:
+        if not self.by_paths:
             facts["components"] = max(len(field.components) for field in self.fields)
         return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
 
@@ -404,10 +404,10 @@ def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -
     return weight * task.align(one, other) + (1 - weight) * other
 
 
-def is_surely_better(one: Float[Tensor, " k"], other: Float[Tensor, " k"]) -> bool:
-    """True if scores are higher by more than two standard errors; False of fewer than two."""
+def is_surely_better(one: Float[Tensor, " k"], other: Float[Tensor, " k"], *, errors: float = 2.0) -> bool:
+    """True if scores are higher by more than some standard errors; False of fewer than two."""
     gain = one - other
-    return len(gain) > 1 and bool(gain.mean() > 2 * gain.std() / math.sqrt(len(gain)))
+    return len(gain) > 1 and bool(gain.mean() > errors * gain.std() / math.sqrt(len(gain)))
 
 
 def predicted(

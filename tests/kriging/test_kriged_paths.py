@@ -10,8 +10,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.distance import cdist
 
 from gaigs.data import Split
-from gaigs.kriging.fit import Hyperparameters
-from gaigs.kriging.paths import Equations, PathField, conjugate_gradients
+from gaigs.kriging.paths import Equations, PathField, PathProcess, conjugate_gradients
 from gaigs.model.kriging import Kriging
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.query import Query
@@ -19,7 +18,7 @@ from gaigs.runs.evaluation import unseen
 from gaigs.task.csi import Csi
 from gaigs.testing import example_links
 
-PROCESS = Hyperparameters(2.0, 0.1, 0.4)
+PROCESS = PathProcess(2.0, 0.1, 0.4)
 
 
 def draw(*shape, seed=0):
@@ -37,7 +36,7 @@ def solved(places, fields, labels, residuals):
 def dense(places, asked, fields, labels, residuals):
     """Covariances of the processes with the residuals, and of the residuals."""
     n, powers = fields.shape[1], (np.abs(residuals) ** 2).mean(1) + 1e-4 * (np.abs(labels) ** 2).mean(1)
-    each = lambda a, b: np.kron(PROCESS.scale**2 * np.exp(-cdist(a, b) / PROCESS.length), np.eye(n))
+    each = lambda a, b: np.kron(PROCESS.deviation**2 * np.exp(-cdist(a, b) / PROCESS.length), np.eye(n))
     matrix = block_diag(*(part.T for part in fields))
     noise = np.diag(np.repeat(PROCESS.nugget * powers, labels.shape[1]))
     return each(asked, places) @ matrix.conj().T, matrix @ each(places, places) @ matrix.conj().T + noise
@@ -64,7 +63,7 @@ def test_variances_of_resolved_paths_are_the_dense_ones():
         found = field.variances(torch.from_numpy(asked), PROCESS)
     towards, covariances = dense(places, asked, fields, labels, labels)
     known = np.einsum("ij,ji->i", towards, np.linalg.solve(covariances, towards.conj().T)).real
-    np.testing.assert_allclose(found, (PROCESS.scale**2 - known).reshape(4, 3), rtol=1e-4)
+    np.testing.assert_allclose(found, (PROCESS.deviation**2 - known).reshape(4, 3), rtol=1e-4)
 
 
 def test_conjugate_gradients_stop_at_their_tolerance():
@@ -139,11 +138,11 @@ def test_variance_grows_away_from_known_places():
     variance = model.deviations(links.batch(torch.arange(5))).square()
     assert variance.shape == (5, *links.task.shape)
     assert (variance > 0).all()
-    process = Hyperparameters(*model.hyperparameters.tolist())
+    process = PathProcess(*model.hyperparameters.tolist())
     places = links.query.transmitters[:5].double()
     near, far = (model.fields[0].variances(at, process) for at in (places, places + 20))
     assert (near < far).all()
-    torch.testing.assert_close(far, torch.full_like(far, process.scale**2), rtol=1e-2, atol=0)
+    torch.testing.assert_close(far, torch.full_like(far, process.deviation**2), rtol=1e-2, atol=0)
 
 
 @pytest.mark.parametrize(("smooth", "noise", "validation"), [(0.0, 1.0, 20), (0.4, 0.0, 0)])
@@ -176,5 +175,6 @@ def test_halves_of_the_validation_links_keep_what_all_of_them_chose(by_paths, mo
     links, trend = made()
     model = Kriging(links.scene, trend, {"name": "friis"})
     model.krige(links, by_paths=by_paths)
-    monkeypatch.setattr("gaigs.model.kriging.is_surely_better", lambda *_: by_paths)  # each half would choose the other
+    # Each half would choose the other.
+    monkeypatch.setattr("gaigs.model.kriging.is_surely_better", lambda *_, **__: by_paths)
     assert [one.by_paths for one, *_ in unseen(model, links)] == [by_paths] * 2

@@ -333,7 +333,7 @@ def test_residuals_of_zero_are_kriged_to_zero():
     own, places = field.Field(scene), torch.rand(1, 3, dtype=torch.float64)
     own.solve(places, torch.zeros(1, *scene.task.shape), PROCESS)
     batch = example_links("spectrum").batch(torch.arange(2))
-    assert not own(batch.query.transmitters.double(), torch.tensor(2.0), batch).any()
+    assert not own(batch.query.transmitters.double(), 2.0, batch).any()
     assert own.size(PROCESS) == 0
 
 
