@@ -176,19 +176,18 @@ class ChannelSearch:
         planes = self.find(self.start)
         if not len(planes):
             return planes, planes[:, :3]
-        best = self.resolve(self.refine(planes, 300, 5e-3))
-        kept = self.without_false(*best)
-        if len(kept) < len(best[0]):  # what they explained is searched anew
-            again = self.resolve(self.refine(self.find(self.refine(kept, 100, 1e-2)), 300, 5e-3))
+        best = self.without_false(*self.resolve(self.refine(planes, 300, 5e-3)))
+        if 0 < len(best[0]) < len(planes):  # what the false ones explained is searched anew
+            again = self.resolve(self.refine(self.find(self.refine(best[0], 100, 1e-2)), 300, 5e-3))
             cost = lambda found: self.left(*self.some(found[0]), *found).item() + LITTLE * len(found[0])
-            best = min(best, again, key=cost)
+            best = min(best, self.without_false(*again), key=cost)
         return self.with_parallel(*best)
 
     def with_parallel(
         self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]
     ) -> tuple[Float[Tensor, "v 4"], Float[Tensor, "v 3"]]:
         """The planes and others parallel to them. Only offsets are searched, so fainter ones stand out from noise."""
-        while len(planes) < self.most:
+        while 0 < len(planes) < self.most:
             parts, count = self.some(planes), len(planes)
             before, found = self.left(*parts, planes, slabs).item(), []
             lines = self.grid(torch.stack(distinct(planes[:, :3], 2e-4)), 400)
@@ -217,8 +216,10 @@ class ChannelSearch:
             log.info("plane (%.2f, %.2f, %.2f) at %.2f m, parallel to others", *planes[-1].tolist())
         return planes, slabs
 
-    def without_false(self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]) -> Float[Tensor, "v 4"]:
-        """Planes of which each explains something that the others do not."""
+    def without_false(
+        self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]
+    ) -> tuple[Float[Tensor, "v 4"], Float[Tensor, "v 3"]]:
+        """Planes of which each explains something that the others do not, and their slabs."""
         while len(planes) > len(self.start):
             without = [torch.arange(len(planes)) != k for k in range(len(self.start), len(planes))]
             left = [self.left(*self.some(planes[kept]), planes[kept], slabs[kept]).item() for kept in without]
@@ -226,7 +227,7 @@ class ChannelSearch:
                 break
             kept = without[left.index(min(left))]
             planes, slabs = self.polish(planes[kept], slabs[kept], 60, 3e-4)
-        return planes
+        return planes, slabs
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
         return all_sequences(len(planes), self.order)
