@@ -478,6 +478,18 @@ def test_rssi_from_end_to_end(tmp_path):
     assert floor.values[1, 2, 3] == pytest.approx(model.predict(point, "south").item(), abs=1e-3)
 
 
+@pytest.mark.parametrize(("part", "word"), [("validation", "training"), ("test", "known")])
+def test_a_receiver_without_links_to_learn_from_is_refused_before_the_training(part, word, tmp_path, monkeypatch):
+    links = load({"name": "synthetic_rssi", "transmitters": 20, "order": 0}, {"name": "random"})
+    own = getattr(links.split, part)
+    links.query.receivers[links.query.receivers == 3] = 2
+    links.query.receivers[own[:1]] = 3
+    monkeypatch.setattr(runs, "load", lambda *_: links)
+    monkeypatch.setattr("gaigs.runs.training.descend", lambda *_: pytest.fail("trained"))
+    with pytest.raises(ValueError, match=f"has no {word} links of north; choose another split"):
+        rssi_run(tmp_path)
+
+
 def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path, monkeypatch):
     """Whatever the steps do: here they drive all apart. The start is looked at before the first revision."""
     options = (

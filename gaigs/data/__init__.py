@@ -82,7 +82,7 @@ class Links:
         held_out: The same links at subcarriers that are held out, with the labels of the test; None if there are none.
         frame: Place of the world frame on a map; None if unknown.
         uncertainties: Standard deviation of each receiver's place (r,) [m]: 0 if given, infinite until ``divide``
-            estimates it from the training links. None: all are given.
+            estimates it from the training links. None: all are given, and receivers without training links stay.
         noises: Standard deviation of each label by the scatter of repeated readings, less the more of them it is the
             mean of (n,), in the label's unit; None without repetitions.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
@@ -188,8 +188,8 @@ def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
 def divide(links: Links, split: Mapping) -> Links:
     """Links with their split, by its configuration; remarks say what is doubtful, such as the phase of channels.
 
-    Receivers without a training link are left out, and those without a place get an estimate of it from the training
-    links.
+    Of links with ``uncertainties``, receivers without a training link are left out, and those without a place get an
+    estimate of it from the training links.
 
     Raises:
         ValueError: An option of the split has a defect, or all spectra are constant.
@@ -200,7 +200,9 @@ def divide(links: Links, split: Mapping) -> Links:
         bands = [task.frequencies / 1e9 for task in tasks]
         at = [f"at {band.min():.7g} .. {band.max():.7g} GHz" for band in bands]
         parts = replace(parts, name=f"{parts.name}, trained {at[0]}, tested {at[1]}")
-    links = with_places(only_trained(replace(links, split=parts)))
+    links = replace(links, split=parts)
+    if links.uncertainties is not None:
+        links = with_places(only_trained(links))
     remarks = [links.remarks]
     for doubt in doubts(links):
         log.warning(doubt)
@@ -266,17 +268,15 @@ def only_trained(links: Links) -> Links:
     parts = {name: torch.isin(kept, part).nonzero()[:, 0] for name, part in links.split.parts().items()}
     names = [receiver.name for receiver, new in zip(links.receivers, number, strict=True) if new < 0]
     remark = f"receivers without a training link are left out, with {len(links) - len(kept)} links: {shortened(names)}"
-    held_out = links.held_out
     return replace(
         links,
         query=replace(links.query[kept], receivers=number[links.query.receivers[kept]]),
         receivers=tuple(links.receivers[old] for old in trained.tolist()),
         labels=links.labels[kept],
-        held_out=None if held_out is None else replace(held_out, labels=held_out.labels[kept]),
         rows=some(links.rows),
         official=None,
         split=Split(links.split.name, **parts, groups=some(links.split.groups)),
-        uncertainties=None if links.uncertainties is None else links.uncertainties[trained],
+        uncertainties=links.uncertainties[trained],
         noises=some(links.noises),
         remarks="; ".join(filter(None, (links.remarks, remark))),
     )
@@ -284,7 +284,7 @@ def only_trained(links: Links) -> Links:
 
 def with_places(links: Links) -> Links:
     """Links whose receivers without a place have an estimate from the training links; remarks say how certain it is."""
-    if links.uncertainties is None or links.uncertainties.isfinite().all():
+    if links.uncertainties.isfinite().all():
         return links
     receivers, deviations, named = [*links.receivers], links.uncertainties.clone(), []
     train = links.split.train

@@ -48,7 +48,7 @@ def write_predictions(
     if isinstance(places, Links):
         asked = places.held_out or places
         subcarriers = None if places.held_out is None else asked.task.frequencies
-        labels = asked.labels[asked.split.test]
+        labels = asked.labels[places.split.test]
     if not 0 < interval < 1:
         raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
     if subcarriers is None and model.calibration is not None and model.calibration.gives(interval):
@@ -74,8 +74,7 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
         raise ValueError(f"{kind} take places: positions [m], a query, or links with a test")
     if isinstance(places, Links):
         check_fit(places, scene)
-        asked = places.held_out or places
-        query = asked.query[asked.split.test]
+        query = places.query[places.split.test]
     elif isinstance(places, Query):
         query = places
     else:

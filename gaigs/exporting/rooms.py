@@ -85,8 +85,8 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
 def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
     """The mirrored Gaussians of a model, without its kriging, of an ensemble those of its first member."""
     own = model
-    while own.inner is not None:
-        own = own.inner
+    while own.underlying is not None:
+        own = own.underlying
     if not isinstance(own, MirroredSplatting):
         raise ValueError(f"{kind} takes a model 'mirrored', got {name_of(own)!r}; train it on the same data")
     return own

@@ -21,8 +21,17 @@ def known_links(links: Links) -> list[Int[Tensor, " k"]]:
     known = [links.known(receiver) for receiver in range(len(links.receivers))]
     without = [receiver.name for receiver, index in zip(links.receivers, known, strict=True) if not len(index)]
     if without:
-        raise ValueError(f"split {links.split.name!r} has no known links of {', '.join(without)}; choose another split")
+        kind = "known" if len(links.split.validation) else "training"
+        raise ValueError(
+            f"split {links.split.name!r} has no {kind} links of {', '.join(without)}; choose another split"
+        )
     return known
+
+
+def check_known(links: Links) -> None:
+    """Raises the ``ValueError`` of ``known_links`` for all known links, and for those of a validation."""
+    known_links(links)
+    known_links(replace(links, split=links.split.validating()))
 
 
 def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:

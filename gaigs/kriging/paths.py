@@ -121,9 +121,9 @@ class PathField(nn.Module):
         return kernel(places, self.places, process.length).to(self.weights) @ self.weights
 
     def variances(self, places: Float[Tensor, "b d"], process: PathProcess) -> Float[Tensor, "b n"]:
-        """Variances of the processes at some places, as if the elements resolved all paths: a lower bound.
+        """Variances of the processes at some places, as if the elements resolved all paths.
 
-        Given the ``AROUND`` nearest known links of each place: this kernel hides those behind them.
+        The ``AROUND`` nearest known links of each place count: this kernel hides those behind them.
         """
         near = distances(places, self.places).topk(min(AROUND, len(self.places)), largest=False).indices
         around = self.places[near]

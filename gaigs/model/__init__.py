@@ -53,7 +53,7 @@ class Model(nn.Module):
         revisions: Fractions of the training after which ``OptionalMethods.revise`` is called.
         any_frequency: True if channels are a function of frequency, read from ``scene.task.frequencies``.
         configuration: Options that a registered model was made with; ``save`` stores them.
-        inner: Model whose room and Gaussians are this one's: the trend of kriging, the first member of an ensemble.
+        underlying: Model with this one's room and Gaussians: a kriged trend, an ensemble's first member; a property.
         calibration: What intervals are made of; None if no validation links have measured the model's errors.
 
     Example:
@@ -81,17 +81,13 @@ class Model(nn.Module):
     revisions: tuple[float, ...] = ()
     predicts_untrained: bool = False
     any_frequency: bool = False
-    inner: "Model | None" = None
+    primitives: Gaussians | None = None
+    underlying: "Model | None" = None
     calibration: Calibration | None = None
 
     def __init__(self, scene: Scene):
         super().__init__()
         self.scene = scene
-
-    @property
-    def primitives(self) -> Gaussians | None:
-        """Gaussians of the scene, which figures show and density control changes."""
-        return None if self.inner is None else self.inner.primitives
 
     def fit(self, links: Links) -> None:
         """Learns from the training links without gradients; by default nothing.
@@ -302,7 +298,7 @@ class Model(nn.Module):
 
 
 class OptionalMethods(Protocol):
-    """Methods that a model, or its ``inner`` one, may have beside those of ``Model``; ``call_optional`` calls one."""
+    """Methods that a model or its ``underlying`` one may have beside those of ``Model``, for ``call_optional``."""
 
     def facts(self) -> dict[str, object]:
         """Entries of ``metrics.json`` beside the model's sizes; plain values by name."""
@@ -338,10 +334,10 @@ class OptionalMethods(Protocol):
 
 
 def call_optional(model: Model, method: str, *arguments: object) -> Any:
-    """Result of a method of ``OptionalMethods``, the model's or its ``inner`` one's; None if neither has it."""
+    """Result of a method of ``OptionalMethods``, the model's or its ``underlying`` one's; None if neither has it."""
     owner: Model | None = model
     while owner is not None and not hasattr(owner, method):
-        owner = owner.inner
+        owner = owner.underlying
     return None if owner is None else getattr(owner, method)(*arguments)
 
 

@@ -1,13 +1,15 @@
 """Ensembles: models that differ by their seed alone, whose differences show how certain they are."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from gaigs.data import Links
+from gaigs.gaussians import Gaussians
 from gaigs.kriging.links import evenly
-from gaigs.model import Model, Prediction
+from gaigs.model import Model, Prediction, call_optional
 from gaigs.query import Batch
 from gaigs.registry import register, registry
 from gaigs.scene import Scene
@@ -44,9 +46,18 @@ class Ensemble(Model):
         self.register_buffer("typical", torch.tensor(0.0))
 
     @property
-    def inner(self) -> Model:  # type: ignore[override]
+    def underlying(self) -> Model:  # type: ignore[override]
         """The first member, whose room and Gaussians stand for those of all."""
         return self.members[0]  # type: ignore[return-value]
+
+    @property
+    def primitives(self) -> Gaussians | None:  # type: ignore[override]
+        return self.underlying.primitives
+
+    def rendering(self, batch: Batch) -> Callable[[], object] | None:
+        """That of all members, one after the other."""
+        parts = [call_optional(member, "rendering", batch) for member in self.members]  # type: ignore[arg-type]
+        return None if None in parts else lambda: [part() for part in parts]
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:

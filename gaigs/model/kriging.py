@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Links
+from gaigs.gaussians import Gaussians
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import (
     FEWEST,
@@ -237,7 +238,7 @@ class Kriging(Model):
     def deviations(self, batch: Batch) -> Tensor:
         """Standard deviations of the labels; of spectra means over their pixels.
 
-        Those of kriged paths are bounds below, without noise.
+        Those of kriged paths have no noise, and treat paths as if the elements resolved them all.
         """
         query = batch.query
         if self.is_scalar:
@@ -378,8 +379,12 @@ class Kriging(Model):
         return self.trend if self.trend_weight > 0 else self.fallback
 
     @property
-    def inner(self) -> Model:  # type: ignore[override]
+    def underlying(self) -> Model:  # type: ignore[override]
         return self.trend
+
+    @property
+    def primitives(self) -> Gaussians | None:  # type: ignore[override]
+        return self.trend.primitives
 
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""

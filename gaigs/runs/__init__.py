@@ -11,6 +11,7 @@ from rich.console import Console
 from gaigs import checkpoint
 from gaigs.data import Links, load
 from gaigs.io.files import write_text
+from gaigs.kriging.links import check_known
 from gaigs.model import Model, call_optional
 from gaigs.processes import is_first, limited_threads, only_run
 from gaigs.radio_maps import radio_map
@@ -117,6 +118,8 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     log.info("data: training transmitters within %s m%s", box, links.remarks and f"; {links.remarks}")
     loss = registry("loss").build(config["loss"], task=task)
     baselines = evaluation.build_baselines(config["baselines"], name, scene)
+    if baselines:
+        check_known(links)  # a training comes before
     fitted = fit(None, loss, links, config, folder)
     if fitted is None:
         return None

@@ -22,6 +22,7 @@ from gaigs import checkpoint
 from gaigs.configuration import composed, preset
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
+from gaigs.kriging.links import check_known
 from gaigs.loss import Loss
 from gaigs.model import Model
 from gaigs.model.ensemble import Ensemble
@@ -122,6 +123,8 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         model = registry("model").build(config["model"], scene=links.scene)
     if isinstance(model, Kriging):
         raise ValueError("model=kriging has no training of its own; choose a trained model, and set kriging=true")
+    if config["kriging"]:
+        check_known(links)  # a training comes before
     make_kriged = lambda trend: Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
     kriged = make_kriged(model)
     parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}

@@ -7,8 +7,6 @@ import pytest
 import torch
 
 import gaigs
-from gaigs.data import divide
-from gaigs.data.bands import hold_out_band
 from gaigs.geometry import ExtrapolationWarning
 from gaigs.testing import example_links
 
@@ -43,18 +41,6 @@ def test_a_band_trains_and_the_others_test():
 def test_bands_without_subcarriers_are_refused(bands, message):
     with pytest.raises(ValueError, match=message):
         gaigs.links("synthetic_csi", **OPTIONS, **bands)
-
-
-def test_receivers_without_training_links_are_left_out():
-    links = example_links("csi")
-    links.query.receivers[:20] = 0  # the other is heard in the test alone
-    found = divide(hold_out_band(links, [2.42e9, 2.44e9], None), {"name": "official"})
-    assert [receiver.name for receiver in found.receivers] == ["gateway0"]
-    assert "receivers without a training link are left out, with 2 links: gateway1" in found.remarks
-    kept = (links.query.receivers == 0).nonzero()[:, 0]
-    assert kept[found.split.test].tolist() == [20, 22]
-    assert torch.equal(found.held_out.labels, links.labels[kept][..., 3:])
-    assert gaigs.evaluate(gaigs.train("mean", found), found, baselines=[]).models
 
 
 def test_a_run_scores_the_held_out_band(tmp_path):

@@ -70,7 +70,7 @@ def test_the_end_with_fewer_places_is_the_fixed_one(file, text, end, moving):
 
 
 def test_the_fixed_end_can_be_chosen(file):
-    links = read(file, RANDOM | {"test": 0}, fixed="tx")
+    links = read(file, fixed="tx")
     assert [r.name for r in links.receivers] == ["tx1", "tx2", "tx3", "tx4"]
     assert [r.pose.position.tolist() for r in links.receivers] == [[x, 1, 1] for x in (1.5, 2.5, 3.5, 4.5)]
     assert links.query.transmitters[:2].tolist() == [[5, 0, 2], [0, 0, 2.5]]
@@ -81,7 +81,7 @@ def test_the_fixed_end_can_be_chosen(file):
     with pytest.raises(TypeError, match="'not_heard' must be a finite number, got nan"):
         read(file, not_heard=math.nan)
     file.write_text(f"{BACK.splitlines()[0]}\n1,2,3,4,5,6,-50\n2,2,3,5,5,6,-51\n")
-    tie = read(file, RANDOM | {"test": 0})
+    tie = read(file, split=RANDOM | {"test": 0.5})
     assert [receiver.name for receiver in tie.receivers] == ["rx1", "rx2"]
 
 
@@ -136,7 +136,7 @@ def test_seventy_gateways_are_more_than_the_usual_gaussians(file):
     row = "{1},{0},1,{0},0,2,-{0}\n"
     rows = "".join(row.format(30 + k, x) for k in range(70) for x in (1, 2, 3, 4))
     file.write_text(f"{FORTH.splitlines()[0]}\n{rows}")
-    links = read(file, RANDOM | {"test": 0}, fixed="rx")
+    links = read(file, fixed="rx")
     model = registry("model").build(gaigs.compose("+experiment=rssi")["model"], scene=links.scene)
     assert len(model.gaussians) == len(links.receivers) == 70
 

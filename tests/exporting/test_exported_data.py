@@ -147,6 +147,16 @@ def test_channels_of_test_links_stand_beside_their_labels(tmp_path, caplog):
         np.testing.assert_allclose(found["z"][:], links.query.transmitters[test, 2])
 
 
+def test_held_out_subcarriers_stand_beside_their_labels(tmp_path):
+    links = gaigs.links("synthetic_csi", transmitters=20, subcarriers=4, order=0)
+    band = links.task.frequencies[:2].tolist()
+    links = gaigs.links("synthetic_csi", transmitters=20, subcarriers=4, order=0, band_train=band)
+    gaigs.export(gaigs.train("friis", links), tmp_path / "test.csv", links)
+    labels, row = links.held_out.labels[links.split.test], rows(tmp_path / "test.csv")[1]
+    assert float(row["subcarrier"]) == links.held_out.task.frequencies[1].item()
+    assert float(row["measured_real"]) == pytest.approx(labels[0, 0, 1].real.item())
+
+
 def test_spectra_have_axes_in_degrees(tmp_path):
     links = gaigs.links("synthetic", transmitters=20, order=0)
     model = gaigs.train("mean", links)

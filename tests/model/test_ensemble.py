@@ -88,6 +88,12 @@ def test_an_ensemble_has_a_member(links):
         gaigs.train("gaigs", links, ensemble=0, **FEW)
 
 
+def test_all_members_are_rendered():
+    links = gaigs.links("synthetic", transmitters=10, order=0)
+    model = Ensemble(links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20}) for _ in range(3)])
+    assert len(model.rendering(links.batch(links.split.test[:1]))()) == 3
+
+
 def test_deviations_do_not_depend_on_the_asked_directions():
     links = gaigs.links("synthetic", transmitters=30, order=0)
     model = Ensemble(links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20}) for _ in range(2)])
