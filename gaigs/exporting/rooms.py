@@ -20,7 +20,7 @@ from torch import Tensor
 from gaigs.data.sionna.meshes import Mesh
 from gaigs.data.synthetic.image_source import TABULATED, conductivity
 from gaigs.io.files import atomic_write, write_text
-from gaigs.model import Model
+from gaigs.model import Model, Wrapper
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.placement.learnt_room import LearntPlane
 from gaigs.placement.mirrored import export
@@ -85,7 +85,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
 def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
     """The mirrored Gaussians of a model, without its kriging, of an ensemble those of its first member."""
     own = model
-    while own.underlying is not None:
+    while isinstance(own, Wrapper):
         own = own.underlying
     if not isinstance(own, MirroredSplatting):
         raise ValueError(f"{kind} takes a model 'mirrored', got {name_of(own)!r}; train it on the same data")

@@ -2,6 +2,7 @@
 
 import copy
 import warnings
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +54,6 @@ class Model(nn.Module):
         revisions: Fractions of the training after which ``OptionalMethods.revise`` is called.
         any_frequency: True if channels are a function of frequency, read from ``scene.task.frequencies``.
         configuration: Options that a registered model was made with; ``save`` stores them.
-        underlying: Model with this one's room and Gaussians: a kriged trend, an ensemble's first member; a property.
         calibration: What intervals are made of; None if no validation links have measured the model's errors.
 
     Example:
@@ -82,7 +82,6 @@ class Model(nn.Module):
     predicts_untrained: bool = False
     any_frequency: bool = False
     primitives: Gaussians | None = None
-    underlying: "Model | None" = None
     calibration: Calibration | None = None
 
     def __init__(self, scene: Scene):
@@ -298,7 +297,7 @@ class Model(nn.Module):
 
 
 class OptionalMethods(Protocol):
-    """Methods that a model or its ``underlying`` one may have beside those of ``Model``, for ``call_optional``."""
+    """Methods that a model may have beside those of ``Model``; ``call_optional`` calls one if it is there."""
 
     def facts(self) -> dict[str, object]:
         """Entries of ``metrics.json`` beside the model's sizes; plain values by name."""
@@ -334,11 +333,33 @@ class OptionalMethods(Protocol):
 
 
 def call_optional(model: Model, method: str, *arguments: object) -> Any:
-    """Result of a method of ``OptionalMethods``, the model's or its ``underlying`` one's; None if neither has it."""
-    owner: Model | None = model
-    while owner is not None and not hasattr(owner, method):
-        owner = owner.underlying
-    return None if owner is None else getattr(owner, method)(*arguments)
+    """Result of a model's method of ``OptionalMethods``; None if the model has no such method."""
+    return getattr(model, method)(*arguments) if hasattr(model, method) else None
+
+
+class Wrapper(Model):
+    """Base of a model around an ``underlying`` one, whose room, Gaussians, rendering and files are its own."""
+
+    @property
+    @abstractmethod
+    def underlying(self) -> Model:
+        """The model within, such as the trend of kriging."""
+
+    @property
+    def primitives(self) -> Gaussians | None:  # type: ignore[override]
+        return self.underlying.primitives
+
+    def rendering(self, batch: Batch) -> Callable[[], object] | None:
+        return call_optional(self.underlying, "rendering", batch)
+
+    def learnt_room(self, links: Links | None = None) -> Any:
+        return call_optional(self.underlying, "learnt_room", links)
+
+    def learnt_paths(self, query: Query) -> Any:
+        return call_optional(self.underlying, "learnt_paths", query)
+
+    def export(self, folder: Path) -> None:
+        call_optional(self.underlying, "export", folder)
 
 
 def extrapolations(query: Query, scene: Scene) -> list[str]:

@@ -7,16 +7,15 @@ import torch
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.gaussians import Gaussians
 from gaigs.kriging.links import evenly
-from gaigs.model import Model, Prediction, call_optional
+from gaigs.model import Model, Prediction, Wrapper, call_optional
 from gaigs.query import Batch
 from gaigs.registry import register, registry
 from gaigs.scene import Scene
 
 
 @register("model", "ensemble")
-class Ensemble(Model):
+class Ensemble(Wrapper):
     """The mean of trained models; a run trains them by ``ensemble=5``.
 
     Args:
@@ -46,13 +45,9 @@ class Ensemble(Model):
         self.register_buffer("typical", torch.tensor(0.0))
 
     @property
-    def underlying(self) -> Model:  # type: ignore[override]
+    def underlying(self) -> Model:
         """The first member, whose room and Gaussians stand for those of all."""
         return self.members[0]  # type: ignore[return-value]
-
-    @property
-    def primitives(self) -> Gaussians | None:  # type: ignore[override]
-        return self.underlying.primitives
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
         """That of all members, one after the other."""

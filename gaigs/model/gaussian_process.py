@@ -55,8 +55,7 @@ class GaussianProcess(Model):
 
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
-        names = ("friis" if isinstance(scene.task, Csi) else "mean",)
-        names = ("mean", "path_loss") if scene.task.is_scalar else names
+        names = ("mean", "path_loss") if scene.task.is_scalar else ("friis" if isinstance(scene.task, Csi) else "mean",)
         # In plain sequences: their state is no state of this look-up.
         given = [{"name": name} for name in names] if trend is None else [trend]
         self.trends = tuple(build_trend(one, scene) for one in given)

@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.gaussians import Gaussians
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import (
     FEWEST,
@@ -24,7 +23,7 @@ from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, coordinates, folds_of, scaled, thinned
 from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
-from gaigs.model import Model, Prediction, call_optional
+from gaigs.model import Model, Prediction, Wrapper, call_optional
 from gaigs.query import Batch
 from gaigs.registry import name_of, register, registry
 from gaigs.scene import Scene
@@ -37,7 +36,7 @@ WEIGHTS = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 
 @register("model", "kriging")
-class Kriging(Model):
+class Kriging(Wrapper):
     """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend, z the kriged residual.
 
     The trend is a trained model. The fallback is a model that is fitted at once. z is the mean of a Gaussian process
@@ -224,12 +223,12 @@ class Kriging(Model):
             return self.process.at(receiver)
         if self.by_paths:
             return None
-        field, process = self.fields[receiver], self._process
+        field, process = self.fields[receiver], self._hyperparameters
         return process.at(scaled(field.places, 1 / process.scale), field.size(process).item() ** 2)
 
     @property
-    def _process(self) -> Any:
-        """Hyperparameters of paths or of labels."""
+    def _hyperparameters(self) -> Any:
+        """The buffer ``hyperparameters`` by name, of kriged paths or labels."""
         return (PathProcess if self.by_paths else Hyperparameters)(*self.hyperparameters.tolist())
 
     def _log(self) -> None:
@@ -243,7 +242,7 @@ class Kriging(Model):
         query = batch.query
         if self.is_scalar:
             return self.process.deviations(coordinates(self.scene, query, 1.0), query.receivers)
-        process = self._process
+        process = self._hyperparameters
         places = query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
         found = places.new_zeros(len(query), *(self.scene.task.shape if self.by_paths else ()))
         trend: Any = self.trend
@@ -338,7 +337,7 @@ class Kriging(Model):
             self.process.cpu().solve(coordinates(self.scene, query, 1.0), query.receivers, left)
             self.process.to(self.weight.device)
             return
-        process = self._process
+        process = self._hyperparameters
         for receiver, field in enumerate(self.fields):
             rows = (query.receivers == receiver).nonzero()[:, 0]
             field.solve(coordinates(self.scene, query[rows], process.scale), residuals(rows), process)
@@ -354,7 +353,7 @@ class Kriging(Model):
         if self.is_scalar:
             levels = self.process(coordinates(self.scene, query, 1.0), query.receivers).to(value)
             return Prediction(blend(task, value + levels, trend, weight), {})
-        process = self._process
+        process = self._hyperparameters
         places = query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
         for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver
@@ -379,12 +378,8 @@ class Kriging(Model):
         return self.trend if self.trend_weight > 0 else self.fallback
 
     @property
-    def underlying(self) -> Model:  # type: ignore[override]
+    def underlying(self) -> Model:
         return self.trend
-
-    @property
-    def primitives(self) -> Gaussians | None:  # type: ignore[override]
-        return self.trend.primitives
 
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
@@ -392,7 +387,7 @@ class Kriging(Model):
         if self.is_scalar:
             facts |= {**self.process.facts(), "links": len(self.process.places)}
             return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
-        facts |= self._process.facts()
+        facts |= self._hyperparameters.facts()
         places = [len(field.places) for field in self.fields]
         facts["links"] = sum(places)
         if not self.by_paths:

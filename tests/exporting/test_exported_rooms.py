@@ -14,7 +14,6 @@ import gaigs
 from gaigs.data.sionna.meshes import Mesh
 from gaigs.exporting.rooms import itu_bsdf, mirrored_of, sheet_bsdf, write_scene
 from gaigs.io.meshes import positions, read_obj, read_ply
-from gaigs.model import call_optional
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
 from gaigs.placement.mirrored import sheets
@@ -63,7 +62,7 @@ def test_gltf_has_the_room_with_y_up(mirrored, tmp_path):
 def test_a_kriged_ensemble_has_the_room_of_its_first_member(mirrored):
     model = Kriging(mirrored.scene, Ensemble(mirrored.scene, [mirrored, mirrored]))
     assert mirrored_of("a room", model) is mirrored
-    assert len(call_optional(model, "learnt_room").planes) == 6
+    assert len(model.learnt_room().planes) == 6
 
 
 def test_a_scene_has_a_material_and_a_mesh_for_each_plane(mirrored, tmp_path):
