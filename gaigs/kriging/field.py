@@ -104,17 +104,17 @@ def principal_components(residuals: Inexact[Tensor, "k m"]) -> Inexact[Tensor, "
     """
     if min(residuals.shape) <= EXACT:
         # By the smaller matrix of products: a decomposition of the residuals themselves takes ten times as long.
-        wide = residuals.to(torch.promote_types(residuals.dtype, torch.float64))
-        is_flat = len(wide) <= wide.shape[1]
-        squares, vectors = torch.linalg.eigh(wide @ wide.mH if is_flat else wide.mH @ wide)
-        values, vectors = squares.flip(0).clamp_min(0).sqrt().to(residuals.abs().dtype), vectors.flip(1).mH
-        components = (vectors @ wide if is_flat else vectors).to(residuals)
+        is_flat = len(residuals) <= residuals.shape[1]
+        gram = residuals @ residuals.mH if is_flat else residuals.mH @ residuals
+        squares, vectors = torch.linalg.eigh(gram.to(torch.promote_types(gram.dtype, torch.float64)))
+        squares, vectors = squares.flip(0).clamp_min(0), vectors.flip(1).mH.to(residuals)[:MOST]
+        components = vectors @ residuals if is_flat else vectors
     else:
         with torch.random.fork_rng(devices=[]):  # a resumed run must continue as an uninterrupted one
             torch.manual_seed(0)
             _, values, columns = torch.svd_lowrank(residuals, q=MOST + 16)
-        components = columns.mH
-    energy = residuals.abs().square().sum()
-    left = energy - values.square().cumsum(0)
+        squares, components = values.square().double(), columns.mH
+    energy = residuals.abs().square().sum(dtype=torch.float64)
+    left = energy - squares.cumsum(0)
     components = components[: min(int((left > LEFT * energy).sum()) + 1, MOST) if energy > 0 else 0]
     return components / components.abs().amax(1, keepdim=True)

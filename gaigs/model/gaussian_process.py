@@ -66,14 +66,22 @@ class GaussianProcess(Model):
         self.factors: Tensor | None = None
         self.process = Hyperparameters()
 
-    @torch.no_grad()
     def fit(self, links: Links) -> None:
         """Fits trend and hyperparameters, and factorises the covariances."""
-        self.links, self.known, self.chosen = links, known_links(links), 0
+        self._fit(links, chooses=True)
+
+    def refit(self, links: Links) -> None:
+        """As ``fit``, for some of the known links: hyperparameters stay; of labels of one number kernel, noise and the
+        choice of the trend."""
+        self._fit(links, chooses=False)
+
+    @torch.no_grad()
+    def _fit(self, links: Links, chooses: bool) -> None:
+        self.links, self.known = links, known_links(links)
         for trend in self.trends:
             trend.fit(links)
         if self.scalar:
-            self._fit_scalar(thinned(links, LIMIT))
+            self._fit_scalar(thinned(links, LIMIT), chooses)
             return
         self.factors = None
         if self.scene.task.dtype.is_complex:
@@ -82,7 +90,8 @@ class GaussianProcess(Model):
             factors = damping(residuals, links.labels[index], links.query.receivers[index])
             self.factors = torch.ones(len(links)).index_copy(0, index, factors)
         residuals = lambda index: torch.cat([thin_labels(part) for part in self._residuals(index)])
-        self.process, _ = fit_hyperparameters(self.scene, links, residuals)
+        if chooses:
+            self.process, _ = fit_hyperparameters(self.scene, links, residuals)
         self.solved, self.signals = [], []
         for index in self.known:
             factor = self._factor(index)
@@ -94,17 +103,7 @@ class GaussianProcess(Model):
             white = wide / root if factor is None else torch.linalg.solve_triangular(factor.to(wide), wide, upper=False)
             self.signals.append(white.abs().square().mean().sqrt().item())
 
-    def refit(self, links: Links) -> None:
-        """As ``fit``, for some of the known links; of labels of one number kernel, noise and trend stay."""
-        if not self.scalar:
-            self.fit(links)
-            return
-        self.links, self.known = links, known_links(links)
-        self.trend.fit(links)
-        self._fit_scalar(thinned(links, LIMIT), chooses=False)
-
-    @torch.no_grad()
-    def _fit_scalar(self, links: Links, chooses: bool = True) -> None:
+    def _fit_scalar(self, links: Links, chooses: bool) -> None:
         index = torch.cat(known_links(links))
         query, process = links.query[index], self.scalar[0]
         residuals = [(links.labels[index] - trend(Batch(query)).value).double() for trend in self.trends]

@@ -21,6 +21,7 @@ from gaigs.placement.mirrored import export
 from gaigs.placement.mirrored.channel_search import FEWEST, ChannelSearch
 from gaigs.placement.mirrored.lag_search import LagSearch
 from gaigs.placement.mirrored.level_search import LevelSearch
+from gaigs.placement.mirrored.reflections import seen_from
 from gaigs.placement.mirrored.search import Loss, move_planes, prune
 from gaigs.pooling import Pooling
 from gaigs.pooling.channels import ChannelPooling
@@ -113,9 +114,7 @@ class MirroredSplatting(GaussianSplatting):
         gains = torch.stack([fit_gain(labels[some], waves[some]) for some in own]) / self.pooling.strength
         gains = torch.where((gains != 0) & (sign != 0), gains, 0.1)
         placement = self.placement
-        known = placement.used if placement.walls else placement.used[:0]
-        normals = placement.normals[known]
-        start = torch.cat((normals, (placement.offsets[known] + normals @ placement.middle)[:, None]), 1)
+        start = placement.planes[placement.used if placement.walls else placement.used[:0]]
         placement.start_from_free_space(gains.conj() if sign > 0 else gains)
         placement.enable_phases(speed_of_light / frequencies.mean().item())
         if placement.fixed or not placement.order or labels[0].numel() < FEWEST:
@@ -126,7 +125,7 @@ class MirroredSplatting(GaussianSplatting):
         aligned[train] = task.align(labels, waves)  # takes off delays that are not those of paths
         planes, slabs = ChannelSearch(replace(links, labels=aligned), *options, start).run()
         for number, (plane, slab) in enumerate(zip(planes, slabs, strict=True)):
-            placement.place(number, plane[:3].float(), float(plane[3] - plane[:3] @ placement.middle.double()), slab)
+            placement.place(number, plane, slab)
         placement.planned.copy_(placement.sequences_of(torch.arange(len(planes))))
         placement.most.copy_(placement.planned.sum())
         placement.step.mul_(0.1)  # the search is exact to millimetres
@@ -171,15 +170,17 @@ class MirroredSplatting(GaussianSplatting):
     def _start(self) -> Float[Tensor, "w 4"]:
         """The user's walls, or the faces of the box without their tilt."""
         placement, used = self.placement, self.placement.used
-        normals = placement.normals[used] if placement.walls else placement.normals[used].round()
-        return torch.cat((normals, (placement.offsets[used] + normals @ placement.middle)[:, None]), 1).cpu()
+        if placement.walls:
+            return placement.planes[used].cpu()
+        straight = torch.cat((placement.normals[used].round(), placement.offsets[used, None]), 1)
+        return seen_from(straight.double(), -placement.middle).cpu()
 
     def _find_planes(self, search: LagSearch) -> None:
         """Puts planes where ``LagSearch`` finds them."""
         placement = self.placement
-        planes = search.run(self._start(), self.scene.bandwidth, len(placement.origin)).to(placement.origin)
+        planes = search.run(self._start(), self.scene.bandwidth, len(placement.origin))
         for number, plane in enumerate(planes):
-            placement.place(number, plane[:3], float(plane[3] - plane[:3] @ placement.middle))
+            placement.place(number, plane)
         placement.kept.copy_(placement.sequences_of(torch.arange(len(planes))))
         placement.most.copy_(placement.kept.sum())
         placement.enable_phases(search.wavelength)

@@ -105,7 +105,7 @@ class Fitted(NamedTuple):
         models: The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
         unseen: The same, not fitted to validation links; empty for a model without a training.
         start: Number of Gaussians before the training.
-        seconds: Duration of the training; None without one.
+        seconds: Duration of the search for planes and of the training; None without one.
         kriging_seconds: Duration of kriging; None without it.
     """
 
@@ -134,14 +134,15 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
             log.warning(words, parts["tokenizer"], parts["deformation"])
         parts["tokenizer"] = "none"
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
+    began = time.monotonic()
     model.fit(links)
-    start = count_gaussians(model)
+    searched, start = time.monotonic() - began, count_gaussians(model)
     if not is_trained(model):
         model.calibration = calibrated(model, links)
         return Fitted({name: model}, {}, start)
     if config["ensemble"] < 1:
         raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
-    model, seconds = descend(model, loss, links, config, folder)
+    model, seconds = descend(model, loss, links, config, folder, searched)
     if not is_first():
         return None
     best, trained = folder / "best.ckpt", ""
@@ -170,8 +171,10 @@ def with_others(model: Model, loss: Loss, links: Links, config: dict, folder: Pa
         place.mkdir(parents=True, exist_ok=True)
         lightning.seed_everything(seed, verbose=False)
         other = registry("model").build(config["model"], scene=links.scene)
+        began = time.monotonic()
         other.fit(links)
-        other, seconds = descend(other, loss, links, config | {"seed": seed}, place)
+        searched = time.monotonic() - began
+        other, seconds = descend(other, loss, links, config | {"seed": seed}, place, searched)
         members.append(other)
         total += seconds
     ensemble = Ensemble(links.scene, members).eval().to(device_of(model))
@@ -179,12 +182,12 @@ def with_others(model: Model, loss: Loss, links: Links, config: dict, folder: Pa
     return ensemble, total
 
 
-def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Model, float]:
-    """Trains a model by gradient descent.
+def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, searched: float) -> tuple[Model, float]:
+    """Trains a model by gradient descent, which ``Model.fit`` has prepared in ``searched`` [s].
 
     Returns:
         The model at the step with the best validation score, or at the last step without validation links; and the
-        duration [s], summed over the parts of an interrupted run.
+        duration of both [s], summed over the parts of an interrupted run.
     """
     split = {"name": links.split.name, **links.split.parts()}
     identity = {"version": checkpoint.VERSION, "model": config["model"], "scene": links.scene.state(), "split": split}
@@ -193,7 +196,7 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
     module = registry("training").build(config["training"], **context)
     last, best = folder / "last.ckpt", folder / "best.ckpt"
     keep_last = KeepLast(last, config["save_every"])
-    options, budget = make_budget(config["trainer"])
+    options, budget = make_budget(config["trainer"], searched)
     callbacks = [budget, KeepBest(best, module.patience), keep_last]  # Lightning calls the last two after all others
     if module.density is not None:
         callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))
@@ -245,10 +248,10 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path) 
             distributed.destroy_process_group()
     if keep_last.received is not None:  # after the last step
         raise Stopped(f"stopped after step {trainer.global_step}", keep_last.received)
-    seconds, steps, size = budget.seconds, trainer.global_step, module.batch_size
+    seconds, steps, size = budget.seconds - budget.searched, trainer.global_step, module.batch_size
     log.info("trained %d steps of %d places in %.0f s: %.1f steps/s", steps, size, seconds, steps / seconds)
     module.load_state_dict(checkpoint.trained_weights(checkpoint.read(best)))
-    return model.eval().to(trainer.strategy.root_device), seconds
+    return model.eval().to(trainer.strategy.root_device), budget.seconds
 
 
 def resumable(last: Path, best: Path) -> dict:

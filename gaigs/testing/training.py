@@ -76,7 +76,7 @@ def check_training(
         whole = _train(module, links, folder, device)
         require(whole.steps == list(range(1, STEPS + 1)), f"{STEPS} batches must be as many steps, got {whole.steps}")
         finite = all(map(math.isfinite, whole.losses))
-        require(finite, f"each step must log a finite train/loss for the progress bar, got {whole.losses}")
+        require(finite, f"each step must return its loss, for the progress line, got {whole.losses}")
         after, names = whole.states[-1], {id(parameter): name for name, parameter in module.model.named_parameters()}
         for group, parameters in module.model.parameter_groups().items():
             own = [names[id(parameter)] for parameter in parameters if parameter.requires_grad]
@@ -94,7 +94,7 @@ def check_training(
 
 @dataclass(eq=False)
 class _Course(Callback):
-    """Keeps the model and the logged loss of every step; writes a checkpoint after step ``STOP``."""
+    """Keeps the model and the loss of every step; writes a checkpoint after step ``STOP``."""
 
     folder: Path
     steps: list[int] = field(default_factory=list)
@@ -102,10 +102,10 @@ class _Course(Callback):
     losses: list[float] = field(default_factory=list)
     metrics: dict[str, float] = field(default_factory=dict)
 
-    def on_train_batch_end(self, trainer, module, *_) -> None:
+    def on_train_batch_end(self, trainer, module, outputs, *_) -> None:
         self.steps.append(trainer.global_step)
         self.states.append(_copy(module.model))
-        self.losses.append(float(trainer.progress_bar_metrics.get("train/loss", math.nan)))
+        self.losses.append(math.nan if outputs is None else float(outputs["loss"]))
         if trainer.global_step == STOP:
             save(trainer, self.folder / f"{STOP}.ckpt")
 

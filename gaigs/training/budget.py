@@ -1,5 +1,6 @@
 """The budget of a training: steps, wall time, or both; and how much of it is spent."""
 
+import math
 import time
 from collections.abc import Callable, Mapping
 
@@ -15,36 +16,43 @@ ENDLESS = 2**40
 class Budget(Callback):
     """Measures a training's time, ends it when its time is up, and has it validate by time.
 
-    The clock of the first process decides for all, after each step. It runs during validations, and a resumed training
-    starts with the time spent before. Lightning's own ``max_time`` gives each process its own clock.
+    The clock of the first process decides for all, after each step. It starts with the search for planes, runs during
+    validations, and a resumed training starts with the time spent before. Lightning's own ``max_time`` gives each
+    process its own clock.
 
     Args:
-        max_time: Of the training [s]; None if steps alone end it.
+        max_time: Of the search and the training [s]; None if steps alone end it. The training has half of it or more.
         every: Least time between validations [s], which take at most a fifth of the training; None: by steps.
+        searched: Duration of the search before the training [s].
 
     Attributes:
-        share: Share of ``max_time`` spent, the same in all processes; 0 without it.
+        share: Share of the training's time spent, the same in all processes; 0 without ``max_time``.
     """
 
-    def __init__(self, max_time: float | None = None, every: float | None = None):
-        self.max_time, self.every = max_time, every
+    def __init__(self, max_time: float | None = None, every: float | None = None, searched: float = 0.0):
+        self.max_time, self.every, self.searched = max_time, every, searched
         self.share = 0.0
-        self.began = self.validated = 0.0  # the last validation, and its end [s]
+        self.began = self.validated = searched  # the last validation, and its end [s]
         self.is_due = False
-        self.spent, self.start = 0.0, None  # time before this process [s], and its clock at the start
+        self.spent, self.start = searched, None  # time before the training [s], and its clock at the start
 
     @property
     def seconds(self) -> float:
-        """Time of the training so far [s]."""
+        """Time of the search and of the training so far [s]."""
         return self.spent + (0.0 if self.start is None else time.monotonic() - self.start)
+
+    @property
+    def limit(self) -> float:
+        """Time at which the training ends [s]; infinite without ``max_time``."""
+        return math.inf if self.max_time is None else max(self.max_time, self.searched + self.max_time / 2)
 
     def state_dict(self) -> dict:
         last = {"share": self.share, "began": self.began, "validated": self.validated, "is_due": self.is_due}
-        return {"seconds": self.seconds, **last}
+        return {"seconds": self.seconds, "searched": self.searched, **last}
 
     def load_state_dict(self, state: dict) -> None:
         self.spent, self.share, self.is_due = state["seconds"], state["share"], state["is_due"]
-        self.began, self.validated = state["began"], state["validated"]
+        self.began, self.validated, self.searched = state["began"], state["validated"], state["searched"]
 
     def on_fit_start(self, trainer, module) -> None:
         self._stop_in_time(trainer)  # a run that was killed once its time was up
@@ -81,7 +89,7 @@ class Budget(Callback):
     def _look(self, trainer) -> float:
         """The first process's time [s]; stops the training when it is up."""
         elapsed = trainer.strategy.broadcast(self.seconds)
-        self.share = 0.0 if self.max_time is None else elapsed / self.max_time
+        self.share = (elapsed - self.searched) / (self.limit - self.searched)
         self._stop_in_time(trainer)
         return elapsed
 
@@ -89,8 +97,8 @@ class Budget(Callback):
         trainer.should_stop = trainer.should_stop or self.share >= 1
 
 
-def make_budget(options: Mapping) -> tuple[dict, Budget]:
-    """The options of Lightning's trainer without those of the budget, and the budget.
+def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
+    """The options of Lightning's trainer without those of the budget, and the budget after a search [s].
 
     The budget takes ``max_time`` and a ``val_check_interval`` that is a time.
 
@@ -118,7 +126,7 @@ def make_budget(options: Mapping) -> tuple[dict, Budget]:
         epochs = options.get(option)
         if epochs not in (only, None):
             raise ValueError(f"trainer.{option} must be {only or 'null'}, as steps or time count, got {epochs}")
-    return options, Budget(max_time, every)
+    return options, Budget(max_time, every, searched)
 
 
 def seconds(option: str, duration: object) -> float:
@@ -141,8 +149,7 @@ def time_share(trainer) -> float | None:
 def is_time_up(trainer) -> bool:
     """True if the time of a training is up, by the clock of the first process."""
     budgets = (callback for callback in trainer.callbacks if isinstance(callback, Budget))
-    limited = [budget for budget in budgets if budget.max_time is not None]
-    return any(trainer.strategy.broadcast(budget.seconds) >= budget.max_time for budget in limited)
+    return any(trainer.strategy.broadcast(budget.seconds) >= budget.limit for budget in budgets)
 
 
 def share_done(trainer) -> Callable[[int], float]:

@@ -118,7 +118,6 @@ class Descent(lightning.LightningModule):
             total = total + self.penalties[name] * places * penalty
         if not torch.isfinite(total):
             raise self._diverged(total, terms, batch)
-        self.log("train/loss", total, prog_bar=True, logger=False)
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             # Lightning would log after the step's callbacks, and a checkpoint written there would lack the row.
             shared = {name: links * term for name, term in terms.items()}

@@ -26,11 +26,12 @@ class ProgressLine(ProgressBar):
         self.task = self.line.add_task("", total=1, **self._done(trainer), rate=0, scores="")
         self.line.start()
 
-    def on_train_batch_end(self, trainer, module, *_) -> None:
-        step, values = trainer.global_step, trainer.progress_bar_metrics
+    def on_train_batch_end(self, trainer, module, outputs, *_) -> None:
+        step, monitor = trainer.global_step, module.task.monitor
         rate = (step - self.first) / (time.monotonic() - self.start)
-        names = {"train/loss": "loss", f"validation/{module.task.monitor}": module.task.monitor}
-        scores = " ".join(f"{short} {values[name]:.3f}" for name, short in names.items() if name in values)
+        scores = f"loss {outputs['loss']:.3f}"
+        if (score := trainer.progress_bar_metrics.get(f"validation/{monitor}")) is not None:
+            scores += f" {monitor} {score:.3f}"
         self.line.update(self.task, **self._done(trainer), rate=rate, scores=scores)
 
     def _done(self, trainer) -> dict:

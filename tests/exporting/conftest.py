@@ -16,8 +16,8 @@ def mirrored():
     placement = model.placement
     for axis in range(3):
         normal = torch.eye(3)[axis]
-        placement.place(axis, normal, float(SIZE[axis] - placement.middle[axis]))
-        placement.place(axis + 3, -normal, float(placement.middle[axis]))
+        placement.place(axis, torch.tensor([*normal, SIZE[axis]]))
+        placement.place(axis + 3, torch.tensor([*-normal, 0.0]))
     with torch.no_grad():
         placement.log_extents.fill_(10.0)
     return model

@@ -51,8 +51,7 @@ def laid(placement, planes):
     """The placement with these planes, each a normal and an offset [m]; all in use."""
     if planes and hasattr(placement, "place"):
         for number, (normal, offset) in enumerate(planes):
-            normal = torch.tensor(normal)
-            placement.place(number, normal, offset - float(functional.normalize(normal, dim=0) @ placement.middle))
+            placement.place(number, torch.tensor([*functional.normalize(torch.tensor(normal), dim=0), offset]))
         placement.kept.copy_(placement.sequences_of(torch.arange(len(planes))))
     return placement
 

@@ -50,7 +50,7 @@ def walled(model):
         for wall, material in enumerate(EMPTY.walls):
             axis, side = divmod(wall, 2)
             normal, offset = torch.eye(3)[axis] * (1 if side else -1), EMPTY.size[axis] if side else 0.0
-            placement.place(wall, normal, float(offset - normal @ placement.middle))
+            placement.place(wall, torch.tensor([*normal, offset]))
             epsilon = permittivity(material, CARRIER)
             placement.log_permittivities[wall] = math.log(epsilon.real - 1)
             placement.log_conductivities[wall] = math.log(-epsilon.imag)

@@ -2,6 +2,7 @@ import re
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from gaigs.training.budget import make_budget
 from gaigs.training.progress import ProgressLine
@@ -21,12 +22,12 @@ def trainer(step, steps, **options):
 def test_the_line_fits_80_columns_and_counts_steps_or_time(capsys, monkeypatch, steps, share, shown):
     monkeypatch.setenv("COLUMNS", "80")
     _, budget = make_budget({"max_steps": steps, "max_time": "00:00:03:00"})
-    own = trainer(1200, steps, callbacks=[budget], progress_bar_metrics={"train/loss": 0.25, "v_num": 3})
+    own = trainer(1200, steps, callbacks=[budget], progress_bar_metrics={"v_num": 3})
     line = ProgressLine()
     line.on_train_start(own, None)
     own.global_step, budget.share = 1499, 0.25
     own.progress_bar_metrics["validation/ssim"] = 0.5
-    line.on_train_batch_end(own, MODULE)
+    line.on_train_batch_end(own, MODULE, {"loss": torch.tensor(0.25)})
     assert [task.percentage for task in line.line.tasks] == [pytest.approx(100 * share)]
     line.on_train_end(own, MODULE)
     (out,) = capsys.readouterr().out.strip().splitlines()
@@ -47,6 +48,6 @@ def test_of_several_processes_the_first_alone_shows_a_line(capsys):
     line.setup(own, MODULE, "fit")
     line.disable()
     line.on_train_start(own, MODULE)
-    line.on_train_batch_end(own, MODULE)
+    line.on_train_batch_end(own, MODULE, {"loss": torch.tensor(0.25)})
     line.on_train_end(own, MODULE)
     assert capsys.readouterr().out == ""

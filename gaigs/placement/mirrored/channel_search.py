@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from gaigs.data import Links
 from gaigs.gaussians import fibonacci_lattice
+from gaigs.placement.mirrored.plane_search import PlaneSearch
 from gaigs.placement.mirrored.reflections import (
     Bounces,
     all_sequences,
@@ -21,6 +22,7 @@ from gaigs.placement.mirrored.reflections import (
     images,
     polarised,
     reflect,
+    seen_from,
     tangents,
 )
 from gaigs.propagation import NEAREST, slab
@@ -44,6 +46,9 @@ DROP = 0.5
 LITTLE = 0.1
 """A plane is false if the mean log of the power that is left rises by less than this without it; of true ones it rises
 by 0.14 and more. Two tilted planes may share what one true plane explains."""
+
+MARGIN = 0.3
+"""Largest distance of a plane from all transmitters and receivers [diagonals of the room]."""
 
 FEWEST = 8
 """Fewest numbers of a channel in which planes can be searched: one path explains any single number."""
@@ -89,6 +94,11 @@ class ReceiverChannels:
             task.frequencies[when],
         )
 
+    def about(self, middle: Float[Tensor, "3"]) -> "ReceiverChannels":
+        """The same seen from a point."""
+        points = {name: getattr(self, name) - middle for name in ("places", "position", "elements")}
+        return replace(self, **points)
+
     def some(self, index: object, when: object = slice(None)) -> "ReceiverChannels":
         """The channels of some places at some subcarriers."""
         channels = self.channels[index][:, :, when]
@@ -133,7 +143,7 @@ class ReceiverChannels:
         return (waves * gains[:, :, None]).flatten(-2)
 
 
-class ChannelSearch:
+class ChannelSearch(PlaneSearch):
     """Planes whose images explain the training channels.
 
     A candidate is a plane (normal, offset). Its score is the share of the residual's power that its image explains,
@@ -157,14 +167,12 @@ class ChannelSearch:
     """
 
     def __init__(self, links: Links, sign: int, common: bool, order: int, most: int, start: Float[Tensor, "w 4"]):
-        self.common, self.order, self.most, self.start = common, min(order, 2), most, start.double()
-        self.generator = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
+        self.common, self.order, self.most = common, min(order, 2), most
         numbers = links.query.receivers[links.split.train].unique().tolist()
-        self.receivers = [ReceiverChannels.of(links, number, sign) for number in numbers]
-        self.receivers = [receiver for receiver in self.receivers if len(receiver.places)]
-        points = torch.cat([part for receiver in self.receivers for part in (receiver.places, receiver.position[None])])
-        self.points, self.middle = points, (points.amin(0) + points.amax(0)) / 2
-        self.diagonal = float((points.amax(0) - points.amin(0)).norm())
+        heard = [receiver for number in numbers if len((receiver := ReceiverChannels.of(links, number, sign)).places)]
+        super().__init__(torch.cat([part for one in heard for part in (one.places, one.position[None])]))
+        self.receivers = [receiver.about(self.middle) for receiver in heard]
+        self.start = seen_from(start.double(), self.middle)
         self.wavelength = speed_of_light / float(self.receivers[0].frequencies.mean())
         # Profiles of a gigabyte at most, also in a hall with a large band.
         size = max(receiver.channels.shape[1] * self.delays(receiver) for receiver in self.receivers)
@@ -173,6 +181,11 @@ class ChannelSearch:
     @torch.no_grad()
     def run(self) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
         """Planes, first those of the start, and their slabs as in ``SLABS``."""
+        planes, slabs = self.found()
+        return seen_from(planes, -self.middle), slabs
+
+    def found(self) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
+        """``run`` about the middle of the room."""
         planes = self.find(self.start)
         if not len(planes):
             return planes, planes[:, :3]
@@ -190,7 +203,7 @@ class ChannelSearch:
         while 0 < len(planes) < self.most:
             parts, count = self.some(planes), len(planes)
             before, found = self.left(*parts, planes, slabs).item(), []
-            lines = self.grid(torch.stack(distinct(planes[:, :3], 2e-4)), 400)
+            lines = self.grid(torch.stack(distinct(planes[:, :3], 2e-4)), 400, MARGIN)
             rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
             profiles = [self.profiles(*pair) for pair in zip(self.many, rests, strict=True)]
             for line, scores in zip(lines, self.scores(self.many, profiles, lines), strict=True):
@@ -213,7 +226,7 @@ class ChannelSearch:
                 break
             both = (tried, own), self.polish(tried, own, 60, 3e-4)
             planes, slabs = min(both, key=lambda found: self.left(*parts, *found).item())
-            log.info("plane (%.2f, %.2f, %.2f) at %.2f m, parallel to others", *planes[-1].tolist())
+            log.info("%s, parallel to others", self.words(planes[-1]))
         return planes, slabs
 
     def without_false(
@@ -244,24 +257,17 @@ class ChannelSearch:
             parts.append(receiver.some(places, when))
         return parts
 
-    def grid(self, normals: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "n k 4"]:
-        """Planes at ``count`` offsets of each normal, up to 0.3 diagonals beyond all positions."""
-        along = self.points @ normals.mT
-        margin = 0.3 * self.diagonal
-        low, high = along.amin(0) - margin, along.amax(0) + margin
-        offsets = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, count).to(low)
-        return torch.cat((normals[:, None].expand(-1, count, -1), offsets[..., None]), 2)
-
     # --- Hough transform ---
 
     def find(self, known: Float[Tensor, "v 4"]) -> Float[Tensor, "w 4"]:
         """Known planes and others, found one after the other, each refined with those before."""
-        grid = self.grid(torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3))).to(self.points), 80)
+        normals = torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3)))
+        grid = self.grid(normals.to(self.points), 80, MARGIN)
         planes = known
         while len(planes) < self.most and (tried := self.with_one_more(planes, grid)):
             _, share, planes = min(tried, key=lambda found: found[0])
             planes = self.refine(planes, 60, 1e-2)
-            log.info("plane (%.2f, %.2f, %.2f) at %.2f m: %.1f %% of the power", *planes[-1].tolist(), 100 * share)
+            log.info("%s: %.1f %% of the power", self.words(planes[-1]), 100 * share)
         for _ in range(len(planes) - len(known)):  # each once more, as the others are known now
             others = torch.cat((planes[: len(known)], planes[len(known) + 1 :]))
             kept = torch.cat((others, planes[len(known), None]))
@@ -276,15 +282,14 @@ class ChannelSearch:
         rests = [self.profiles(receiver, self.projected(receiver, planes)[0]) for receiver in self.many]
         few = [receiver.some(slice(None, None, 3)) for receiver in self.many]
         scores = self.scores(few, [rest[::3] for rest in rests], grid).flatten()
-        for plane in planes:
-            scores[self.alike(grid.flatten(0, 1), plane)] = 0
+        score = lambda near: self.scores(self.many, rests, near[:, None])[:, 0]
         # Of noise a wave explains one part in as many as a channel has numbers; the best of a grid somewhat more.
         places = sum(len(receiver.places) for receiver in self.many)
         numbers = min(receiver.flat.shape[1] for receiver in self.many)
         before = self.unexplained(planes)
         by_chance = math.exp(before) * (1 + 5 / math.sqrt(places)) / numbers
         found = []
-        for plane, share in self.best(rests, planes, grid.flatten(0, 1), scores):
+        for plane, share in self.best(grid.flatten(0, 1), scores, score, planes):
             if share >= max(FAINTEST, by_chance):
                 refined = self.refine(torch.cat((planes, plane[None])), 30, 1e-2)
                 after = self.unexplained(refined)
@@ -304,37 +309,6 @@ class ChannelSearch:
     ) -> tuple[Complex[Tensor, "b k"], Complex[Tensor, "b n"]]:
         """What free strengths leave, and these strengths."""
         return project(receiver.waves(receiver.images(planes, self.sequences(planes))), receiver.flat, ridge)
-
-    def best(self, rests, planes, flat: Float[Tensor, "k 4"], scores) -> list[tuple[Float[Tensor, "4"], float]]:
-        """The best three planes near the eight highest maxima but known ones, with their shares of power."""
-        chosen: list[Tensor] = []
-        while len(chosen) < 8 and scores.max() > 0:
-            chosen.append(flat[scores.argmax()])
-            scores[self.alike(flat, chosen[-1])] = 0
-        if not chosen:
-            return []
-        tried, turn, shift = torch.stack(chosen), 0.06, 0.02 * self.diagonal
-        for _ in range(4):
-            noise = torch.randn(len(tried), 24, 4, generator=self.generator).double()
-            noise[:, 0] = 0
-            turned = functional.normalize(tried[:, None, :3] + turn * noise[..., :3], dim=-1)
-            moved = tried[:, None, 3] + (turned - tried[:, None, :3]) @ self.middle + shift * noise[..., 3]
-            about = torch.cat((turned, moved[..., None]), 2)
-            highest, at = self.scores(self.many, rests, about.flatten(0, 1)[:, None]).view(moved.shape).max(1)
-            tried = about[torch.arange(len(tried)), at]
-            turn, shift = turn / 2, shift / 2
-        found: list[tuple[Tensor, float]] = []
-        for number in highest.argsort(descending=True).tolist():
-            others = [*planes, *(plane for plane, _ in found)]
-            if len(found) < 3 and not any(self.alike(tried[number, None], plane).any() for plane in others):
-                found.append((tried[number], highest[number].item()))
-        return found
-
-    def alike(self, flat: Float[Tensor, "k 4"], plane: Float[Tensor, "4"]) -> Bool[Tensor, " k"]:
-        """True for planes within 16 degrees and three hundredths of the room of a known one."""
-        cosines = flat[:, :3] @ plane[:3]
-        apart = (flat[:, 3] - flat[:, :3] @ self.middle) * cosines.sign() - (plane[3] - plane[:3] @ self.middle)
-        return (cosines.abs() > 0.96) & (apart.abs() < 0.03 * self.diagonal)
 
     def profiles(self, receiver: ReceiverChannels, rest: Complex[Tensor, "b k"]) -> Float[Tensor, "b e t 2"]:
         """Delay profiles of a residual at each element, over the square root of the channel's power.
@@ -403,16 +377,10 @@ class ChannelSearch:
     def descend(
         self, loss, planes: Float[Tensor, "w 4"], others: list[Tensor], steps: int, rate: float
     ) -> list[Tensor]:
-        """Adam on planes, which turn about the room's middle, and on other parameters of ``loss``."""
-        normals = planes[:, :3].clone().requires_grad_()
-        offsets = (planes[:, 3] - planes[:, :3] @ self.middle).requires_grad_()
-        others = [part.clone().requires_grad_() for part in others]
-
-        def now() -> Float[Tensor, "w 4"]:
-            units = functional.normalize(normals, dim=1)
-            return torch.cat((units, (offsets + units @ self.middle)[:, None]), 1)
-
-        optimizer = torch.optim.Adam([{"params": [normals, offsets]}, {"params": others}])
+        """Adam on planes and on other parameters of ``loss``."""
+        moving, *others = (part.clone().requires_grad_() for part in (planes, *others))
+        now = lambda: torch.cat((functional.normalize(moving[:, :3], dim=1), moving[:, 3:]), 1)
+        optimizer = torch.optim.Adam([{"params": [moving]}, {"params": others}])
         for step in range(steps):
             for group, highest in zip(optimizer.param_groups, (rate, 2e-2), strict=True):
                 group["lr"] = highest * 0.03 ** (step / steps)
@@ -462,8 +430,7 @@ class ChannelSearch:
         ]
         turned = []
         for axis in axes:
-            offsets = axis @ self.middle + planes[k, 3] - planes[k, :3] @ self.middle
-            offsets = offsets + 0.1 * self.diagonal * torch.linspace(-1, 1, 81).double()
+            offsets = planes[k, 3] + 0.1 * self.diagonal * torch.linspace(-1, 1, 81).double()
             line = torch.cat((axis.expand(81, 3), offsets[:, None]), 1)
             scores = self.scores(self.many, rests, line[None])[0]
             for at in maxima(scores, 5):
@@ -493,8 +460,7 @@ class ChannelSearch:
 
     def proposals(self, planes, k: int, reach: float, tilt: float, materials) -> list[tuple[Tensor, Tensor]]:
         """Planes near plane k, and slabs, with which its reflections have like phases: maxima of a periodogram."""
-        normal, sequences = planes[k, :3], self.sequences(planes)
-        pivot = planes[k, 3] - normal @ self.middle
+        normal, offset, sequences = planes[k, :3], planes[k, 3], self.sequences(planes)
         across = tangents(normal)
         steps = min(self.wavelength / 16, reach / 4), min(self.wavelength / 5 / self.diagonal, tilt / 4)
         grids = [
@@ -505,7 +471,7 @@ class ChannelSearch:
 
         def moved(q: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
             turned = functional.normalize(normal + q[1] * across[0] + q[2] * across[1], dim=0)
-            return torch.cat((turned, (turned @ self.middle + pivot + q[0])[None]))
+            return torch.cat((turned, (offset + q[0])[None]))
 
         own = int((sequences[:, :-1].lt(0).all(1) & (sequences[:, -1] == k)).nonzero())
         found = []
@@ -518,7 +484,7 @@ class ChannelSearch:
                 return (reflect(receiver.places, plane[:3], plane[3]) - receiver.position).norm(dim=1)
 
             slope = torch.autograd.functional.jacobian(length, torch.zeros(3).double())
-            ways = reflect(receiver.places, normal, planes[k, 3]) - receiver.position
+            ways = reflect(receiver.places, normal, offset) - receiver.position
             cosines = (functional.normalize(ways, dim=1) @ normal).abs().clamp(1e-3, 1)
             weights = strengths[:, own].abs() * waves[:, own].norm(dim=1) / receiver.flat.norm(dim=1)
             phasors = weights * strengths[:, own].sgn() * phase.conj()
@@ -536,10 +502,10 @@ class ChannelSearch:
             sums = (left.flatten(1).mT @ tilts[1]).real.unflatten(0, (len(grids[0]), -1)).flatten(1)
             highest, at = sums.max(1)  # of each offset
             highest = highest / (phasors.abs() * expected.abs()).sum()
-            for offset in range(len(highest)):
-                if highest[offset] == highest[max(0, offset - 2) : offset + 3].max():
-                    q = grids[0][offset], grids[1][at[offset] // len(grids[2])], grids[2][at[offset] % len(grids[2])]
-                    trials.append((highest[offset].item(), torch.stack(q), material))
+            for move in range(len(highest)):
+                if highest[move] == highest[max(0, move - 2) : move + 3].max():
+                    q = grids[0][move], grids[1][at[move] // len(grids[2])], grids[2][at[move] % len(grids[2])]
+                    trials.append((highest[move].item(), torch.stack(q), material))
         trials.sort(key=lambda trial: -trial[0])
         kept: list[tuple[float, Tensor, Tensor]] = []
         for trial in trials:  # the best half-space and the best slab of each lobe

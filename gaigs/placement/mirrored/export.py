@@ -134,9 +134,8 @@ def _planes(placement: Mirrored, found: TracedPaths) -> Planes:
     permittivities = torch.complex(1 + placement.log_permittivities.exp(), -placement.log_conductivities.exp())
     reflected, _ = fresnel(permittivities, torch.ones_like(permittivities.real))
     gains = reflected.abs().log() + placement.plane_gains
-    middle = placement.middle.double()
-    offsets, middles = placement.offsets + placement.normals.double() @ middle, placement.middles + middle
-    parts = placement.normals, offsets, gains, middles, placement.log_extents.exp()
+    middles = placement.middles + placement.middle.double()
+    parts = placement.normals, placement.planes[:, 3], gains, middles, placement.log_extents.exp()
     normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
     # The middle of the reflecting area need not lie on the plane: take the plane's point with the least loss.
     steep = extents**2 * normals

@@ -17,6 +17,7 @@ from gaigs.antenna import Array, Receiver
 from gaigs.data import Links
 from gaigs.gaussians import fibonacci_lattice
 from gaigs.geometry import Grid, Pose, sinc
+from gaigs.placement.mirrored.plane_search import PlaneSearch
 from gaigs.placement.mirrored.reflections import (
     all_sequences,
     fold,
@@ -24,6 +25,7 @@ from gaigs.placement.mirrored.reflections import (
     polarised,
     reflect,
     reflection_points,
+    seen_from,
     square_normals,
     tangents,
 )
@@ -298,7 +300,7 @@ class Peak(NamedTuple):
         return bool(gap[:3].norm() > TILE / 4 or (gap[3] - gap[:3] @ self.pivot).abs() > wavelength / 4)
 
 
-class LagSearch:
+class LagSearch(PlaneSearch):
     """Planes whose reflections explain spectra.
 
     A spectrum gives back the covariances of the array's elements (``Beamformer.lags``), so a model is compared with it
@@ -329,7 +331,6 @@ class LagSearch:
         most: int = 150,
     ):
         self.order, self.doubts = min(order, 2), []
-        self.generator = torch.Generator().manual_seed(int(torch.randint(2**31, ())))
         for own, carrier, pose, receiver in self.parts(links, frequencies, most):
             lags, left = covariances(links.labels[own], links.query[own])
             powers = lags[:, lags.shape[1] // 2].real
@@ -355,10 +356,7 @@ class LagSearch:
         self.wavelength = speed_of_light / frequencies.max().item()
         train, query = links.split.train, links.query
         used = query.receivers[train].unique()
-        points = torch.cat((query.transmitters[train], links.scene.positions(query.transmitters)[used]))
-        self.middle = (points.amin(0) + points.amax(0)) / 2  # about which single precision suffices
-        self.points = points - self.middle
-        self.diagonal = float((points.amax(0) - points.amin(0)).norm())
+        super().__init__(torch.cat((query.transmitters[train], links.scene.positions(query.transmitters)[used])))
         heard = torch.stack((query.receivers[train].double(), frequencies[train].double()), 1).unique(dim=0)
         pairs = heard[torch.linspace(0, len(heard) - 1, min(len(heard), PAIRS)).round().long()].tolist()
         for number, carrier in pairs:
@@ -380,11 +378,9 @@ class LagSearch:
         """
         if not len(planes) or not self.receivers:
             return planes
-        shift = lambda planes, by: torch.cat((planes[:, :3], (planes[:, 3] + planes[:, :3] @ by)[:, None]), 1)
         count = sum(len(receiver.places) for receiver in self.receivers)
-        start = Found(
-            shift(planes.float(), -self.middle), torch.ones(count, len(planes) + 1).bool(), torch.zeros(count)
-        )
+        everywhere = torch.ones(count, len(planes) + 1).bool()
+        start = Found(seen_from(planes.double(), self.middle).float(), everywhere, torch.zeros(count))
         trials, strongest = [], int(self.powers(start.planes, all_sequences(len(planes), 1)[1:]).argmax())
         choices = self.bandwidths(bandwidth)
         for self.bandwidth in choices:
@@ -392,7 +388,7 @@ class LagSearch:
             trials.append((left, self.bandwidth))
         _, self.bandwidth = min(trials)
         found = self.around(self.with_more(self.around(start), most))
-        return shift(found.planes, self.middle)
+        return seen_from(found.planes.double(), -self.middle)
 
     def bandwidths(self, known: float | None) -> list[float]:
         """The bandwidth, or those to try [Hz]: from a carrier to a band in which hardly two paths interfere."""
@@ -412,10 +408,7 @@ class LagSearch:
     def with_more(self, found: Found, most: int) -> Found:
         """Further planes, one after the other, as long as the errors fall by ``GAIN``."""
         normals = torch.cat((fibonacci_lattice(200, 0.0, math.pi / 2).float(), torch.eye(3)))
-        along = self.points @ normals.T
-        low, high = along.amin(0) - 0.15 * self.diagonal, along.amax(0) + 0.15 * self.diagonal
-        offsets = low[:, None] + (high - low)[:, None] * torch.linspace(0, 1, 60)
-        grid = torch.cat((normals.repeat_interleave(60, 0), offsets.flatten()[:, None]), 1)
+        grid = self.grid(normals, 60, 0.15).flatten(0, 1)
         while len(found.planes) < most:
             before, trials = self.errors(found.planes, found.open), []
             for plane in self.candidates(found, grid):
@@ -459,10 +452,8 @@ class LagSearch:
             logs.append(part.errors(part.sums(*part.paths(planes, sequences, own[::every]), self.bandwidth)))
         return torch.cat(logs)
 
-    # --- Hough transform ---
-
     def candidates(self, found: Found, grid: Float[Tensor, "k 4"]) -> list[Float[Tensor, "4"]]:
-        """Up to three planes whose reflections add power where it lacks: maxima of the grid, sharpened."""
+        """Planes whose reflections add power where it lacks, see ``best``."""
         side = torch.linspace(-1, 1, 33)
         plane_waves = torch.cartesian_prod(side, side)
         maps, sequences = [], self.sequences(found.planes)
@@ -471,28 +462,7 @@ class LagSearch:
             steering = receiver.steering(plane_waves)
             maps.append(((steering.conj() @ slopes) * steering).sum(-1).real.view(-1, 1, 33, 33))
         scores = torch.cat([self.scores(maps, part) for part in grid.split(4000)])
-        for plane in found.planes:
-            scores[self.alike(grid, plane)] = 0
-        chosen: list[Tensor] = []
-        while len(chosen) < 6 and scores.max() > 0:
-            chosen.append(grid[scores.argmax()])
-            scores[self.alike(grid, chosen[-1])] = 0
-        if not chosen:
-            return []
-        tried, turn, shift = torch.stack(chosen), 0.06, 0.02 * self.diagonal
-        for _ in range(4):
-            noise = torch.randn(len(tried), 24, 4, generator=self.generator)
-            noise[:, 0] = 0
-            turned = functional.normalize(tried[:, None, :3] + turn * noise[..., :3], dim=-1)
-            about = torch.cat((turned, tried[:, None, 3:] + shift * noise[..., 3:]), 2)
-            highest, at = self.scores(maps, about.flatten(0, 1)).view(about.shape[:2]).max(1)
-            tried = about[torch.arange(len(tried)), at]
-            turn, shift = turn / 2, shift / 2
-        kept: list[Tensor] = []
-        for plane in tried[highest.argsort(descending=True)]:
-            if len(kept) < 3 and not any(self.alike(plane[None], other) for other in (*found.planes, *kept)):
-                kept.append(plane)
-        return kept
+        return [plane for plane, _ in self.best(grid, scores, lambda near: self.scores(maps, near), found.planes)]
 
     def scores(self, maps: list[Float[Tensor, "b 1 k k"]], planes: Float[Tensor, "c 4"]) -> Float[Tensor, " c"]:
         """Fall of the errors by the power of one more reflection, over the norm of that power."""
@@ -505,11 +475,6 @@ class LagSearch:
             _, direct = receiver.seen(receiver.places)
             square += (powers * direct.square()[:, None]).square().sum(0)
         return total / square.sqrt().clamp_min(1e-6)
-
-    def alike(self, flat: Float[Tensor, "k 4"], plane: Float[Tensor, "4"]) -> Bool[Tensor, " k"]:
-        """True for planes within 16 degrees and three hundredths of the room of a known one."""
-        cosines = flat[:, :3] @ plane[:3]
-        return (cosines.abs() > 0.96) & ((flat[:, 3] * cosines.sign() - plane[3]).abs() < 0.03 * self.diagonal)
 
     # --- phases ---
 

@@ -14,7 +14,7 @@ from gaigs.data import Links
 from gaigs.geometry import sinc
 from gaigs.placement.mirrored.lag_search import LagSearch, ReceiverLags, reflection
 from gaigs.placement.mirrored.paths import Mirrored
-from gaigs.placement.mirrored.reflections import square_normals
+from gaigs.placement.mirrored.reflections import seen_from, square_normals
 from gaigs.query import Query
 
 log = logging.getLogger(__name__)
@@ -89,18 +89,16 @@ class LevelSearch(LagSearch):
             self.receivers.append(ReceiverLevels(places - self.middle, lags, carrier, pose, point))
             first = own.new_zeros(len(places)).index_copy(0, which.flip(0), own.flip(0))
             self.queries.append(links.query[first])
-        self.start = torch.cat((planes[:, :3], (planes[:, 3] - planes[:, :3] @ self.middle)[:, None]), 1)
+        self.start = seen_from(planes.double(), self.middle).float()
 
     @torch.no_grad()
     def locate(self, placement: Mirrored) -> list[int]:
         """Puts planes where they are clear, and lets paths at them interfere; the result are their numbers."""
         found: list[int] = []
         least = 0.0
-        shift = placement.middle.cpu().float() - self.middle
         while left := [k for k, number in enumerate(self.numbers) if not placement.located[number]]:
             located = placement.located[self.numbers].cpu()
-            own = torch.cat((placement.normals, placement.offsets[:, None]), 1)[self.numbers].cpu().float()
-            own[:, 3] += own[:, :3] @ shift
+            own = seen_from(placement.planes[self.numbers].cpu(), self.middle).float()
             planes = torch.where(located[:, None], own, self.start)
             passing = self.passing(placement, planes)
             is_unknown = self.known is None and not located.any()
@@ -116,12 +114,10 @@ class LevelSearch(LagSearch):
                 break
             if is_unknown:
                 placement.log_bandwidth.fill_(math.log(self.bandwidth))
-            plane = plane.to(placement.origin)
-            placement.place(self.numbers[k], plane[:3], float(plane[3] - plane[:3] @ shift.to(plane)))
+            placement.place(self.numbers[k], seen_from(plane.double(), -self.middle))
             placement.locate(self.numbers[k])
             found.append(self.numbers[k])
-            world = float(plane[3] + plane[:3] @ self.middle.to(plane))
-            log.info("plane (%.2f, %.2f, %.2f) at %.2f m, by %.1f standard errors", *plane[:3].tolist(), world, gain)
+            log.info("%s, by %.1f standard errors", self.words(plane), gain)
         return found
 
     def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:

@@ -17,7 +17,16 @@ from gaigs.data import Links
 from gaigs.gaussians import SH_DC, Gaussians, Placed
 from gaigs.placement import Placement
 from gaigs.placement.mirrored.obstacles import Obstacles
-from gaigs.placement.mirrored.reflections import Bounces, Folded, all_sequences, fold, images, largest_order, polarised
+from gaigs.placement.mirrored.reflections import (
+    Bounces,
+    Folded,
+    all_sequences,
+    fold,
+    images,
+    largest_order,
+    polarised,
+    seen_from,
+)
 from gaigs.placement.mirrored.walls import read_planes
 from gaigs.propagation import NEAREST, fresnel, slab
 from gaigs.query import Query
@@ -195,8 +204,8 @@ class Mirrored(Placement):
         if len(planes) > most:
             log.warning("placement.planes: %s has %d planes, the first %d are taken", self.walls, len(planes), most)
         planes = planes[:most]
-        for plane, (*normal, offset) in enumerate(planes):
-            self.place(plane, torch.stack(normal), (offset - torch.stack(normal) @ self.middle).item())
+        for number, plane in enumerate(planes):
+            self.place(number, plane)
         self.kept.copy_(self.sequences_of(torch.arange(len(planes), device=self.kept.device)))
         self.most.copy_(self.kept.sum())
 
@@ -211,24 +220,27 @@ class Mirrored(Placement):
         return self.origin[:, 3] + self.step * UNIT * self.diagonal * self.shifts[:, 3]
 
     @property
+    def planes(self) -> Float[Tensor, "w 4"]:
+        """Normals and offsets of all planes in the world's frame [m]."""
+        return seen_from(torch.cat((self.normals, self.offsets[:, None]), 1).double(), -self.middle)
+
+    @property
     def used(self) -> Int[Tensor, " k"]:
         """Planes of the kept paths."""
         found = self.sequences[self.kept].unique()
         return found[found >= 0]
 
     @torch.no_grad()
-    def place(
-        self, plane: int, normal: Float[Tensor, "3"], offset: float, material: Float[Tensor, "3"] | None = None
-    ) -> None:
-        """Puts a plane at an offset along its normal, from the middle of the room [m].
+    def place(self, number: int, plane: Float[Tensor, "4"], material: Float[Tensor, "3"] | None = None) -> None:
+        """Puts one of the ``planes``.
 
         A material is that of a slab: logarithms of the permittivity's real part over 1, of its imaginary part, and of
         the thickness [m].
         """
-        self.origin[plane] = torch.cat((functional.normalize(normal, dim=0), normal.new_tensor([offset])))
-        self.shifts[plane] = 0
+        self.origin[number] = seen_from(plane.double(), self.middle)
+        self.shifts[number] = 0
         if material is not None:
-            self.log_permittivities[plane], self.log_conductivities[plane], self.log_thicknesses[plane] = material
+            self.log_permittivities[number], self.log_conductivities[number], self.log_thicknesses[number] = material
 
     def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
         """True for each sequence of these planes alone."""

@@ -52,6 +52,12 @@ class Folded(NamedTuple):
         return strengths
 
 
+def seen_from(planes: Float[Tensor, "*w 4"], origin: Float[Tensor, "3"]) -> Float[Tensor, "*w 4"]:
+    """Planes (normal, offset along it [m]) in a frame with another origin [m]."""
+    normals, offsets = planes[..., :3], planes[..., 3:]
+    return torch.cat((normals, offsets - normals @ origin.to(normals)[:, None]), -1)
+
+
 def largest_order(planes: int, most: int) -> int:
     """Largest order for which ``all_sequences`` of two planes or more has at most ``most`` of them."""
     order, count, longest = 0, 1, planes

@@ -40,8 +40,8 @@ def build(links):
         placement = Mirrored(links.scene, 2, planes, order, obstacles)
         with torch.no_grad():
             for k, axis in enumerate(torch.eye(3)):
-                placement.place(k, axis, float(SIZE[k] - placement.middle[k]))
-                placement.place(k + 3, axis, float(-placement.middle[k]))
+                placement.place(k, torch.tensor([*axis, SIZE[k]]))
+                placement.place(k + 3, torch.tensor([*axis, 0.0]))
             placement.log_permittivities.fill_(np.log(PERMITTIVITY.real - 1))
             placement.log_conductivities.fill_(np.log(-PERMITTIVITY.imag))
             placement.log_extents.fill_(np.log(1e3))
@@ -53,7 +53,7 @@ def build(links):
 def add(placement, normal, offset):
     """Puts the seventh plane somewhere, and keeps all paths."""
     with torch.no_grad():
-        placement.place(6, torch.tensor(normal), offset - float(torch.tensor(normal) @ placement.middle))
+        placement.place(6, torch.tensor([*normal, offset]))
         placement.kept.fill_(True)
     return placement
 

@@ -12,7 +12,7 @@ from gaigs.data import Split
 from gaigs.geometry import Pose
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.placement.mirrored.lag_search import MATERIAL, Found, LagSearch
-from gaigs.placement.mirrored.reflections import all_sequences
+from gaigs.placement.mirrored.reflections import all_sequences, seen_from
 from gaigs.propagation import fresnel
 from gaigs.query import Query
 from gaigs.task.spectrum import Spectrum
@@ -36,14 +36,10 @@ def search():
     ones = lambda labels, query: (torch.ones(len(labels), count, dtype=torch.complex128), torch.zeros(len(labels)))
     made = LagSearch(links, query.frequencies, ones, 2)
     own = made.receivers[0]
-    lags = own.sums(*own.paths(shifted(WALLS, -made.middle), all_sequences(3, 2)), 0.0)
+    lags = own.sums(*own.paths(seen_from(WALLS, made.middle), all_sequences(3, 2)), 0.0)
     made.receivers = [replace(own, lags=7 * lags)]
     made.bandwidth = 0.0
     return made
-
-
-def shifted(planes, by):
-    return torch.cat((planes[:, :3], (planes[:, 3] + planes[:, :3] @ by)[:, None]), 1)
 
 
 def test_planes_off_by_decimetres_and_degrees_are_found(search):
@@ -59,7 +55,7 @@ def test_planes_off_by_decimetres_and_degrees_are_found(search):
 
 def test_a_missing_plane_is_found_though_half_of_the_links_lack_it(search):
     own = search.receivers[0]
-    without = own.sums(*own.paths(shifted(WALLS[:2], -search.middle), all_sequences(2, 2)), 0.0)
+    without = own.sums(*own.paths(seen_from(WALLS[:2], search.middle), all_sequences(2, 2)), 0.0)
     search.receivers = [replace(own, lags=torch.cat((own.lags[:75], 7 * without[75:])))]
     found = search.run(WALLS[:2], 0.0, 3)
     assert len(found) == 3

@@ -65,7 +65,7 @@ def room(bandwidth, noise=1.0, is_silent=False, seed=0):
     torch.manual_seed(0)
     placement = MirroredSplatting(links.scene, placement={"name": "mirrored", "obstacles": 0}).placement
     for k, plane in enumerate(start):
-        placement.place(k, plane[:3], float(plane[3] - plane[:3] @ placement.middle))
+        placement.place(k, plane)
     placement.kept.copy_(placement.sequences_of(torch.arange(3)))
     search = LevelSearch(links, query.frequencies, 0 * links.labels, start, [0, 1, 2], 2)
     placement.enable_phases(search.wavelength)

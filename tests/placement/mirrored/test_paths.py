@@ -44,7 +44,7 @@ def walled(placement):
             axis, side = divmod(wall, 2)
             normal = torch.eye(3)[axis] * (1 if side else -1)
             offset = ROOM.size[axis] if side else 0.0
-            placement.place(wall, normal, float(offset - normal @ placement.middle))
+            placement.place(wall, torch.tensor([*normal, offset]))
             epsilon = permittivity(material, FREQUENCY)
             placement.log_permittivities[wall] = math.log(epsilon.real - 1)
             placement.log_conductivities[wall] = math.log(-epsilon.imag)
@@ -144,9 +144,10 @@ def test_a_plane_moves_and_its_paths_are_dropped():
     placement = make(planes=7)
     with torch.no_grad():
         placement.shifts.normal_()
-    placement.place(2, torch.tensor([0.0, 3.0, 4.0]), 1.5)
-    torch.testing.assert_close(placement.normals[2], torch.tensor([0.0, 0.6, 0.8]))
-    assert placement.offsets[2] == 1.5
+    plane = torch.tensor([0.0, 0.6, 0.8, 1.5])
+    placement.place(2, plane)
+    torch.testing.assert_close(placement.planes[2].float(), plane)
+    assert (placement.offsets[2] - 1.5 + plane[:3] @ placement.middle).abs() < 1e-6
     placement.kept &= placement.sequences_of(torch.tensor([0, 2]))
     assert placement.used.tolist() == [0, 2]
     kept = sorted(map(tuple, placement.sequences[placement.kept].tolist()))
