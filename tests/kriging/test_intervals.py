@@ -192,14 +192,17 @@ def test_look_ups_are_calibrated_by_all_known_links(validation):
     assert scores["mean"]["calibration_links"] > 900
 
 
-def test_folds_state_deviations_with_the_hyperparameters_of_all_links(monkeypatch):
-    links = gaigs.links("synthetic_rssi", transmitters=30, order=0)
+@pytest.mark.parametrize("data", ["synthetic_rssi", "synthetic_csi"])
+def test_folds_state_deviations_with_the_hyperparameters_of_all_links(monkeypatch, data):
+    links = gaigs.links(data, transmitters=30, order=0)
     model, spreads, stating = gaigs.train("gaussian_process", links), evaluation.spreads, []
     monkeypatch.setattr(evaluation, "spreads", lambda one, *rest: stating.append(one) or spreads(one, *rest))
     evaluation.calibrated(model, links)
     assert len(stating) == 5
     for one in stating:
-        torch.testing.assert_close(one.scalar[0].logarithms, model.scalar[0].logarithms, rtol=0, atol=0)
+        assert one.process == model.process or one.scalar
+        for process, whole in zip(one.scalar, model.scalar, strict=True):
+            torch.testing.assert_close(process.logarithms, whole.logarithms, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(("level", "need"), [(0.9, 9), (0.8, 4), (0.5, 1), (0.99, 99)])

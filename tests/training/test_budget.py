@@ -64,10 +64,10 @@ class Turned(Plane):
 def train(links, tmp_path, monkeypatch):
     """Trains by a clock; gives the trainer."""
 
-    def train(clock, module=None, steps=-1, resume=None, **options):
+    def train(clock, module=None, steps=-1, resume=None, searched=0.0, **options):
         monkeypatch.setattr(budget_module, "time", clock)
         given = {"max_steps": steps, "max_time": "00:00:00:10", "val_check_interval": "00:00:00:04"} | options
-        given, budget = make_budget(given)
+        given, budget = make_budget(given, searched)
         del given["max_steps"]
         module = module or make_module(links)
         keep = KeepBest(tmp_path / "best.ckpt", None), KeepLast(tmp_path / "last.ckpt", every=math.inf)
@@ -104,6 +104,16 @@ def test_rates_fall_with_the_time(train, links):
     train(clock, module)
     share = [0, *(k / 10 for k in range(9))]  # as of the end of the step before
     assert clock.rates == pytest.approx([0.01**done for done in share])
+
+
+@pytest.mark.parametrize(("searched", "steps"), [(3.0, 7), (5.0, 5), (30.0, 5)])
+def test_a_search_counts_but_leaves_half_of_the_time(train, links, searched, steps):
+    clock = Clock()
+    module = make_module(links, learning_rates={"slope": 1.0, "network": 0.5}, schedule={"warmup": 0, "final": 0.01})
+    trainer = train(clock, module, searched=searched)
+    assert trainer.global_step == steps
+    assert trainer.callbacks[1].seconds == searched + steps
+    assert clock.rates == pytest.approx([0.01 ** (k / steps) for k in (0, *range(steps - 1))])
 
 
 def test_of_steps_and_time_the_larger_share_counts(train, links):

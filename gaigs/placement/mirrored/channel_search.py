@@ -373,22 +373,6 @@ class ChannelSearch(PlaneSearch):
 
         return self.descend(loss, planes, [], steps, rate)[0]
 
-    @torch.enable_grad()
-    def descend(
-        self, loss, planes: Float[Tensor, "w 4"], others: list[Tensor], steps: int, rate: float
-    ) -> list[Tensor]:
-        """Adam on planes and on other parameters of ``loss``."""
-        moving, *others = (part.clone().requires_grad_() for part in (planes, *others))
-        now = lambda: torch.cat((functional.normalize(moving[:, :3], dim=1), moving[:, 3:]), 1)
-        optimizer = torch.optim.Adam([{"params": [moving]}, {"params": others}])
-        for step in range(steps):
-            for group, highest in zip(optimizer.param_groups, (rate, 2e-2), strict=True):
-                group["lr"] = highest * 0.03 ** (step / steps)
-            optimizer.zero_grad()
-            loss(now(), *others).backward()
-            optimizer.step()
-        return [part.detach() for part in (now(), *others)]
-
     # --- phases ---
 
     def resolve(self, planes: Float[Tensor, "w 4"]) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:

@@ -24,7 +24,6 @@ from gaigs.placement.mirrored.reflections import (
     images,
     polarised,
     reflect,
-    reflection_points,
     seen_from,
     square_normals,
     tangents,
@@ -96,6 +95,10 @@ class ReceiverLags:
     def some(self, index: object) -> "ReceiverLags":
         """The same of some links."""
         return replace(self, places=self.places[index], lags=self.lags[index])
+
+    @property
+    def position(self) -> Float[Tensor, "3"]:
+        return self.pose.position
 
     @property
     def wavenumber(self) -> float:
@@ -497,11 +500,6 @@ class LagSearch(PlaneSearch):
         best = best if is_sure(least[0] - least[best]) else 0
         return Found(trials[best], self.opened(found.open, k + 1, errors[best] < blocked), least[best])
 
-    def pivot(self, plane: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
-        """Mean point at which a plane reflects [m]: turned about it, a plane changes the lengths least."""
-        ends = [(part.places, part.pose.position.expand_as(part.places)) for part in self.receivers]
-        return torch.cat([reflection_points(*pair, plane[None])[:, 0] for pair in ends]).mean(0)
-
     def peaks(
         self, waves: list[tuple[Tensor, Tensor]], normal: Float[Tensor, "3"], plane: Float[Tensor, "4"]
     ) -> list[Peak]:
@@ -532,27 +530,11 @@ class LagSearch(PlaneSearch):
                 kept.append(peak)
         return kept
 
-    @torch.enable_grad()
-    def polish(self, found: Found, steps: int = 40, rate: float = 3e-3) -> Float[Tensor, "w 4"]:
-        """Descends on the error at every second link with all planes, which turn about their pivots."""
-        planes, sequences = found.planes, self.sequences(found.planes)
-        pivots = torch.stack([self.pivot(plane) for plane in planes])
-        heights = planes[:, 3] - (planes[:, :3] * pivots).sum(1)
-        axes = torch.stack([torch.stack(tangents(normal)) for normal in planes[:, :3]])
-        shifts = torch.zeros(len(planes), 3, requires_grad=True)
-
-        def now() -> Float[Tensor, "w 4"]:
-            # Lengths change by about twice a shift [m], and by some metres times a turn [rad].
-            normals = functional.normalize(planes[:, :3] + 0.4 * (shifts[:, 1:, None] * axes).sum(1), dim=1)
-            return torch.cat((normals, ((normals * pivots).sum(1) + heights + shifts[:, 0])[:, None]), 1)
-
-        optimizer = torch.optim.Adam([shifts])
-        for step in range(steps):
-            optimizer.param_groups[0]["lr"] = rate * 0.05 ** (step / steps)
-            optimizer.zero_grad()
-            self.errors(now(), found.open, sequences, every=2).mean().backward()
-            optimizer.step()
-        return now().detach()
+    def polish(self, found: Found) -> Float[Tensor, "w 4"]:
+        """Descends on the error at every second link with all planes."""
+        sequences = self.sequences(found.planes)
+        loss = lambda planes: self.errors(planes, found.open, sequences, every=2).mean()
+        return self.descend(loss, found.planes, [], 40, 3e-3)[0]
 
 
 def is_sure(gains: Float[Tensor, " b"]) -> bool:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from gaigs.placement.mirrored.reflections import seen_from
+from gaigs.placement.mirrored.reflections import reflection_points, seen_from, tangents
 
 
 class PlaneSearch:
@@ -16,6 +16,8 @@ class PlaneSearch:
 
     Args:
         points: Transmitters and receivers (n, 3) [m].
+
+    A search has ``receivers``, each with its ``position`` and the ``places`` of its transmitters about the middle.
 
     Attributes:
         middle: Of the points (3,) [m].
@@ -83,3 +85,32 @@ class PlaneSearch:
             if len(found) < 3 and not any(self.alike(tried[number, None], plane) for plane in others):
                 found.append((tried[number], highest[number].item()))
         return found
+
+    def pivot(self, plane: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
+        """Mean point at which a plane reflects [m]: turned about it, a plane changes the lengths least."""
+        ends = [(part.places, part.position.expand_as(part.places)) for part in self.receivers]
+        return torch.cat([reflection_points(*pair, plane[None])[:, 0] for pair in ends]).mean(0)
+
+    @torch.enable_grad()
+    def descend(
+        self, loss: Callable[..., Tensor], planes: Float[Tensor, "w 4"], others: list[Tensor], steps: int, rate: float
+    ) -> list[Tensor]:
+        """Adam on planes, which turn about their pivots, and on other parameters of a loss; ``rate`` in [m] a step."""
+        pivots = torch.stack([self.pivot(plane) for plane in planes])
+        heights = planes[:, 3] - (planes[:, :3] * pivots).sum(1)
+        axes = torch.stack([torch.stack(tangents(normal)) for normal in planes[:, :3]])
+        shifts, *others = (part.clone().requires_grad_() for part in (0 * planes[:, :3], *others))
+
+        def now() -> Float[Tensor, "w 4"]:
+            # Lengths change by about twice a shift [m], and by some metres times a turn [rad].
+            normals = functional.normalize(planes[:, :3] + 0.4 * (shifts[:, 1:, None] * axes).sum(1), dim=1)
+            return torch.cat((normals, ((normals * pivots).sum(1) + heights + shifts[:, 0])[:, None]), 1)
+
+        optimizer = torch.optim.Adam([{"params": [shifts]}, {"params": others}])
+        for step in range(steps):
+            for group, highest in zip(optimizer.param_groups, (rate, 2e-2), strict=True):
+                group["lr"] = highest * 0.03 ** (step / steps)
+            optimizer.zero_grad()
+            loss(now(), *others).backward()
+            optimizer.step()
+        return [part.detach() for part in (now(), *others)]
