@@ -142,8 +142,8 @@ class MirroredSplatting(GaussianSplatting):
         adds_waves = not isinstance(self.pooling, LagPooling)
         if placement.is_bare:
             placement.enable_reflections()
-        # Of spectra early, too: each path costs time in every step.
-        if number == len(self.revisions) - 1 or (number == 1 and placement.found and not adds_waves):
+        # Of planes that a search has found early, too: each path costs time in every step.
+        if number == len(self.revisions) - 1 or (number == 1 and placement.found):
             return prune(placement, [batch for batch in (train, validation) if batch is not None], loss)
         if number < 2 and not adds_waves:
             return "planes stay where they are"
