@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gaigs.data import Links, Parts
-from gaigs.data.readings import gateway, loud_remark, to_dbm
+from gaigs.data.readings import carriers_of, gateway, loud_remark, to_dbm
 from gaigs.io import tables
 from gaigs.io.yaml import read_mapping, to_position
 from gaigs.query import Query
@@ -23,7 +23,7 @@ NOT_HEARD = -100.0
 
 
 @register("data", "nerf2_rssi")
-def read(root: str | Path) -> Links:
+def read(root: str | Path, frequency: float | None = None) -> Links:
     """A data set from its folder: one link for each reading that a gateway heard.
 
     Readings of -100 dBm were not heard. They, and gateways that heard nothing, are left out and counted in the remarks.
@@ -32,6 +32,7 @@ def read(root: str | Path) -> Links:
     Args:
         root: Folder with ``tx_pos.csv``, ``gateway_rssi.csv``, ``gateway_position.yml``, for the official split
             ``train_index.txt`` and ``test_index.txt``, and optionally ``layout.csv``.
+        frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -65,7 +66,7 @@ def read(root: str | Path) -> Links:
         remarks += f", and so are the gateways that heard nothing: {', '.join(silent)}"
     remarks += loud_remark(dbm[heard].tolist())
     return Links(
-        query=Query(torch.tensor(positions)[rows], receivers),
+        query=Query(torch.tensor(positions)[rows], receivers, carriers_of(frequency, len(rows))),
         receivers=tuple(gateway(names[k], gateways[names[k]]) for k in present.tolist()),
         labels=dbm[heard].float(),
         task=Rssi(),

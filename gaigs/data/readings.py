@@ -12,6 +12,7 @@ from torch import Tensor
 from gaigs.antenna import Receiver
 from gaigs.geometry import Pose
 from gaigs.io.tables import Rows, to_numbers
+from gaigs.query import check_carrier
 
 QUIETEST, LOUDEST = -150.0, 30.0
 """Bounds of readings [dBm]: others are another unit, a lost sign or a mark of "not heard" such as 100."""
@@ -64,3 +65,11 @@ def loud_remark(levels: Iterable[float]) -> str:
     """The remark that counts levels of 0 dBm or more: many tables mean "not heard" by 0."""
     count = sum(level >= 0 for level in levels)
     return f"; {count} readings of 0 dBm or more are taken for levels" if count else ""
+
+
+def carriers_of(frequency: float | None, count: int) -> Float[Tensor, " n"] | None:
+    """The carrier of ``count`` readings [Hz]; None if it is unknown."""
+    if frequency is None:
+        return None
+    check_carrier("frequency", frequency)
+    return torch.full((count,), frequency, dtype=torch.float64)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from gaigs.data import Links
-from gaigs.data.readings import gateway, loud_remark, to_dbm
+from gaigs.data.readings import carriers_of, gateway, loud_remark, to_dbm
 from gaigs.io import tables
 from gaigs.io.files import write_text
 from gaigs.query import Query
@@ -24,7 +24,11 @@ QUIETEST = -200.0
 
 @register("data", "rssi_csv")
 def read(
-    file: str | Path, layout: str | Path | None = None, fixed: str | None = None, not_heard: float = -100.0
+    file: str | Path,
+    layout: str | Path | None = None,
+    fixed: str | None = None,
+    not_heard: float = -100.0,
+    frequency: float | None = None,
 ) -> Links:
     """A data set from a table with a heading, one reading a line: one link for each reading that was heard.
 
@@ -39,6 +43,7 @@ def read(
         layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; None for no walls.
         fixed: End that stands still, ``tx`` or ``rx``; None for the end with fewer places, the receiver in a tie.
         not_heard: Value of readings that were not heard [dBm]; all others lie in [-200, 30].
+        frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -72,7 +77,7 @@ def read(
     if ignored:
         remarks += f"; columns ignored: {', '.join(ignored)}"
     return Links(
-        query=Query(transmitters, receivers),
+        query=Query(transmitters, receivers, carriers_of(frequency, len(receivers))),
         receivers=tuple(gateway(f"{fixed}{k + 1}", places[k]) for k in present.tolist()),
         labels=torch.tensor(dbm)[heard],
         task=Rssi(),

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from gaigs.data import Links, shortened
 from gaigs.data.maps import to_utm
-from gaigs.data.readings import LOUDEST, QUIETEST, gateway, loud_remark, marks_of
+from gaigs.data.readings import LOUDEST, QUIETEST, carriers_of, gateway, loud_remark, marks_of
 from gaigs.geometry import FAR, Frame
 from gaigs.io import tables
 from gaigs.io.yaml import read_mapping, to_vector
@@ -94,6 +94,7 @@ def read(
     height: float = 1.0,
     storey: float = 3.0,
     epsg: int | None = None,
+    frequency: float | None = None,
 ) -> Links:
     """A data set from a wide table: one link for each gateway that a place hears.
 
@@ -113,6 +114,7 @@ def read(
         storey: Height of a storey [m], for a column ``floor``.
         epsg: System of the coordinates, e.g. 32632 or 3857; None: WGS 84 for degrees, none for metres. Coordinates of
             another system than UTM are converted to it, which takes ``gaigs[maps]``.
+        frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -176,7 +178,7 @@ def read(
     ]
     labels = torch.from_numpy(means[counts > 0]).float()
     return Links(
-        query=Query(torch.tensor(places)[rows], torch.from_numpy(receivers)),
+        query=Query(torch.tensor(places)[rows], torch.from_numpy(receivers), carriers_of(frequency, len(rows))),
         receivers=tuple(gateway(name, stands.get(name, [0.0, 0.0, 0.0])) for name in names),
         labels=labels,
         task=Rssi(),

@@ -172,7 +172,8 @@ class MirroredSplatting(GaussianSplatting):
         placement, used = self.placement, self.placement.used
         if placement.walls:
             return placement.planes[used].cpu()
-        straight = torch.cat((placement.normals[used].round(), placement.offsets[used, None]), 1)
+        normals = (placement.normals[used] @ placement.turn).round() @ placement.turn.mT
+        straight = torch.cat((normals, placement.offsets[used, None]), 1)
         return seen_from(straight.double(), -placement.middle).cpu()
 
     def _find_planes(self, search: LagSearch) -> None:

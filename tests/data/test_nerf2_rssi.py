@@ -13,8 +13,8 @@ from gaigs.testing import check_data
 OFFICIAL = {"name": "official", "validation": 0}
 
 
-def read(folder, split=OFFICIAL):
-    return load({"name": "nerf2_rssi", "root": str(folder)}, split)
+def read(folder, split=OFFICIAL, **options):
+    return load({"name": "nerf2_rssi", "root": str(folder), **options}, split)
 
 
 def named(links, index=slice(None)):
@@ -42,6 +42,10 @@ def test_every_reading_that_was_heard_is_a_link(rssi_folder):
     assert links.edges.shape == (0, 2, 3)
     assert links.remarks == "12 readings of 6 rows at 3 gateways; 6 of -100 dBm were not heard and are left out"
     check_data(links)
+
+
+def test_a_carrier_is_that_of_all_readings(rssi_folder):
+    assert read(rssi_folder, frequency=2.44e9).query.frequencies.unique().tolist() == [2.44e9]
 
 
 def test_a_gateway_that_heard_nothing_is_left_out(rssi_folder):

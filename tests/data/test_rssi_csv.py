@@ -85,6 +85,12 @@ def test_the_fixed_end_can_be_chosen(file):
     assert [receiver.name for receiver in tie.receivers] == ["rx1", "rx2"]
 
 
+def test_a_carrier_is_that_of_all_readings(file):
+    assert read(file, frequency=2.44e9).query.frequencies.tolist() == [2.44e9] * 6
+    with pytest.raises(ValueError, match="frequency must be a carrier in Hz"):
+        read(file, frequency=2.44)
+
+
 def test_only_the_mark_is_not_heard(file):
     file.write_text(FORTH.replace("-53", "-120.5").replace("-43", "-200"))
     links = read(file)

@@ -71,6 +71,10 @@ def test_surveys_of_any_form_are_the_same_links(survey, text):
     torch.testing.assert_close(links.query.transmitters[0], torch.cat((first, torch.ones(1))))
 
 
+def test_a_carrier_is_that_of_all_readings(survey):
+    assert survey(table(), frequency=2.44e9).query.frequencies.unique().tolist() == [2.44e9]
+
+
 def test_degrees_become_metres_of_utm(survey):
     pyproj = pytest.importorskip("pyproj")
     columns = np.column_stack((48.13860 + PLACES[:, 1] / 111195, 11.57360 + PLACES[:, 0] / 74260))

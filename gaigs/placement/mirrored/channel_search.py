@@ -50,6 +50,10 @@ by 0.14 and more. Two tilted planes may share what one true plane explains."""
 MARGIN = 0.3
 """Largest distance of a plane from all transmitters and receivers [diagonals of the room]."""
 
+CELLS = 64, 40
+"""Most steps of the periodogram over offset and over each tilt, on either side: they follow the wavelength, and the
+cells of all three its cube. At 60 GHz they reach 2 cm, and 0.004 rad in a room of 10 m."""
+
 FEWEST = 8
 """Fewest numbers of a channel in which planes can be searched: one path explains any single number."""
 
@@ -447,11 +451,9 @@ class ChannelSearch(PlaneSearch):
         normal, offset, sequences = planes[k, :3], planes[k, 3], self.sequences(planes)
         across = tangents(normal)
         steps = min(self.wavelength / 16, reach / 4), min(self.wavelength / 5 / self.diagonal, tilt / 4)
-        grids = [
-            torch.arange(-round(r / s), round(r / s) + 1).double() * s
-            for r, s in zip((reach, tilt), steps, strict=True)
-        ]
-        grids = [grids[0], grids[1], grids[1]]
+        counts = (min(round(r / s), most) for r, s, most in zip((reach, tilt), steps, CELLS, strict=True))
+        offset_grid, tilt_grid = (s * torch.arange(-n, n + 1).double() for n, s in zip(counts, steps, strict=True))
+        grids = [offset_grid, tilt_grid, tilt_grid]
 
         def moved(q: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
             turned = functional.normalize(normal + q[1] * across[0] + q[2] * across[1], dim=0)

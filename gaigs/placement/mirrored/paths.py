@@ -38,6 +38,12 @@ log = logging.getLogger(__name__)
 BOX = 6
 """Planes at the start: one beyond each face of the box that holds transmitters and receivers."""
 
+MARGIN = 0.04
+"""Distance of these planes from the box [diagonals]."""
+
+SMALLER, WIDTH = 0.85, 0.25
+"""Largest area of a turned box over that along the world's axes, and its least width over its length."""
+
 TILT = 0.05
 """Standard deviation of the random tilt of the first planes: parallel planes would have equal gradients."""
 
@@ -151,7 +157,8 @@ class Mirrored(Placement):
         half = (upper - lower) / 2
         self.register_buffer("middle", lower + half, persistent=False)
         self.diagonal = 2 * float(half.norm())
-        margin = 0.04 * self.diagonal
+        margin = MARGIN * self.diagonal
+        self.register_buffer("turn", torch.eye(3), persistent=False)
         faces = torch.cat((torch.eye(3), -torch.eye(3), torch.eye(3).repeat(-(-(planes - BOX) // 3), 1)))[:planes]
         offsets = torch.cat((half + margin, half + margin, torch.zeros(planes - BOX)))
         normals = faces + TILT * torch.randn(planes, 3)
@@ -196,8 +203,15 @@ class Mirrored(Placement):
         self.holds, self.held, self.tried = False, None, None
 
     def fit(self, links: Links) -> None:
-        """Starts from the user's walls, if there are any."""
+        """Starts from the user's walls, or turns the faces of the box as the places lie."""
         if self.walls is None:
+            points = torch.cat((links.query.transmitters[links.split.train], self.scene.positions(self.middle).cpu()))
+            self.turn = upright_turn(points).to(self.origin)
+            if not torch.equal(self.turn, torch.eye(3).to(self.turn)):
+                faces = torch.cat((self.turn.mT, -self.turn.mT))
+                farthest = ((points.to(self.origin) - self.middle) @ faces.mT).amax(0)
+                self.origin[:BOX, :3] = self.origin[:BOX, :3] @ self.turn.mT
+                self.origin[:BOX, 3] = farthest + MARGIN * self.diagonal
             return
         planes = read_planes(Path(self.walls), *self.box).to(self.origin)
         most = len(self.origin)
@@ -461,3 +475,22 @@ def _beside(placed: Placed, gaussians: Gaussians) -> Placed:
         coherences=torch.cat((placed.coherences, ones.new_zeros(free))),
         bandwidth=placed.bandwidth,
     )
+
+
+def upright_turn(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
+    """Rotation about z to the axes of the upright box that holds all points and has the least area.
+
+    The box along the world's axes is kept unless the other is clearly smaller, and no strip: places along a line say
+    nothing of the room's walls.
+    """
+    angles = torch.arange(0, 90, dtype=torch.float64).deg2rad()
+    cos, sin = angles.cos(), angles.sin()
+    axes = torch.stack((torch.stack((cos, -sin), 1), torch.stack((sin, cos), 1)), 1)  # columns
+    along = points[:, :2].double() @ axes
+    edges = along.amax(1) - along.amin(1)
+    areas = edges.prod(1)
+    best = int(areas.argmin())
+    turn = torch.eye(3, dtype=torch.float64)
+    if areas[best] < SMALLER * areas[0] and edges[best].min() > WIDTH * edges[best].max():
+        turn[:2, :2] = axes[best]
+    return turn.to(points)

@@ -8,11 +8,13 @@ import torch
 from scipy.constants import speed_of_light
 
 from gaigs.antenna import Array, Receiver
+from gaigs.data import Split
 from gaigs.data.synthetic import POSE, REGION
 from gaigs.data.synthetic.image_source import Room, permittivity, trace
 from gaigs.gaussians import SH_DC
+from gaigs.model.mirrored import MirroredSplatting
 from gaigs.placement.mirrored import paths
-from gaigs.placement.mirrored.paths import Mirrored
+from gaigs.placement.mirrored.paths import Mirrored, upright_turn
 from gaigs.query import Query
 from gaigs.scene import Scene
 from gaigs.task.csi import Csi
@@ -138,6 +140,35 @@ def test_initial_planes_lie_beyond_the_faces_of_the_box():
         assert placement.normals[plane, axis] * sign > 0.95
         beyond = placement.offsets[plane] - sign * (corners[0 if sign < 0 else 1] - placement.middle)[axis]
         assert 0 < beyond < 0.1 * placement.diagonal
+
+
+TURNED = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.5, 0], [0.5, 0, 0], [0, 0, 0]]))
+"""Rotation about z by 0.5 rad."""
+
+
+@pytest.mark.parametrize(
+    ("edges", "expected"),
+    [((6.0, 4.0, 2.0), TURNED), ((6.0, 0.3, 2.0), torch.eye(3)), ((0.0, 0.0, 2.0), torch.eye(3))],
+    ids=["room", "strip", "one place"],
+)
+def test_the_first_faces_turn_as_the_places_lie(edges, expected):
+    places = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(edges)
+    torch.testing.assert_close(upright_turn(places), torch.eye(3))
+    turn = upright_turn(places @ TURNED.mT)
+    torch.testing.assert_close(turn.mT @ expected, torch.eye(3), atol=0.03, rtol=0)
+
+
+def test_turned_faces_hold_all_places():
+    links = example_links("rssi")
+    places = (torch.rand(len(links), 3) * torch.tensor([6.0, 4.0, 2.0])) @ TURNED.mT
+    links = replace(links, query=replace(links.query, transmitters=places))
+    links = replace(links, split=Split("all", torch.arange(len(links)), *torch.zeros(2, 0).long()))
+    model = MirroredSplatting(links.scene)
+    model.placement.fit(links)
+    planes = model.placement.planes[:6]
+    assert (places.double() @ planes[:, :3].mT < planes[:, 3] + 0.3).all()
+    straight = model._start()
+    assert (straight[:, :3] @ TURNED.double()).abs().max(1).values.min() > 0.99
 
 
 def test_a_plane_moves_and_its_paths_are_dropped():
