@@ -4,7 +4,7 @@
     python benchmarks/learnt_room.py runs/room  a finished run of channels by mirrored Gaussians
 
 The room is exported as a scene of Mitsuba, loaded by Sionna RT, and traced at the test places, with as many reflections
-as the model has and up to ``DEPTH`` crossings of furniture. Each receiver's channels have the gain that stands in the
+as the model's paths have and up to ``DEPTH`` crossings of furniture. Each receiver's channels have the gain that stands in the
 scene's file; nothing is fitted to the links that are compared. Prints tables in Markdown. Needs gaigs[sionna].
 """
 
@@ -61,6 +61,7 @@ def main(folder: Path) -> None:
     model, links = model_of(folder), links_of(folder)
     own = model.trend if isinstance(model, Kriging) else model
     placement, query, carrier = own.placement, links.query[links.split.test], float(links.scene.frequencies[0])
+    bounces = int((placement.sequences[placement.kept] >= 0).sum(1).max())
     lines = [("plane", "normal", "offset [m]", "share of the power", "material", "slab")]
     chosen = materials(placement, own.traced, carrier)
     for plane in facts(placement, own.traced)["planes"]:
@@ -73,7 +74,7 @@ def main(folder: Path) -> None:
     print(markdown(lines) + "\n")
     with tempfile.TemporaryDirectory() as scratch:
         gaigs.export(model, f"{scratch}/room.xml")
-        traced = trace(Path(scratch) / "room.xml", links, query, placement.order)
+        traced = trace(Path(scratch) / "room.xml", links, query, bounces)
     if own.pooling.array_sign > 0:  # the data's time dependence is exp(-j omega t)
         traced = traced.conj()
     measured, plain = links.labels[links.split.test], own.predict(query)
