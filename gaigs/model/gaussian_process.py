@@ -78,7 +78,7 @@ class GaussianProcess(Model):
     @torch.no_grad()
     def _fit(self, links: Links, chooses: bool) -> None:
         self.links, self.known = links, known_links(links)
-        for trend in self.trends:
+        for trend in self.trends if chooses else (self.trend,):
             trend.fit(links)
         if self.scalar:
             self._fit_scalar(thinned(links, LIMIT), chooses)
@@ -106,13 +106,13 @@ class GaussianProcess(Model):
     def _fit_scalar(self, links: Links, chooses: bool) -> None:
         index = torch.cat(known_links(links))
         query, process = links.query[index], self.scalar[0]
-        residuals = [(links.labels[index] - trend(Batch(query)).value).double() for trend in self.trends]
+        left = lambda trend: (links.labels[index] - trend(Batch(query)).value).double()
         known, folds = (coordinates(self.scene, query, 1.0), query.receivers), folds_of(links, index)
         if chooses:
-            self.chosen = process.fit(*known, residuals, folds)
+            self.chosen = process.fit(*known, [left(trend) for trend in self.trends], folds)
         else:
-            process.refit(*known, residuals[self.chosen], folds)
-        process.solve(*known, residuals[self.chosen])
+            process.refit(*known, left(self.trend), folds)
+        process.solve(*known, left(self.trend))
 
     @property
     def trend(self) -> Model:

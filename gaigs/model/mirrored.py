@@ -168,9 +168,9 @@ class MirroredSplatting(GaussianSplatting):
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
 
     def _start(self) -> Float[Tensor, "w 4"]:
-        """The user's walls, or the faces of the box without their tilt."""
+        """The user's walls or planes that are learnt, or the faces of the box without their tilt."""
         placement, used = self.placement, self.placement.used
-        if placement.walls:
+        if placement.walls or not placement.is_new:
             return placement.planes[used].cpu()
         normals = (placement.normals[used] @ placement.turn).round() @ placement.turn.mT
         straight = torch.cat((normals, placement.offsets[used, None]), 1)

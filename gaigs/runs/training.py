@@ -105,7 +105,7 @@ class Fitted(NamedTuple):
         models: The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
         unseen: The same, not fitted to validation links; empty for a model without a training.
         start: Number of Gaussians before the training.
-        seconds: Duration of the search for planes and of the training; None without one.
+        seconds: Duration of ``Model.fit``, as of a search for planes, and of the training; None without one.
         kriging_seconds: Duration of kriging; None without it.
     """
 

@@ -23,7 +23,7 @@ class Budget(Callback):
     Args:
         max_time: Of the search and the training [s]; None if steps alone end it. The training has half of it or more.
         every: Least time between validations [s], which take at most a fifth of the training; None: by steps.
-        searched: Duration of the search before the training [s].
+        searched: Duration of the search before the training [s]; of several processes the first one's counts.
 
     Attributes:
         share: Share of the training's time spent, the same in all processes; 0 without ``max_time``.
@@ -52,9 +52,11 @@ class Budget(Callback):
 
     def load_state_dict(self, state: dict) -> None:
         self.spent, self.share, self.is_due = state["seconds"], state["share"], state["is_due"]
-        self.began, self.validated, self.searched = state["began"], state["validated"], state["searched"]
+        self.began, self.validated, self.searched = state["began"], state["validated"], state.get("searched", 0.0)
 
     def on_fit_start(self, trainer, module) -> None:
+        own = self.searched, self.spent, self.began, self.validated
+        self.searched, self.spent, self.began, self.validated = trainer.strategy.broadcast(own)
         self._stop_in_time(trainer)  # a run that was killed once its time was up
 
     def on_train_start(self, trainer, module) -> None:

@@ -199,6 +199,13 @@ def test_a_training_whose_time_is_up_takes_no_step_more(train, tmp_path):
     assert (trainer.global_step, again.losses, again.validated) == (10, [], [])
 
 
+def test_the_search_of_the_first_process_counts():
+    _, budget = make_budget({"max_time": "00:00:00:10"}, 4.0)
+    trainer = SimpleNamespace(strategy=SimpleNamespace(broadcast=lambda own: (1.0,) * len(own)), should_stop=False)
+    budget.on_fit_start(trainer, None)
+    assert (budget.searched, budget.seconds, budget.limit) == (1.0, 1.0, 10.0)
+
+
 def test_the_clock_of_the_first_process_decides():
     """This process's clock is ahead, the first one's is not."""
     _, budget = make_budget({"max_time": "00:00:00:10", "val_check_interval": "00:00:00:05"})

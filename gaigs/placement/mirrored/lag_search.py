@@ -62,6 +62,9 @@ STRANGE = 0.01
 """Share of a spectrum that its array cannot explain, from which on the search is left out. Measured spectra have 0.001,
 powers in place of amplitudes 0.05."""
 
+BEYOND = 0.15
+"""Largest distance of a plane from all transmitters and receivers [diagonals of the room]."""
+
 PAIRS = 16
 """Most pairs of a receiver and a carrier: each costs a periodogram."""
 
@@ -411,7 +414,7 @@ class LagSearch(PlaneSearch):
     def with_more(self, found: Found, most: int) -> Found:
         """Further planes, one after the other, as long as the errors fall by ``GAIN``."""
         normals = torch.cat((fibonacci_lattice(200, 0.0, math.pi / 2).float(), torch.eye(3)))
-        grid = self.grid(normals, 60, 0.15).flatten(0, 1)
+        grid = self.grid(normals, 60, BEYOND).flatten(0, 1)
         while len(found.planes) < most:
             before, trials = self.errors(found.planes, found.open), []
             for plane in self.candidates(found, grid):

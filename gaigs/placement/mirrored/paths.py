@@ -41,8 +41,9 @@ BOX = 6
 MARGIN = 0.04
 """Distance of these planes from the box [diagonals]."""
 
-SMALLER, WIDTH = 0.85, 0.25
-"""Largest area of a turned box over that along the world's axes, and its least width over its length."""
+SMALLER, WIDTH, ENOUGH = 0.85, 0.25, 40
+"""Largest area of a turned box over that along the world's axes, its least width over its length, and fewest places:
+of 40 that fill a room along the axes chance turns next to none, of 10 a quarter."""
 
 TILT = 0.05
 """Standard deviation of the random tilt of the first planes: parallel planes would have equal gradients."""
@@ -159,10 +160,12 @@ class Mirrored(Placement):
         self.diagonal = 2 * float(half.norm())
         margin = MARGIN * self.diagonal
         self.register_buffer("turn", torch.eye(3), persistent=False)
+        self.is_new = False  # set by fit
         faces = torch.cat((torch.eye(3), -torch.eye(3), torch.eye(3).repeat(-(-(planes - BOX) // 3), 1)))[:planes]
         offsets = torch.cat((half + margin, half + margin, torch.zeros(planes - BOX)))
         normals = faces + TILT * torch.randn(planes, 3)
         self.register_buffer("origin", torch.cat((normals, offsets[:, None]), 1))
+        self.register_buffer("first", self.origin.clone(), persistent=False)
         self.register_buffer("step", torch.ones(()))
         sequences = all_sequences(planes, order)
         self.register_buffer("sequences", sequences, persistent=False)
@@ -205,13 +208,14 @@ class Mirrored(Placement):
     def fit(self, links: Links) -> None:
         """Starts from the user's walls, or turns the faces of the box as the places lie."""
         if self.walls is None:
-            points = torch.cat((links.query.transmitters[links.split.train], self.scene.positions(self.middle).cpu()))
-            self.turn = upright_turn(points).to(self.origin)
-            if not torch.equal(self.turn, torch.eye(3).to(self.turn)):
+            self.is_new = torch.equal(self.origin, self.first) and not self.shifts.any()
+            places = links.query.transmitters[links.split.train]
+            self.turn = upright_turn(places).to(self.origin)
+            if self.is_new and not torch.equal(self.turn, torch.eye(3).to(self.turn)):
                 faces = torch.cat((self.turn.mT, -self.turn.mT))
-                farthest = ((points.to(self.origin) - self.middle) @ faces.mT).amax(0)
-                self.origin[:BOX, :3] = self.origin[:BOX, :3] @ self.turn.mT
-                self.origin[:BOX, 3] = farthest + MARGIN * self.diagonal
+                points = torch.cat((places, self.scene.positions(places))).to(self.origin)
+                self.origin[:BOX, :3] = self.first[:BOX, :3] @ self.turn.mT
+                self.origin[:BOX, 3] = ((points - self.middle) @ faces.mT).amax(0) + MARGIN * self.diagonal
             return
         planes = read_planes(Path(self.walls), *self.box).to(self.origin)
         most = len(self.origin)
@@ -477,20 +481,22 @@ def _beside(placed: Placed, gaussians: Gaussians) -> Placed:
     )
 
 
-def upright_turn(points: Float[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
-    """Rotation about z to the axes of the upright box that holds all points and has the least area.
+def upright_turn(places: Float[Tensor, "n 3"]) -> Float[Tensor, "3 3"]:
+    """Rotation about z to the axes of the upright box that holds all places and has the least area.
 
     The box along the world's axes is kept unless the other is clearly smaller, and no strip: places along a line say
-    nothing of the room's walls.
+    nothing of the room's walls, nor do fewer than ``ENOUGH``.
     """
+    turn = torch.eye(3, dtype=torch.float64)
+    if len(places.unique(dim=0)) < ENOUGH:
+        return turn.to(places)
     angles = torch.arange(0, 90, dtype=torch.float64).deg2rad()
     cos, sin = angles.cos(), angles.sin()
     axes = torch.stack((torch.stack((cos, -sin), 1), torch.stack((sin, cos), 1)), 1)  # columns
-    along = points[:, :2].double() @ axes
+    along = places[:, :2].double() @ axes
     edges = along.amax(1) - along.amin(1)
     areas = edges.prod(1)
     best = int(areas.argmin())
-    turn = torch.eye(3, dtype=torch.float64)
     if areas[best] < SMALLER * areas[0] and edges[best].min() > WIDTH * edges[best].max():
         turn[:2, :2] = axes[best]
-    return turn.to(points)
+    return turn.to(places)

@@ -96,6 +96,8 @@ class PlaneSearch:
         self, loss: Callable[..., Tensor], planes: Float[Tensor, "w 4"], others: list[Tensor], steps: int, rate: float
     ) -> list[Tensor]:
         """Adam on planes, which turn about their pivots, and on other parameters of a loss; ``rate`` in [m] a step."""
+        if not len(planes):
+            return [planes, *others]
         pivots = torch.stack([self.pivot(plane) for plane in planes])
         heights = planes[:, 3] - (planes[:, :3] * pivots).sum(1)
         axes = torch.stack([torch.stack(tangents(normal)) for normal in planes[:, :3]])

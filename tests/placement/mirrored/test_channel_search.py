@@ -144,6 +144,12 @@ def test_false_plane_is_dropped(monkeypatch):
     torch.testing.assert_close(found[1], true, rtol=0, atol=0.05)
 
 
+def test_the_only_plane_may_be_false():
+    own = search(room(walls=PLANES[:0])[0])
+    planes, slabs = own.without_false(torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double(), torch.zeros(1, 3).double())
+    assert len(planes) == len(slabs) == 0
+
+
 def test_tilted_plane_is_turned_square():
     links, walls = room(walls=np.array([[1.0, 0, 0, -0.4], [0, 1.0, 0, -0.7]]))
     tilted, level = torch.tensor([[0.99, -0.13, 0.05, -0.2], [0, 0, 1.0, 3.1]]).double()

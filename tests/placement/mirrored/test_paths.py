@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.constants import speed_of_light
 
+import gaigs
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Split
 from gaigs.data.synthetic import POSE, REGION
@@ -159,8 +160,9 @@ def test_the_first_faces_turn_as_the_places_lie(edges, expected):
 
 
 def test_turned_faces_hold_all_places():
-    links = example_links("rssi")
-    places = (torch.rand(len(links), 3) * torch.tensor([6.0, 4.0, 2.0])) @ TURNED.mT
+    links = gaigs.links("synthetic_rssi", transmitters=60, order=0)
+    room = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 4.0, 2.0])
+    places = (room @ TURNED.mT)[links.rows]
     links = replace(links, query=replace(links.query, transmitters=places))
     links = replace(links, split=Split("all", torch.arange(len(links)), *torch.zeros(2, 0).long()))
     model = MirroredSplatting(links.scene)
@@ -169,6 +171,17 @@ def test_turned_faces_hold_all_places():
     assert (places.double() @ planes[:, :3].mT < planes[:, 3] + 0.3).all()
     straight = model._start()
     assert (straight[:, :3] @ TURNED.double()).abs().max(1).values.min() > 0.99
+    with torch.no_grad():
+        model.placement.shifts.normal_()
+    learnt = model.placement.planes
+    model.placement.fit(links)
+    torch.testing.assert_close(model.placement.planes, learnt, rtol=0, atol=0, msg="a second fit turned them")
+    torch.testing.assert_close(model._start(), learnt[:6])
+
+
+def test_few_places_turn_no_face():
+    turned = [upright_turn(torch.rand(8, 3, generator=torch.Generator().manual_seed(seed))) for seed in range(20)]
+    assert all(torch.equal(turn, torch.eye(3)) for turn in turned)
 
 
 def test_a_plane_moves_and_its_paths_are_dropped():
