@@ -4,8 +4,8 @@
     python benchmarks/learnt_room.py runs/room  a finished run of channels by mirrored Gaussians
 
 The room is exported as a scene of Mitsuba, loaded by Sionna RT, and traced at the test places, with as many reflections
-as the model's paths have and up to ``DEPTH`` crossings of furniture. Each receiver's channels have the gain that stands in the
-scene's file; nothing is fitted to the links that are compared. Prints tables in Markdown. Needs gaigs[sionna].
+as the model's paths have and up to ``DEPTH`` crossings of furniture. Each receiver's channels have the gain that stands
+in the scene's file; nothing is fitted to the links that are compared. Prints tables in Markdown. Needs gaigs[sionna].
 """
 
 import cmath

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,15 +18,16 @@ class PlaneSearch:
     Args:
         points: Transmitters and receivers (n, 3) [m].
 
-    A search has ``receivers``, each with its ``position`` and the ``places`` of its transmitters about the middle.
-
     Attributes:
+        receivers: Each with its ``position`` and the ``places`` of its transmitters, about the middle [m].
         middle: Of the points (3,) [m].
         points: The same about the middle.
         diagonal: Of their box [m].
 
     Source: Hough, Method and means for recognizing complex patterns, 1962.
     """
+
+    receivers: list[Any]
 
     def __init__(self, points: Float[Tensor, "n 3"]):
         lower, upper = points.amin(0), points.amax(0)
