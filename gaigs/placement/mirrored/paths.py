@@ -165,7 +165,7 @@ class Mirrored(Placement):
         offsets = torch.cat((half + margin, half + margin, torch.zeros(planes - BOX)))
         normals = faces + TILT * torch.randn(planes, 3)
         self.register_buffer("origin", torch.cat((normals, offsets[:, None]), 1))
-        self.register_buffer("first", self.origin.clone(), persistent=False)
+        self.register_buffer("first", self.origin.clone(), persistent=False)  # a model that differs has learnt
         self.register_buffer("step", torch.ones(()))
         sequences = all_sequences(planes, order)
         self.register_buffer("sequences", sequences, persistent=False)

@@ -36,6 +36,7 @@ class PlaneSearch:
 
     @cached_property
     def generator(self) -> torch.Generator:
+        """Made when it is first used: a search that draws nothing leaves the training's random numbers alone."""
         return torch.Generator().manual_seed(int(torch.randint(2**31, ())))
 
     def words(self, plane: Float[Tensor, "4"]) -> str:
