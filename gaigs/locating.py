@@ -166,7 +166,7 @@ class Fingerprints:
                 logarithms = likelihoods[int(unknown_power)] + own.prior.double()
                 if step is not None:
                     order = walk(truth, step)
-                    own, logarithms = track(own, logarithms[order], step)
+                    own, logarithms = track(own, logarithms[order], step, torch.ones(len(order)).bool())
                     truth = truth[order]
                 heights = logarithms - own.prior + own.density
                 near = distances(truth.double(), own.places.double()).argmin(1)
@@ -279,7 +279,7 @@ def locate(
         model: A model with intervals; or its ``fingerprints``, which then take a few milliseconds a value.
         value: A label of each receiver (r, *shape), or those of several transmissions (n, r, *shape), scaled as the
             training labels; with one receiver also (*shape) or (n, *shape). NaN, of channels also zeros, where a
-            receiver has not heard it.
+            receiver has not heard it; of a track, a value may be unheard by all.
         links, region: As for ``fingerprints``.
         unknown_power: True if all labels of a transmission share an unknown offset [dB], or factor of amplitudes.
             Channels are always compared without their power and phase.
@@ -289,7 +289,8 @@ def locate(
             whose regions are often too small.
 
     Raises:
-        ValueError: A value has another shape than the labels, or was heard by no receiver; or an option is impossible.
+        ValueError: A value has another shape than the labels, or was heard by no receiver and is no part of a track; or
+            an option is impossible.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -308,7 +309,7 @@ def locate(
         prints = model
     else:
         prints = fingerprints(model, links, region)
-    return posterior(prints, as_fingerprints(value, prints), unknown_power, step, level)
+    return posterior(prints, as_fingerprints(value, prints, step is not None), unknown_power, step, level)
 
 
 def posterior(
@@ -329,7 +330,7 @@ def posterior(
         logarithms = log_likelihood(*squares(prints, part @ prints.axes, unknown_power), prints.degrees, prints.temper)
         own, logarithms = Candidates(prints.places, prints.prior, prints.density), logarithms + prints.prior
         if step is not None:
-            own, logarithms = track(own, logarithms, step)
+            own, logarithms = track(own, logarithms, step, ~part.isnan().all((1, 2)))
         probabilities, heights = torch.softmax(logarithms, 1), logarithms - own.prior + own.density
         order = heights.argsort(1, descending=True)
         ordered = probabilities.gather(1, order)
@@ -507,8 +508,11 @@ def received(links: Links, index: Int[Tensor, " k"]) -> tuple[Float[Tensor, "n r
     return found, places
 
 
-def as_fingerprints(value: object, prints: Fingerprints) -> Float[Tensor, "n r m"]:
-    """The fingerprints of values that a user gives; raises a ``ValueError`` for other shapes."""
+def as_fingerprints(value: object, prints: Fingerprints, is_track: bool = False) -> Float[Tensor, "n r m"]:
+    """The fingerprints of values that a user gives; raises a ``ValueError`` for other shapes.
+
+    A track may have values that no receiver has heard.
+    """
     shape, count = tuple(prints.task.shape), prints.values.shape[1]
     given = as_tensor("value", value, f"labels of {count} receivers").detach().cpu().to(prints.task.dtype)
     values = given.reshape(-1, 1, *shape) if count == 1 and given.ndim - len(shape) in (0, 1) else given
@@ -518,8 +522,9 @@ def as_fingerprints(value: object, prints: Fingerprints) -> Float[Tensor, "n r m
         raise ValueError(f"value must be {need}, got {tuple(given.shape)}")
     flat = values.reshape(*values.shape[:2], -1)
     missing = flat.isnan().any(2) | ((flat == 0).all(2) if values.is_complex() else False)
-    if missing.all(1).any():
-        raise ValueError(f"value {int(missing.all(1).int().argmax())} was heard by no receiver; leave it out")
+    silent = missing.all(1)
+    if silent.all() if is_track else silent.any():
+        raise ValueError(f"value {int(silent.int().argmax())} was heard by no receiver; leave it out")
     if not flat[~missing].isfinite().all():
         raise ValueError("value must be finite, or NaN where a receiver has not heard it")
     found = prints.task.fingerprint(values.flatten(0, 1)).unflatten(0, values.shape[:2])
@@ -648,18 +653,18 @@ def walk(places: Float[Tensor, "n 3"], step: float) -> Int[Tensor, " k"]:
 
 
 def track(
-    candidates: Candidates, logarithms: Float[Tensor, "n g"], step: float
+    candidates: Candidates, logarithms: Float[Tensor, "n g"], step: float, heard: Bool[Tensor, " n"]
 ) -> tuple[Candidates, Float[Tensor, "n j"]]:
     """An even part of the candidates, and the posterior of a track there.
 
     Posteriors of single values, ``logarithms``, still spread over ``SPREAD`` of them, so that ``KEPT`` hold them.
     """
-    spread = torch.softmax(logarithms, 1).square().sum(1).reciprocal().median()
+    spread = torch.softmax(logarithms[heard], 1).square().sum(1).reciprocal().median()
     some = torch.arange(0, len(candidates.places), max(1, int(spread / SPREAD)))
     part = Candidates(*(each[some] for each in candidates))
     # Single precision halves the time; across a room it moves the mean by less than a micrometre.
     own, places = logarithms[:, some], (part.places - part.places.mean(0)).float()
-    return part, smoothed((own - own.amax(1, keepdim=True)).float(), places, step).to(logarithms)
+    return part, smoothed((own - own.amax(1, keepdim=True)).float(), places, step, heard).to(logarithms)
 
 
 def geometric_median(places: Float[Tensor, "g 3"], probabilities: Float[Tensor, "n g"]) -> Float[Tensor, "n 3"]:
@@ -677,11 +682,20 @@ def geometric_median(places: Float[Tensor, "g 3"], probabilities: Float[Tensor, 
     return found.float()
 
 
-def smoothed(logarithms: Float[Tensor, "n g"], places: Float[Tensor, "g 3"], step: float) -> Float[Tensor, "n g"]:
-    """Posterior of each place of a track given all values, from those given each value alone: forward and backward."""
-    kept = min(KEPT, len(places))
-    best = logarithms.topk(kept, dim=1)
-    spacing = distances(places[best.indices[0]], places[best.indices[0]]).fill_diagonal_(math.inf).amin(1).median()
+def smoothed(
+    logarithms: Float[Tensor, "n g"], places: Float[Tensor, "g 3"], step: float, heard: Bool[Tensor, " n"]
+) -> Float[Tensor, "n g"]:
+    """Posterior of each place of a track given all values, from those given each value alone: forward and backward.
+
+    While no value is ``heard``, the track is where the values before and after may be.
+    """
+    known_ones, numbers = heard.nonzero()[:, 0], torch.arange(len(heard))
+    after = torch.searchsorted(known_ones, numbers).clamp_max(len(known_ones) - 1)
+    before = (torch.searchsorted(known_ones, numbers, right=True) - 1).clamp_min(0)
+    chosen = torch.maximum(logarithms[known_ones[before]], logarithms[known_ones[after]])
+    indices = chosen.topk(min(KEPT, len(places)), dim=1).indices
+    best = logarithms.gather(1, indices)
+    spacing = distances(places[indices[0]], places[indices[0]]).fill_diagonal_(math.inf).amin(1).median()
     step = math.hypot(step, spacing.item())  # candidates are no finer
 
     known: list[Tensor] = []
@@ -693,13 +707,13 @@ def smoothed(logarithms: Float[Tensor, "n g"], places: Float[Tensor, "g 3"], ste
         moves = known[2]
         return (moves @ (logarithm - logarithm.max()).exp()).log()  # above 0: each move may be a jump
 
-    forward, backward = [best.values[0]], [torch.zeros_like(best.values[0])]
-    for own, pair in zip(best.values[1:], itertools.pairwise(best.indices), strict=True):
+    forward, backward = [best[0]], [torch.zeros_like(best[0])]
+    for own, pair in zip(best[1:], itertools.pairwise(indices), strict=True):
         forward.append(own + moved(forward[-1], *pair))
-    for own, pair in zip(best.values.flip(0), itertools.pairwise(best.indices.flip(0)), strict=False):
+    for own, pair in zip(best.flip(0), itertools.pairwise(indices.flip(0)), strict=False):
         backward.append(moved(own + backward[-1], *pair))
     found = torch.stack(forward) + torch.stack(backward[::-1])
-    return torch.full_like(logarithms, -math.inf).scatter(1, best.indices, found)
+    return torch.full_like(logarithms, -math.inf).scatter(1, indices, found)
 
 
 def neighbours(

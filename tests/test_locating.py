@@ -92,7 +92,7 @@ def test_a_track_has_the_posterior_of_all_its_paths():
     rng = torch.Generator().manual_seed(0)
     places = torch.rand(4, 3, generator=rng, dtype=torch.float64)
     values, step = torch.randn(3, 4, generator=rng, dtype=torch.float64), 0.4
-    found = torch.softmax(smoothed(values, places, step), 1)
+    found = torch.softmax(smoothed(values, places, step, torch.tensor([True, False, True])), 1)
     spacing = torch.cdist(places, places).fill_diagonal_(math.inf).amin(1).median()
     size = math.hypot(step, spacing)
     expected = np.zeros((3, 4))
@@ -102,6 +102,14 @@ def test_a_track_has_the_posterior_of_all_its_paths():
             weight *= np.exp(-(((places[a] - places[b]).norm() / size) ** 2).item() / 2) + 1e-4
         expected[range(3), path] += weight
     np.testing.assert_allclose(found, expected / expected.sum(1, keepdims=True), rtol=1e-6)
+
+
+def test_a_track_goes_on_where_no_receiver_hears(rssi):
+    values = torch.tensor([[-45.0, -60.0, -55.0, -65.0]] * 2 + [[math.nan] * 4] + [[-65.0, -55.0, -60.0, -45.0]])
+    found, alone = gaigs.locate(rssi[2], values, step=0.5).mean, gaigs.locate(rssi[2], values[[0, 3]]).mean
+    ends = (alone - found[2]).norm(dim=1)
+    assert ends.sum() < 1.5 * (alone[0] - alone[1]).norm()
+    assert ends.min() > 0.1
 
 
 def test_transmitters_are_nearer_than_their_neighbours_and_in_their_regions():

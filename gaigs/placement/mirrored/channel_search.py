@@ -148,6 +148,10 @@ class ReceiverChannels:
         return (waves * gains[:, :, None]).flatten(-2)
 
 
+Room = tuple[Float[Tensor, "_ 4"], Float[Tensor, "_ 3"]]
+"""Planes, and their slabs as in ``SLABS``."""
+
+
 class ChannelSearch(PlaneSearch):
     """Planes whose images explain the training channels.
 
@@ -156,8 +160,9 @@ class ChannelSearch(PlaneSearch):
     best candidate is refined by variable projection, together with the planes before it: strengths of paths are free at
     each place, so neither phases nor blockage are assumed. Then phases count: a periodogram over offset and two tilts
     proposes planes and slabs whose reflections have like phases at all places, and the residual decides, with strengths
-    that are real and not negative. It sees delays too, so it tells planes half a wavelength apart. At last, planes that
-    explain hardly anything are dropped, and what they explained is searched anew.
+    that are real and not negative. It sees delays too, so it tells planes half a wavelength apart. Planes that explain
+    hardly anything are dropped, and what they explained is searched anew. At last the room grows along its axes, which
+    shows planes that hide behind the direct path.
 
     Args:
         links: Their training links count; of the task ``csi``.
@@ -179,64 +184,116 @@ class ChannelSearch(PlaneSearch):
         self.receivers = [receiver.about(self.middle) for receiver in heard]
         self.start = seen_from(start.double(), self.middle)
         self.wavelength = speed_of_light / float(self.receivers[0].frequencies.mean())
+        # [m] Peaks of delay profiles are off by a part of the resolution, where paths are close.
+        band = max(float(receiver.frequencies.max() - receiver.frequencies.min()) for receiver in self.receivers)
+        self.reach = max(0.07, speed_of_light / 8 / max(band, 1.0))
         # Profiles of a gigabyte at most, also in a hall with a large band.
         size = max(receiver.channels.shape[1] * self.delays(receiver) for receiver in self.receivers)
         self.many = self.drawn(min(200, 60_000_000 // size))
 
     @torch.no_grad()
-    def run(self) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
+    def run(self) -> Room:
         """Planes, first those of the start, and their slabs as in ``SLABS``."""
         planes, slabs = self.found()
         return seen_from(planes, -self.middle), slabs
 
-    def found(self) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
+    def found(self) -> Room:
         """``run`` about the middle of the room."""
         planes = self.find(self.start)
         if not len(planes):
             return planes, planes[:, :3]
         best = self.without_false(*self.resolve(self.refine(planes, 300, 5e-3)))
-        if 0 < len(best[0]) < len(planes):  # what the false ones explained is searched anew
+        if not len(best[0]):
+            return best
+        if not len(self.start) and not is_square(best[0]):  # tilted planes may stand for several upright ones
+            upright = self.without_false(*self.grown(*self.seed(best), best[0]))
+            if self.cost(upright) < self.cost(best):
+                return upright
+        if len(best[0]) < len(planes):  # what the false ones explained is searched anew
             again = self.resolve(self.refine(self.find(self.refine(best[0], 100, 1e-2)), 300, 5e-3))
-            cost = lambda found: self.left(*self.some(found[0]), *found).item() + LITTLE * len(found[0])
-            best = min(best, self.without_false(*again), key=cost)
-        return self.with_parallel(*best)
+            best = min(best, self.without_false(*again), key=self.cost)
+        return self.without_false(*self.grown(*best))
 
-    def with_parallel(
-        self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]
-    ) -> tuple[Float[Tensor, "v 4"], Float[Tensor, "v 3"]]:
-        """The planes and others parallel to them. Only offsets are searched, so fainter ones stand out from noise."""
-        while 0 < len(planes) < self.most:
-            parts, count = self.some(planes), len(planes)
-            before, found = self.left(*parts, planes, slabs).item(), []
-            lines = self.grid(torch.stack(distinct(planes[:, :3], 2e-4)), 400, BEYOND)
-            rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
-            profiles = [self.profiles(*pair) for pair in zip(self.many, rests, strict=True)]
-            for line, scores in zip(lines, self.scores(self.many, profiles, lines), strict=True):
-                for plane in planes:
-                    scores[self.alike(line, plane)] = 0
-                found += [(scores[at].item(), line[at]) for at in maxima(scores, 11)]
-            # A share of what is left lowers its log by about as much.
-            found = sorted((pair for pair in found if pair[0] > LITTLE * math.exp(before)), key=lambda pair: -pair[0])
-            trials = []
-            for _, plane in found[:4]:
-                tried = torch.cat((planes, plane[None]))
-                for moved, material in self.proposals(tried, count, 0.07, 1e-4, SLABS[::3]):
-                    both = torch.cat((planes, moved[None])), torch.cat((slabs, material[None]))
-                    trials.append((self.left(*parts, *both).item(), *both))
-            if not trials:
+    def cost(self, room: Room) -> float:
+        """What is left, and the least that each plane must explain."""
+        return self.left(*self.some(room[0]), *room).item() + LITTLE * len(room[0])
+
+    # --- planes along axes ---
+
+    def seed(self, room: Room) -> Room:
+        """The upright plane along the axes of a room that explains most alone; the room if there is none."""
+        none, normals, trials = (room[0][:0], room[1][:0]), axes(room[0]), []
+        for plane in self.along(*none, normals[normals[:, 2].abs() < 0.01], 0.0)[:6]:
+            for moved, material in self.proposals(plane[None], 0, self.reach, 0.04, SLABS[::3]):
+                upright = moved * moved.new_tensor([1.0, 1.0, 0.0, 1.0]) / moved[:2].norm()
+                trials.append((upright[None], material[None]))
+        return min((self.polish(*trial, 60, 3e-4) for trial in self.least(trials)), key=self.cost, default=room)
+
+    def grown(self, planes, slabs, others: Float[Tensor, "v 4"] | tuple[()] = ()) -> Room:
+        """The planes, and further ones along the axes of the room or, where none is left, near others.
+
+        Only offsets are searched and strengths are real, so fainter planes stand out from noise, and a floor from the
+        direct path. All planes move a little whenever there is one more.
+        """
+        while len(planes) < self.most:
+            before = self.cost((planes, slabs))
+            new = [plane for plane in others if not self.alike(planes, plane).any()]
+            for candidates in (self.along(planes, slabs, axes(planes), LITTLE)[:4], new):
+                found = self.with_best(planes, slabs, candidates)
+                if self.cost(found) < before - LITTLE:  # twice of what keeps a plane
+                    break
+            else:
                 break
-            _, *best = min(trials, key=lambda trial: trial[0])
-            tried, own = self.polish(best[0], best[1], 12, 5e-4, count)
-            if self.left(*parts, tried, own).item() > before - 2 * LITTLE:  # twice of what keeps a plane
-                break
-            both = (tried, own), self.polish(tried, own, 60, 3e-4)
-            planes, slabs = min(both, key=lambda found: self.left(*parts, *found).item())
-            log.info("%s, parallel to others", self.words(planes[-1]))
+            planes, slabs = self.settled(*found)
+            log.info("%s, square to others", self.words(planes[-1]))
         return planes, slabs
 
-    def without_false(
-        self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]
-    ) -> tuple[Float[Tensor, "v 4"], Float[Tensor, "v 3"]]:
+    def along(self, planes, slabs, normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "4"]]:
+        """Planes with these normals that explain a share of what real strengths leave, the best first."""
+        lines, found = self.grid(normals, 400, BEYOND), []
+        rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
+        shares = [log_share(rest, receiver.flat) for receiver, rest in zip(self.many, rests, strict=True)]
+        least = least * torch.cat(shares).mean().exp().item()  # a share of what is left lowers its log by about as much
+        profiles = [self.profiles(*pair) for pair in zip(self.many, rests, strict=True)]
+        for line, scores in zip(lines, self.scores(self.many, profiles, lines), strict=True):
+            for plane in planes:
+                scores[self.alike(line, plane)] = 0
+            found += [(scores[at].item(), line[at]) for at in maxima(scores, 11)]
+        return [plane for score, plane in sorted(found, key=lambda pair: -pair[0]) if score > least]
+
+    def with_best(self, planes, slabs, candidates: list[Float[Tensor, "4"]]) -> Room:
+        """The planes with the best candidate, if there is any."""
+        trials = []
+        for plane in candidates:
+            tried = torch.cat((planes, plane[None]))
+            for moved, material in self.proposals(tried, len(planes), self.reach, 1e-4, SLABS[::3]):
+                trials.append((torch.cat((planes, moved[None])), torch.cat((slabs, material[None]))))
+        best = self.least(trials)[:1]
+        return self.polish(*best[0], 12, 5e-4, len(planes)) if best else (planes, slabs)
+
+    def settled(self, planes, slabs) -> Room:
+        """Each plane once more at its best offset and tilt, as the others are known now."""
+        for k in range(len(planes)):
+            trials = [(planes, slabs)]
+            for plane, material in self.proposals(planes, k, self.reach, 0.006, SLABS[::3]):
+                trials.append((planes.clone(), slabs.clone()))
+                trials[-1][0][k], trials[-1][1][k] = plane, material
+            planes, slabs = self.least(trials)[0]
+        return self.least([(planes, slabs), self.polish(planes, slabs, 30, 3e-4)])[0]
+
+    def least(self, rooms: list[Room]) -> list[Room]:
+        """At most three rooms that leave least, the best first. Few places choose these three."""
+        if not rooms:
+            return []
+        parts, turns = self.some(rooms[0][0])
+        left = lambda room: self.left(parts, turns, *room).item()
+        if len(rooms) > 3:
+            few = [part.some(slice(None, None, 3)) for part in parts]
+            some = [turn if len(turn) == 1 else turn[::3] for turn in turns]
+            rooms = sorted(rooms, key=lambda room: self.left(few, some, *room).item())[:3]
+        return sorted(rooms, key=left)
+
+    def without_false(self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]) -> Room:
         """Planes of which each explains something that the others do not, and their slabs."""
         while len(planes) > len(self.start):
             without = [torch.arange(len(planes)) != k for k in range(len(self.start), len(planes))]
@@ -380,7 +437,7 @@ class ChannelSearch(PlaneSearch):
 
     # --- phases ---
 
-    def resolve(self, planes: Float[Tensor, "w 4"]) -> tuple[Float[Tensor, "w 4"], Float[Tensor, "w 3"]]:
+    def resolve(self, planes: Float[Tensor, "w 4"]) -> Room:
         """Moves planes to where real strengths of slabs leave least. Planes not yet resolved keep complex strengths."""
         slabs, resolved = SLABS[1].repeat(len(planes), 1), torch.zeros(len(planes), dtype=torch.bool)
         parts = self.some(planes)
@@ -464,7 +521,7 @@ class ChannelSearch(PlaneSearch):
         found = []
         for receiver, phase in zip(self.receivers, self.phases(planes, self.receivers), strict=True):
             waves = receiver.waves(receiver.images(planes, sequences))
-            _, strengths = project(waves, receiver.flat, 1e-4)
+            _, strengths = project(waves.to(torch.complex64), receiver.flat.to(torch.complex64), 1e-4)
 
             def length(q: Float[Tensor, "3"], receiver=receiver) -> Float[Tensor, " b"]:
                 plane = moved(q)
@@ -565,6 +622,21 @@ def real_residual(
 def log_share(part: Complex[Tensor, "b k"], whole: Complex[Tensor, "b k"]) -> Float[Tensor, " b"]:
     power = whole.abs().square().sum(-1)
     return (part.abs().square().sum(-1) / torch.where(power > 0, power, 1) + FLOOR).log()
+
+
+def axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
+    """Normals of planes and of others that a room may have: level, upright and at right angles to upright ones."""
+    normals, up = planes[:, :3], planes.new_tensor([0.0, 0.0, 1.0])
+    upright = functional.normalize(normals[normals[:, 2].abs() < 0.5] * (1 - up), dim=1)
+    across = torch.linalg.cross(up.expand_as(upright), upright)
+    return torch.stack(distinct(torch.cat((normals, up[None], upright, across)), 2e-4))
+
+
+def is_square(planes: Float[Tensor, "w 4"]) -> bool:
+    """True if planes are level or upright, and parallel or at right angles to each other, to a degree or so."""
+    normals = torch.cat((planes[:, :3], planes.new_tensor([[0.0, 0.0, 1.0]])))
+    cosines = (normals @ normals.mT).abs()
+    return bool(((cosines < 0.02) | (cosines > 0.9998)).all())
 
 
 def maxima(scores: Float[Tensor, " k"], width: int) -> Int[Tensor, " n"]:

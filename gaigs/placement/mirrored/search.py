@@ -16,6 +16,9 @@ from gaigs.query import Batch
 
 log = logging.getLogger(__name__)
 
+NEGLIGIBLE = 1e-6
+"""Power of a path over the strongest one's below which it is dropped in any case: hundreds would take long."""
+
 Loss = Callable[[Batch], float]
 """Loss of the model as it stands, on a batch."""
 
@@ -90,7 +93,7 @@ def _errors_of_moves(model, batch: Batch, plane: int, moves: Float[Tensor, " m"]
 
 
 def prune(placement: Mirrored, batches: list[Batch], loss: Loss) -> str:
-    """Drops planes, then paths, weakest first, that hardly lower any batch's loss; returns a sentence for the log."""
+    """Drops planes, then paths, that hardly lower any batch's loss, weakest first; returns a sentence for the log."""
     planes, paths = len(placement.used), int(placement.kept.sum())
     before = [loss(batch) for batch in batches]
 
@@ -99,6 +102,8 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss) -> str:
         return all(loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True))
 
     best = placement.kept.clone()
+    shares = _shares(placement, batches[0])
+    best[best.nonzero()[:, 0][shares < NEGLIGIBLE * shares.max()]] = False
     for plane in reversed(by_strength(placement, batches[0])):
         without = best & ~(placement.sequences == plane).any(1)
         best = without if is_good(without) else best

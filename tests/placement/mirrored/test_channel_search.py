@@ -159,16 +159,32 @@ def test_tilted_plane_is_turned_square():
     assert any((plane[0] - true).abs().max() < 0.03 for plane in turned)
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_parallel_plane_is_found_if_there_is_one(count):
-    walls = np.array([[1.0, 0, 0, -0.4], [1.0, 0, 0, 6.3]])
-    links, walls = room(walls=walls[:count])
+WALL, PARALLEL, FLOOR = [1.0, 0, 0, -0.4], [1.0, 0, 0, 6.3], [0, 0, 1.0, -0.2]
+
+
+@pytest.mark.parametrize("walls", [[WALL], [WALL, PARALLEL], [WALL, FLOOR]])
+def test_room_grows_by_planes_along_its_axes(walls):
+    links, walls = room(walls=np.array(walls))
     first = torch.tensor([[math.log(2.0), math.log(0.3), 0.0]]).double()
     own = search(links)
-    planes, slabs = own.with_parallel(seen_from(walls, own.middle)[:1], first)
+    planes, slabs = own.grown(seen_from(walls, own.middle)[:1], first)
     planes = seen_from(planes, -own.middle)
-    assert len(slabs) == count
+    assert len(slabs) == len(walls)
     torch.testing.assert_close(planes, walls, rtol=0, atol=0.01)
+
+
+def test_upright_planes_are_found_behind_a_tilted_one(monkeypatch):
+    """As free strengths of an array that tells no heights apart may find it."""
+    links, walls = room(walls=np.array([WALL, FLOOR]))
+    own = search(links)
+    tilted = torch.tensor([[math.cos(0.4), 0, math.sin(0.4), -0.4]]).double()
+    monkeypatch.setattr(own, "find", lambda known: seen_from(tilted, own.middle))
+    monkeypatch.setattr(own, "refine", lambda planes, *options: planes)
+    monkeypatch.setattr(own, "resolve", lambda planes: (planes, channel_search.SLABS[:1]))
+    monkeypatch.setattr(own, "without_false", lambda *room: room)
+    planes, _ = own.run()
+    order = planes[:, 2].abs().argsort()
+    torch.testing.assert_close(planes[order] * planes[order].sum(1, keepdim=True).sign(), walls, rtol=0, atol=0.01)
 
 
 # --- strengths ---
