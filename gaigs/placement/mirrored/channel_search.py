@@ -240,7 +240,7 @@ class ChannelSearch(PlaneSearch):
             new = [plane for plane in others if not self.alike(planes, plane).any()]
             for candidates in (self.along(planes, slabs, axes(planes), LITTLE)[:4], new):
                 found = self.with_best(planes, slabs, candidates)
-                if self.cost(found) < before - LITTLE:  # twice of what keeps a plane
+                if self.cost(found) < before - LITTLE / 2:  # more than what keeps a plane
                     break
             else:
                 break
@@ -499,7 +499,8 @@ class ChannelSearch(PlaneSearch):
         for receiver in receivers:
             if self.common:  # a hundred places say it
                 receiver = receiver.some(slice(None, None, max(1, len(receiver.places) // 100)))
-            direct = self.projected(receiver, planes, 1e-4)[1][:, 0]
+            # One place alone does not tell direct paths from those beside them: they share their power, and so a phase.
+            direct = self.projected(receiver, planes, 1e-4 if self.common else 1e-2)[1][:, 0]
             strong = direct.abs() >= direct.abs().median()
             found.append((direct.sgn() * strong).sum()[None].sgn() if self.common else direct.sgn())
         return found
@@ -576,7 +577,12 @@ class ChannelSearch(PlaneSearch):
             channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
             waves = receiver.reflected(planes, slabs, sequences)
             waves, signed = torch.cat((waves, 1j * waves[:, free]), 1), torch.cat((free, free[free]))
-            found.append(real_residual(waves, channels, signed))
+            rest = real_residual(waves, channels, signed)
+            if not self.common:  # once more with the phase of each place that explains most
+                explained = channels - rest
+                channels = channels * (explained * channels.conj()).sum(1, keepdim=True).sgn()
+                rest = real_residual(waves, channels, signed)
+            found.append(rest)
         return found
 
     def polish(self, planes, slabs, steps: int, rate: float, only: int | None = None) -> tuple[Tensor, Tensor]:
