@@ -275,7 +275,7 @@ class ChannelSearch(PlaneSearch):
         """Each plane once more at its best offset and tilt, as the others are known now."""
         for k in range(len(planes)):
             trials = [(planes, slabs)]
-            for plane, material in self.proposals(planes, k, self.reach, 0.006, SLABS[::3]):
+            for plane, material in self.proposals(planes, k, self.reach, 0.006, SLABS):
                 trials.append((planes.clone(), slabs.clone()))
                 trials[-1][0][k], trials[-1][1][k] = plane, material
             planes, slabs = self.least(trials)[0]
