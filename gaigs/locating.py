@@ -524,7 +524,9 @@ def as_fingerprints(value: object, prints: Fingerprints, is_track: bool = False)
     missing = flat.isnan().any(2) | ((flat == 0).all(2) if values.is_complex() else False)
     silent = missing.all(1)
     if silent.all() if is_track else silent.any():
-        raise ValueError(f"value {int(silent.int().argmax())} was heard by no receiver; leave it out")
+        raise ValueError(
+            f"value {int(silent.int().argmax())} was heard by no receiver; leave it out, or give step of a track"
+        )
     if not flat[~missing].isfinite().all():
         raise ValueError("value must be finite, or NaN where a receiver has not heard it")
     found = prints.task.fingerprint(values.flatten(0, 1)).unflatten(0, values.shape[:2])
@@ -687,12 +689,15 @@ def smoothed(
 ) -> Float[Tensor, "n g"]:
     """Posterior of each place of a track given all values, from those given each value alone: forward and backward.
 
-    While no value is ``heard``, the track is where the values before and after may be.
+    While no value is ``heard``, the track is near the line between the likeliest places before and after.
     """
-    known_ones, numbers = heard.nonzero()[:, 0], torch.arange(len(heard))
-    after = torch.searchsorted(known_ones, numbers).clamp_max(len(known_ones) - 1)
-    before = (torch.searchsorted(known_ones, numbers, right=True) - 1).clamp_min(0)
-    chosen = torch.maximum(logarithms[known_ones[before]], logarithms[known_ones[after]])
+    hearing, numbers = heard.nonzero()[:, 0], torch.arange(len(heard))
+    after = torch.searchsorted(hearing, numbers).clamp_max(len(hearing) - 1)
+    before = (torch.searchsorted(hearing, numbers, right=True) - 1).clamp_min(0)
+    ends, gaps = places[logarithms[hearing].argmax(1)], (hearing[after] - hearing[before]).clamp_min(1)
+    parts = ((numbers - hearing[before]) / gaps).clamp(0, 1)[:, None].to(places)
+    lines = torch.lerp(ends[before], ends[after], parts)
+    chosen = torch.where(heard[:, None], logarithms, -distances(lines, places))
     indices = chosen.topk(min(KEPT, len(places)), dim=1).indices
     best = logarithms.gather(1, indices)
     spacing = distances(places[indices[0]], places[indices[0]]).fill_diagonal_(math.inf).amin(1).median()

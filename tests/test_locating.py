@@ -105,11 +105,13 @@ def test_a_track_has_the_posterior_of_all_its_paths():
 
 
 def test_a_track_goes_on_where_no_receiver_hears(rssi):
-    values = torch.tensor([[-45.0, -60.0, -55.0, -65.0]] * 2 + [[math.nan] * 4] + [[-65.0, -55.0, -60.0, -45.0]])
-    found, alone = gaigs.locate(rssi[2], values, step=0.5).mean, gaigs.locate(rssi[2], values[[0, 3]]).mean
-    ends = (alone - found[2]).norm(dim=1)
-    assert ends.sum() < 1.5 * (alone[0] - alone[1]).norm()
-    assert ends.min() > 0.1
+    links, _, prints = rssi
+    values, places = received(links, links.split.train)
+    ends = values[[places[:, 0].argmin(), places[:, 0].argmax()], :, 0].repeat_interleave(3, 0)
+    found = gaigs.locate(prints, torch.cat((ends[:3], torch.full((7, 4), math.nan), ends[3:])), step=0.5)
+    way, middle = (found.mean[-1] - found.mean[0]).norm(), (found.mean[0] + found.mean[-1]) / 2
+    assert way > 2
+    assert found.probabilities[6] @ (found.places - middle).norm(dim=1).double() < 0.4 * way
 
 
 def test_transmitters_are_nearer_than_their_neighbours_and_in_their_regions():

@@ -205,8 +205,9 @@ class ChannelSearch(PlaneSearch):
         best = self.without_false(*self.resolve(self.refine(planes, 300, 5e-3)))
         if not len(best[0]):
             return best
-        if not len(self.start) and not is_square(best[0]):  # tilted planes may stand for several upright ones
-            upright = self.without_false(*self.grown(*self.seed(best), best[0]))
+        if not is_square(best[0]):  # tilted planes may stand for several upright ones
+            first = (self.start, SLABS[1].repeat(len(self.start), 1)) if len(self.start) else self.seed(best)
+            upright = self.without_false(*self.grown(*first, best[0]))
             if self.cost(upright) < self.cost(best):
                 return upright
         if len(best[0]) < len(planes):  # what the false ones explained is searched anew
@@ -221,13 +222,13 @@ class ChannelSearch(PlaneSearch):
     # --- planes along axes ---
 
     def seed(self, room: Room) -> Room:
-        """The upright plane along the axes of a room that explains most alone; the room if there is none."""
+        """The upright plane along the axes of a room that explains most alone, if there is any."""
         none, normals, trials = (room[0][:0], room[1][:0]), axes(room[0]), []
         for plane in self.along(*none, normals[normals[:, 2].abs() < 0.01], 0.0)[:6]:
             for moved, material in self.proposals(plane[None], 0, self.reach, 0.04, SLABS[::3]):
                 upright = moved * moved.new_tensor([1.0, 1.0, 0.0, 1.0]) / moved[:2].norm()
                 trials.append((upright[None], material[None]))
-        return min((self.polish(*trial, 60, 3e-4) for trial in self.least(trials)), key=self.cost, default=room)
+        return min((self.polish(*trial, 60, 3e-4) for trial in self.least(trials)), key=self.cost, default=none)
 
     def grown(self, planes, slabs, others: Float[Tensor, "v 4"] | tuple[()] = ()) -> Room:
         """The planes, and further ones along the axes of the room or, where none is left, near others.

@@ -102,7 +102,7 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss) -> str:
         return all(loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True))
 
     best = placement.kept.clone()
-    shares = _shares(placement, batches[0])
+    shares = torch.stack([_shares(placement, batch) for batch in batches]).amax(0)
     best[best.nonzero()[:, 0][shares < NEGLIGIBLE * shares.max()]] = False
     for plane in reversed(by_strength(placement, batches[0])):
         without = best & ~(placement.sequences == plane).any(1)

@@ -173,14 +173,16 @@ def test_room_grows_by_planes_along_its_axes(walls):
     torch.testing.assert_close(planes, walls, rtol=0, atol=0.01)
 
 
-def test_upright_planes_are_found_behind_a_tilted_one(monkeypatch):
+@pytest.mark.parametrize("walls, known, tilt", [([WALL, FLOOR], 0, 0.4), ([WALL, FLOOR], 1, 0.4), ([FLOOR], 0, 1.2)])
+def test_planes_along_axes_replace_a_tilted_one(walls, known, tilt, monkeypatch):
     """As free strengths of an array that tells no heights apart may find it."""
-    links, walls = room(walls=np.array([WALL, FLOOR]))
+    links, walls = room(walls=np.array(walls))
     own = search(links)
-    tilted = torch.tensor([[math.cos(0.4), 0, math.sin(0.4), -0.4]]).double()
-    monkeypatch.setattr(own, "find", lambda known: seen_from(tilted, own.middle))
+    own.start = seen_from(walls[:known], own.middle)
+    tilted = torch.tensor([[math.cos(tilt), 0, math.sin(tilt), -0.4]]).double()
+    monkeypatch.setattr(own, "find", lambda start: torch.cat((start, seen_from(tilted, own.middle))))
     monkeypatch.setattr(own, "refine", lambda planes, *options: planes)
-    monkeypatch.setattr(own, "resolve", lambda planes: (planes, channel_search.SLABS[:1]))
+    monkeypatch.setattr(own, "resolve", lambda planes: (planes, channel_search.SLABS[: len(planes)]))
     monkeypatch.setattr(own, "without_false", lambda *room: room)
     planes, _ = own.run()
     order = planes[:, 2].abs().argsort()
