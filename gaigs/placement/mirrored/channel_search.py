@@ -236,6 +236,7 @@ class ChannelSearch(PlaneSearch):
         Only offsets are searched and strengths are real, so fainter planes stand out from noise, and a floor from the
         direct path. All planes move a little whenever there is one more.
         """
+        count = len(planes)
         while len(planes) < self.most:
             before = self.cost((planes, slabs))
             new = [plane for plane in others if not self.alike(planes, plane).any()]
@@ -247,7 +248,7 @@ class ChannelSearch(PlaneSearch):
                 break
             planes, slabs = self.settled(*found)
             log.info("%s, square to others", self.words(planes[-1]))
-        return planes, slabs
+        return self.settled(planes, slabs, polishes=True) if len(planes) > count else (planes, slabs)
 
     def along(self, planes, slabs, normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "4"]]:
         """Planes with these normals that explain a share of what real strengths leave, the best first."""
@@ -272,14 +273,17 @@ class ChannelSearch(PlaneSearch):
         best = self.least(trials)[:1]
         return self.polish(*best[0], 12, 5e-4, len(planes)) if best else (planes, slabs)
 
-    def settled(self, planes, slabs) -> Room:
+    def settled(self, planes, slabs, polishes: bool = False) -> Room:
         """Each plane once more at its best offset and tilt, as the others are known now."""
         for k in range(len(planes)):
             trials = [(planes, slabs)]
             for plane, material in self.proposals(planes, k, self.reach, 0.006, SLABS):
                 trials.append((planes.clone(), slabs.clone()))
                 trials[-1][0][k], trials[-1][1][k] = plane, material
-            planes, slabs = self.least(trials)[0]
+            best = self.least(trials)
+            if polishes:  # a slab that does not fit yet may hide the best offset
+                best += [self.polish(*trial, 12, 5e-4, k) for trial in best]
+            planes, slabs = self.least(best)[0]
         return self.least([(planes, slabs), self.polish(planes, slabs, 30, 3e-4)])[0]
 
     def least(self, rooms: list[Room]) -> list[Room]:

@@ -173,7 +173,9 @@ def test_room_grows_by_planes_along_its_axes(walls):
     torch.testing.assert_close(planes, walls, rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize("walls, known, tilt", [([WALL, FLOOR], 0, 0.4), ([WALL, FLOOR], 1, 0.4), ([FLOOR], 0, 1.2)])
+@pytest.mark.parametrize(
+    ("walls", "known", "tilt"), [([WALL, FLOOR], 0, 0.4), ([WALL, FLOOR], 1, 0.4), ([FLOOR], 0, 1.2)]
+)
 def test_planes_along_axes_replace_a_tilted_one(walls, known, tilt, monkeypatch):
     """As free strengths of an array that tells no heights apart may find it."""
     links, walls = room(walls=np.array(walls))
