@@ -240,7 +240,7 @@ class ChannelSearch(PlaneSearch):
         while len(planes) < self.most:
             before = self.cost((planes, slabs))
             new = [plane for plane in others if not self.alike(planes, plane).any()]
-            for candidates in (self.along(planes, slabs, axes(planes), LITTLE)[:4], new):
+            for candidates in filter(None, (self.along(planes, slabs, axes(planes), LITTLE)[:4], new)):
                 found = self.with_best(planes, slabs, candidates)
                 if self.cost(found) < before - LITTLE / 2:  # more than what keeps a plane
                     break
@@ -264,14 +264,13 @@ class ChannelSearch(PlaneSearch):
         return [plane for score, plane in sorted(found, key=lambda pair: -pair[0]) if score > least]
 
     def with_best(self, planes, slabs, candidates: list[Float[Tensor, "4"]]) -> Room:
-        """The planes with the best candidate, if there is any."""
+        """The planes with the best candidate."""
         trials = []
         for plane in candidates:
             tried = torch.cat((planes, plane[None]))
             for moved, material in self.proposals(tried, len(planes), self.reach, 1e-4, SLABS[::3]):
                 trials.append((torch.cat((planes, moved[None])), torch.cat((slabs, material[None]))))
-        best = self.least(trials)[:1]
-        return self.polish(*best[0], 12, 5e-4, len(planes)) if best else (planes, slabs)
+        return self.polish(*self.least(trials)[0], 12, 5e-4, len(planes))
 
     def settled(self, planes, slabs, polishes: bool = False) -> Room:
         """Each plane once more at its best offset and tilt, as the others are known now."""
@@ -282,8 +281,8 @@ class ChannelSearch(PlaneSearch):
                 trials[-1][0][k], trials[-1][1][k] = plane, material
             best = self.least(trials)
             if polishes:  # a slab that does not fit yet may hide the best offset
-                best += [self.polish(*trial, 12, 5e-4, k) for trial in best]
-            planes, slabs = self.least(best)[0]
+                best = self.least(best + [self.polish(*trial, 12, 5e-4, k) for trial in best])
+            planes, slabs = best[0]
         return self.least([(planes, slabs), self.polish(planes, slabs, 30, 3e-4)])[0]
 
     def least(self, rooms: list[Room]) -> list[Room]:
@@ -584,8 +583,8 @@ class ChannelSearch(PlaneSearch):
             waves, signed = torch.cat((waves, 1j * waves[:, free]), 1), torch.cat((free, free[free]))
             rest = real_residual(waves, channels, signed)
             if not self.common:  # once more with the phase of each place that explains most
-                explained = channels - rest
-                channels = channels * (explained * channels.conj()).sum(1, keepdim=True).sgn()
+                turn = ((channels - rest) * channels.conj()).sum(1, keepdim=True).sgn()
+                channels = torch.where(turn == 0, channels, channels * turn)  # 0 where nothing is explained
                 rest = real_residual(waves, channels, signed)
             found.append(rest)
         return found
