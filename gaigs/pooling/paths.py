@@ -2,6 +2,7 @@
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,11 +10,9 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.antenna import Array, Receiver
-from gaigs.geometry import Directions, Grid, magnitudes, polar, sinc
+from gaigs.antenna import Receiver
+from gaigs.geometry import Directions, Grid, polar, sinc
 from gaigs.pooling import Pooling
-from gaigs.projection import Splats
-from gaigs.projection.direction_cosine import DirectionCosine
 from gaigs.propagation import NEAREST
 from gaigs.query import Query
 from gaigs.scene import Scene
@@ -84,68 +83,79 @@ class LagPooling(PathPooling):
                 )
 
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b l"]:
-        """Covariance of the elements at each of ``array.lags``; a path is at least as wide as a pixel of 24 x 48."""
-        if paths.receiver.array.is_point:  # a power has no directions
-            nowhere = torch.zeros_like(paths.means)
-            splats = Splats(
-                nowhere[..., :2], nowhere[:1], paths.lengths, torch.ones_like(paths.lengths, dtype=torch.bool)
-            )
-        else:
-            plane = DirectionCosine(Grid.sphere(24, 48).pitch)
-            splats = plane.project(paths.means, paths.semi_axes, paths.receiver.pose)
-        own = paths.amplitudes, paths.lengths, paths.coherences, paths.bandwidth
-        return self.covariances(splats, *own, paths.receiver.array, paths.carriers)
-
-    @staticmethod
-    def covariances(
-        splats: Splats,
-        amplitudes: Complex[Tensor, "b n"],
-        lengths: Float[Tensor, "b n"],
-        coherences: Float[Tensor, " n"],
-        bandwidth: Float[Tensor, ""] | None,
-        array: Array,
-        carriers: Float[Tensor, " b"],
-    ) -> Complex[Tensor, "b l"]:
         """Mean covariance of the pairs of elements that are ``array.lags`` apart; at lag 0 it is the power.
 
         Where powers add, elements a lag D apart, in wavelengths, have
 
             sum |A|² exp(-(2 pi)² D' S D / 2 + j 2 pi D . u)
 
-        Two paths interfere by the product of their coherences, and over a band by sinc(bandwidth (t - t')), with t
-        their delays: the mean over the band of cos(2 pi f (t - t')).
-
-        ``splats`` are the paths in direction cosines: directions u and covariances S; only visible ones count.
+        with u a path's direction cosines and S their covariance: the Gaussian's, and that of ``LEAST_SPREAD``. Two
+        paths interfere by the product of their coherences, and over a band by sinc(bandwidth (t - t')), with t their
+        delays: the mean over the band of cos(2 pi f (t - t')).
         """
-        amplitudes, directions = torch.where(splats.visible, amplitudes, 0), splats.means2d
+        array, amplitudes, coherences = paths.receiver.array, paths.amplitudes, paths.coherences
         steps, pairs, counts = (part.to(amplitudes.device) for part in array.lags)
-        steps, counts = steps.to(lengths), counts.to(lengths)
-        wavelengths = speed_of_light / carriers.to(lengths)[:, None, None]
+        steps, counts = steps.to(paths.lengths), counts.to(paths.lengths)
+        if array.is_point:  # a power has no directions
+            heard = lambda places: amplitudes.new_ones(1, 1, len(places))
+        else:
+            heard = _steering(paths)
         # Half of the lags are the conjugates of the others.
-        half = len(steps) // 2
-        angles = 2 * math.pi / wavelengths * (directions @ steps[half:, :2].T)
-        narrow = _footprints(splats, steps[half:, :2], wavelengths)
-        powers = magnitudes(amplitudes).square() * (1 - coherences.square())
-        real, imaginary = ((powers[..., None] * narrow * part).sum(1) for part in (angles.cos(), angles.sin()))
-        later = torch.complex(real, imaginary)
+        powers = torch.view_as_real(amplitudes).square().sum(-1) * (1 - coherences.square())
+        later = (powers[..., None] * heard(steps[len(steps) // 2 :])).sum(1)
         found = torch.cat((later[:, 1:].conj().flip(1), later), 1)
         sure = coherences.nonzero()[:, 0]  # the others have no phase
         if not len(sure):
             return found
-        elements = array.elements.to(directions)[:, :2]
-        angles = 2 * math.pi / wavelengths * (directions @ elements.T)
-        steering = polar(_footprints(splats, elements, wavelengths), angles)
-        waves = ((amplitudes * coherences)[..., None] * steering)[:, sure]
-        if bandwidth is None:
-            heard = waves.sum(1)[..., None]
-            covariance = heard @ heard.mH
+        waves = ((amplitudes * coherences)[..., None] * heard(array.elements.to(steps)))[:, sure]
+        if paths.bandwidth is None:
+            field = waves.sum(1)[..., None]
+            covariance = field @ field.mH
         else:
-            turns = bandwidth / speed_of_light * lengths[:, sure]
+            turns = paths.bandwidth / speed_of_light * paths.lengths[:, sure]
             likeness = sinc(turns[:, :, None] - turns[:, None])
             alike = likeness @ torch.view_as_real(waves).flatten(2)  # real products take half the time of complex ones
             covariance = torch.view_as_complex(alike.unflatten(2, (-1, 2))).mT @ waves.conj()
-        added = torch.zeros_like(found).index_add(1, pairs, covariance.flatten(1))
-        return found + added / counts
+        return found + torch.zeros_like(found).index_add(1, pairs, covariance.flatten(1)) / counts
+
+
+LEAST_SPREAD = Grid.sphere(24, 48).pitch / math.sqrt(12)
+"""Least standard deviation of a path's direction cosines where powers add: that of a pixel of 24 x 48."""
+
+
+def _steering(paths: ReceivedPaths) -> Callable[[Float[Tensor, "k 3"]], Complex[Tensor, "b n k"]]:
+    """exp(-(2 pi)² D' S D / 2 + j 2 pi D . u) of each path at steps D in the array's plane [m]."""
+    points, wavenumbers, across = _seen(paths)
+    angles = wavenumbers * points / points.norm(dim=-1, keepdim=True).clamp_min(NEAREST)
+
+    def response(steps: Tensor) -> Tensor:
+        least = (LEAST_SPREAD * wavenumbers).square() * steps.square().sum(-1)
+        return polar(((_spreads(across, steps) + least) / -2).exp(), angles @ steps.T)
+
+    return response
+
+
+def _seen(paths: ReceivedPaths) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b 1 1"], Float[Tensor, "c n 3 3"]]:
+    """Gaussians' centres in the array's frame [m], wavenumbers [1/m], and semi-axes across the way [rad/m].
+
+    The last are angles as the middle of the array sees them, times the wavenumber.
+    """
+    pose = paths.receiver.pose.to(paths.means)
+    points, semi_axes = pose.local(paths.means), pose.rotation.mT @ paths.semi_axes
+    wavenumbers = 2 * math.pi / speed_of_light * paths.carriers.to(points)[:, None, None]
+    ways = points.norm(dim=-1, keepdim=True).clamp_min(NEAREST)
+    units = (points / ways)[..., None]
+    return (
+        points,
+        wavenumbers,
+        (semi_axes - units * (units * semi_axes).sum(-2, keepdim=True)) * (wavenumbers / ways)[..., None],
+    )
+
+
+def _spreads(across: Float[Tensor, "b n 3 3"], steps: Float[Tensor, "k 3"]) -> Float[Tensor, "b n k"]:
+    """(2 pi)² D' S D of each path at each step D [m]."""
+    turns = (steps @ across.movedim(-2, 0).flatten(1)).view(len(steps), *across.shape[:2], 3)
+    return turns.square().sum(-1).movedim(0, -1)
 
 
 def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Complex[Tensor, "b e s"]:
@@ -162,8 +172,8 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
 
     Source: ours; the Fourier transform of a Gaussian, and Van Trees, Optimum Array Processing, 2002, section 2.2.
     """
-    amplitudes, lengths, pose = paths.amplitudes, paths.lengths, paths.receiver.pose.to(paths.means)
-    points, semi_axes = pose.local(paths.means), pose.rotation.mT @ paths.semi_axes
+    amplitudes, lengths = paths.amplitudes, paths.lengths
+    points, wavenumbers, across = _seen(paths)
     elements, exact = paths.receiver.array.elements.to(points), points.norm(dim=-1, keepdim=True)
     # Plain differences: by the matrix product an element far from a near point would lose its digits.
     own = torch.cdist(points, elements, compute_mode="donot_use_mm_for_euclid_dist")
@@ -172,13 +182,8 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
     both = own + exact
     longer = (elements.square().sum(-1) - 2 * points @ elements.T) / torch.where(both > 0, both, 1)
     longer = longer + (to_elements - own) - (ways - exact)
-    wavenumbers = 2 * math.pi / speed_of_light * paths.carriers.to(points)[:, None, None]
-    # Semi-axes across the way, in radians as the middle sees them.
-    units = (points / ways)[..., None]
-    across = (semi_axes - units * (units * semi_axes).sum(-2, keepdim=True)) * (wavenumbers / ways)[..., None]
-    turns = (elements @ across.movedim(-2, 0).flatten(1)).view(len(elements), *across.shape[:2], 3)
-    spread = turns.square().sum(-1).movedim(0, -1)
-    waves = amplitudes[..., None] * polar((spread / -2).exp() * (ways / to_elements), -wavenumbers * longer)
+    spreads = _spreads(across, elements)
+    waves = amplitudes[..., None] * polar((spreads / -2).exp() * (ways / to_elements), -wavenumbers * longer)
     reach = float(elements.norm(dim=-1).amax()) / speed_of_light
     rates = -2 * math.pi * offsets.to(lengths)
     turned = lambda delays: torch.polar(torch.ones_like(delays), delays)
@@ -196,12 +201,3 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
     sums = torch.stack(terms, 2).flatten(2).mT @ middle  # (b, terms x e, s)
     powers = (reach * rates)[:, None] ** torch.arange(len(terms), device=rates.device)[:, None]
     return (sums.unflatten(1, (len(terms), -1)) * powers[:, :, None]).sum(1)
-
-
-def _footprints(
-    splats: Splats, steps: Float[Tensor, "k 2"], wavelengths: Float[Tensor, "b 1 1"]
-) -> Float[Tensor, "b n k"]:
-    """exp(-(2 pi)² D' S D / 2) for each path and step D [m]."""
-    squares = (steps[:, :, None] * steps[:, None]).flatten(1)
-    covariances = splats.covariances2d.expand(len(wavelengths), -1, -1, -1).flatten(2)
-    return ((-0.5 * (2 * math.pi / wavelengths) ** 2) * (covariances @ squares.T)).exp()

@@ -1,13 +1,16 @@
 """Faint waves, and paths at an array: silence, extreme footprints, zero or one path."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from precision import DTYPES, require_same
 
 from gaigs.antenna import Array, Receiver
 from gaigs.geometry import Pose, magnitudes, polar
-from gaigs.pooling.paths import LagPooling, ReceivedPaths, element_fields
-from gaigs.projection import Splats
+from gaigs.pooling.path_rssi import PathRssi
+from gaigs.pooling.paths import ReceivedPaths, element_fields
+from gaigs.testing import example_links
 
 FAINT = [0.0, 1e-45, 1e-42, 1e-39, 1.2e-38, 1e-30, 1.0, 1e30]
 
@@ -39,7 +42,7 @@ def test_nan_shows_in_waves():
 N, B = 9, 2
 generator = torch.Generator().manual_seed(0)
 CENTRES = torch.rand(B, N, 2, generator=generator) - 0.5
-SPLATS = {
+WIDTHS = {
     "points": torch.zeros(3),
     "narrow": torch.tensor([1e-3, 0, 1e-3]),
     "of all widths": torch.logspace(-2, 1.5, N)[None, :, None] * torch.tensor([1.0, 0.3, 1.0]),
@@ -47,14 +50,14 @@ SPLATS = {
     "long and thin": torch.tensor([10.0, 5.0, 1e-6]),
 }
 WAVES = {"silent": 0.0, "denormal": 1e-42, "faint": 1e-18, "loud": 1e10}
-CASES = [(splats, "loud", N) for splats in SPLATS] + [("narrow", waves, N) for waves in WAVES]
+CASES = [(widths, "loud", N) for widths in WIDTHS] + [("narrow", waves, N) for waves in WAVES]
 CASES += [("narrow", "loud", 1), ("narrow", "loud", 0)]
 
 
-@pytest.mark.parametrize(("splats", "waves", "n"), CASES)
+@pytest.mark.parametrize(("widths", "waves", "n"), CASES)
 @pytest.mark.parametrize("coherence", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("bandwidth", [None, 0.0, 1e9])
-def test_paths_at_an_array(splats, waves, n, coherence, bandwidth):
+def test_paths_at_an_array(widths, waves, n, coherence, bandwidth):
     array = Array.planar(3, 3, 0.03)
     receiver = Receiver("here", Pose(torch.zeros(3), torch.eye(3)), array)
     size = WAVES[waves]
@@ -64,18 +67,15 @@ def test_paths_at_an_array(splats, waves, n, coherence, bandwidth):
     ahead = (1 - CENTRES.square().sum(-1, keepdim=True)).sqrt()
     points = torch.linspace(0.1, 30, N)[:, None] * torch.cat((CENTRES, ahead), -1)
     points[:, 4:7] = torch.tensor([[0.0, 0, 0], [0.03, -0.03, 0], [0.03, 0.03, 1e-5]])
-    axes = points.norm(dim=-1)[..., None, None] * torch.diag_embed(SPLATS[splats].abs().expand(1, N, 3))
+    axes = points.norm(dim=-1)[..., None, None] * torch.diag_embed(WIDTHS[widths].expand(1, N, 3))
 
-    def ask(_, points, axes, centres, factors, amplitudes, lengths, coherences):
-        visible = torch.arange(n) != 4
-        drawn = Splats(centres, factors, lengths.detach(), visible.expand(B, n))
+    def ask(pooling, points, axes, amplitudes, lengths, coherences):
         carriers, offsets = lengths.new_full((B,), 5e9), lengths.new_tensor([[-1e7, 0, 1e7]]).expand(B, 3)
         band = None if bandwidth is None else lengths.new_tensor(bandwidth)
-        own = amplitudes, lengths, coherences, band
-        fields = element_fields(ReceivedPaths(points, axes, *own, receiver, carriers), offsets)
-        lags = LagPooling.covariances(drawn, *own, array, carriers)
+        paths = ReceivedPaths(points, axes, amplitudes, lengths, coherences, band, receiver, carriers)
+        fields, lags = element_fields(paths, offsets), pooling.sum_paths(paths)
         return (fields, lags) if size <= 1 else (fields / size, lags / size**2)
 
-    factors = SPLATS[splats].expand(1, N, 3)
-    leaves = points, axes, CENTRES, factors, amplitudes, lengths
-    require_same(ask, None, *(leaf[:, :n] for leaf in leaves), torch.full((n,), coherence))
+    pooling = PathRssi(replace(example_links("rssi", 5e9).scene, receivers=(receiver,)))
+    leaves = points, axes, amplitudes, lengths
+    require_same(ask, pooling, *(leaf[:, :n] for leaf in leaves), torch.full((n,), coherence))

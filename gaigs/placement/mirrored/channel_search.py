@@ -3,7 +3,7 @@
 import logging
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
@@ -15,7 +15,6 @@ from gaigs.data import Links
 from gaigs.gaussians import fibonacci_lattice
 from gaigs.placement.mirrored.plane_search import PlaneSearch
 from gaigs.placement.mirrored.reflections import (
-    Bounces,
     all_sequences,
     distinct,
     fold,
@@ -143,7 +142,8 @@ class ReceiverChannels:
         permittivities, thickness = _materials(slabs)
         depths = thickness[:, None] * self.frequencies / speed_of_light
         gains = folded.exists[..., None].to(self.channels.dtype).expand(-1, -1, len(self.frequencies))
-        gains = folded.reflected(gains, partial(_response, normals, permittivities, depths))
+        materials = permittivities[folded.planes, None], folded.cosines[..., None].clamp(1e-3, 1), depths[folded.planes]
+        gains = folded.reflected(gains, polarised(folded.normals[:, None], *slab(*materials)))
         waves = self.waves(seen[-1]).unflatten(-1, (len(self.elements), -1))
         return (waves * gains[:, :, None]).flatten(-2)
 
@@ -665,18 +665,6 @@ def _materials(slabs: Float[Tensor, "*w 3"]) -> tuple[Complex[Tensor, "*w"], Flo
     """Permittivities, and thicknesses [m]."""
     real, imaginary, thickness = slabs.exp().unbind(-1)
     return torch.complex(1 + real, -imaginary), thickness
-
-
-def _response(
-    normals: Float[Tensor, "v 3"],
-    permittivities: Complex[Tensor, " v"],
-    depths: Float[Tensor, "v s"],
-    bounce: Bounces,
-) -> Complex[Tensor, "b w s"]:
-    """Reflection coefficients of a bounce at slabs, their thicknesses (depths) in wavelengths."""
-    depth, permittivity = depths[bounce.planes], permittivities[bounce.planes, None]
-    te, tm = slab(permittivity, bounce.cosines[..., None].clamp(1e-3, 1), depth)
-    return polarised(normals[bounce.planes, None], te, tm)
 
 
 def _evenly(count: int, most: int) -> Int[Tensor, " k"]:

@@ -94,8 +94,9 @@ def trace_paths(placement: Mirrored, query: Query) -> TracedPaths:
         _, stands, folded = placement.folded(part)
         receivers.append(placement.scene.positions(stands)[part.receivers])
         points = stands.new_full((len(part), *sequences.shape, 3), torch.nan)
-        for back, met in enumerate(folded.bounces, 1):
-            points[:, met.first :, -back] = met.points + placement.middle
+        parts = folded.bounces.split([len(sequences) - first for first in folded.firsts], 1)
+        for back, (first, met) in enumerate(zip(folded.firsts, parts, strict=True), 1):
+            points[:, first:, -back] = met + placement.middle
         bounces.append(points)
     parts = sequences, torch.cat(powers).double(), torch.cat(bounces), query.transmitters, torch.cat(receivers)
     return TracedPaths(*(part.cpu().numpy() for part in parts))

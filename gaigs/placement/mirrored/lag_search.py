@@ -184,10 +184,8 @@ class ReceiverLags:
             )  # -1 is the last
             own[:, 0] = passing[:, 0]
             gains = gains * own
-        gains = folded.reflected(
-            torch.complex(gains, torch.zeros_like(gains)),
-            lambda bounce: reflection(normals[bounce.planes], bounce.cosines),
-        )
+        reflections = reflection(folded.normals, folded.cosines)
+        gains = folded.reflected(torch.complex(gains, torch.zeros_like(gains)), reflections)
         phases = -self.wavenumber * lengths
         return gains * torch.polar(torch.ones_like(phases), phases), self.steering(ways), lengths
 

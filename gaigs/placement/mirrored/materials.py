@@ -49,15 +49,14 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
     for part in query.parts(64):  # links at a time
         part = part.to(normals.device)
         powers = placement(None, part).gains.abs().square()
-        response = placement.responses(part)
-        for bounce in placement.folded(part)[2].bounces:
-            first, planes, _, cosines = bounce
-            wanted = compared(response(bounce) * gains[first:])
-            weights.index_add_(0, planes, powers[:, first:].sum(0))
-            for option, (name, thicknesses) in enumerate(options):
-                te, tm = slab(permittivities[name], cosines, thicknesses[planes] * (frequency / speed_of_light))
-                error = (compared(polarised(normals[planes], te, tm)) - wanted).abs().square()
-                errors[option].index_add_(0, planes, (powers[:, first:] * error).sum(0))
+        _, _, folded = placement.folded(part)
+        planes, path = folded.planes, folded.path[: len(folded.planes)]
+        wanted = compared(placement.coefficients(part, folded) * gains[path])
+        weights.index_add_(0, planes, powers[:, path].sum(0))
+        for option, (name, thicknesses) in enumerate(options):
+            te, tm = slab(permittivities[name], folded.cosines, thicknesses[planes] * (frequency / speed_of_light))
+            error = (compared(polarised(folded.normals, te, tm)) - wanted).abs().square()
+            errors[option].index_add_(0, planes, (powers[:, path] * error).sum(0))
     chosen = errors.argmin(0).tolist()
     met = (weights > 0).nonzero()[:, 0].tolist()
     return {plane: Material(options[chosen[plane]][0], options[chosen[plane]][1][plane].item()) for plane in met}

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,7 +18,6 @@ from gaigs.gaussians import SH_DC, Gaussians, Placed
 from gaigs.placement import Placement
 from gaigs.placement.mirrored.obstacles import Obstacles
 from gaigs.placement.mirrored.reflections import (
-    Bounces,
     Folded,
     all_sequences,
     fold,
@@ -363,27 +362,23 @@ class Mirrored(Placement):
         """Field of each kept path over free space, after reflections and obstacles; 0 for no path."""
         left = self.path_gains[self.kept] + self.receiver_gains[query.receivers, None]
         left = torch.complex(left.exp() * folded.exists, torch.zeros_like(left))
-        left = folded.reflected(left, self.responses(query))
+        left = folded.reflected(left, self.coefficients(query, folded))
         if blocked and self.obstacles is not None and not self.is_bare:
             left = left * (-self._depths(self.obstacles, folded, left)).exp()
         return left
 
-    def responses(self, query: Query) -> Callable[[Bounces], Complex[Tensor, "b w"]]:
-        """The reflection coefficients of a query's bounces, with the gains of their planes."""
-        normals = self.normals
-        permittivities = torch.complex(1 + self.log_permittivities.exp(), -self.log_conductivities.exp())
-
-        def response(bounce: Bounces) -> Complex[Tensor, "b w"]:
-            _, planes, points, cosines = bounce
-            if self.log_thicknesses is None:
-                te, tm = fresnel(permittivities[planes], cosines)
-            else:
-                wavelengths = speed_of_light / carriers(self.scene, query).to(cosines)[:, None]
-                te, tm = slab(permittivities[planes], cosines, self.log_thicknesses[planes].exp() / wavelengths)
-            aside = (points - self.middles[planes]) * (-self.log_extents[planes]).exp()
-            return polarised(normals[planes], te, tm) * (self.plane_gains[planes] - aside.square().sum(-1) / 2).exp()
-
-        return response
+    def coefficients(self, query: Query, folded: Folded) -> Complex[Tensor, "b w"]:
+        """Reflection coefficients at the bounces, with the gains of their planes."""
+        planes, cosines = folded.planes, folded.cosines
+        permittivities = torch.complex(1 + self.log_permittivities.exp(), -self.log_conductivities.exp())[planes]
+        if self.log_thicknesses is None:
+            te, tm = fresnel(permittivities, cosines)
+        else:
+            wavelengths = speed_of_light / carriers(self.scene, query).to(cosines)[:, None]
+            te, tm = slab(permittivities, cosines, self.log_thicknesses[planes].exp() / wavelengths)
+        aside = (folded.bounces - self.middles[planes]) * (-self.log_extents[planes]).exp()
+        gains = (self.plane_gains[planes] - aside.square().sum(-1) / 2).exp()
+        return polarised(folded.normals, te, tm) * gains
 
     def _depths(
         self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]

@@ -1,7 +1,6 @@
-"""Reflection paths: sequences of planes, images, and bounces of each path."""
+"""Reflection paths: sequences of planes, images, and legs of each path."""
 
 import itertools
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -10,45 +9,43 @@ from torch import Tensor
 from torch.nn import functional
 
 
-class Bounces(NamedTuple):
-    """One bounce of each sequence of a least length, from sequence ``first`` on.
-
-    Attributes:
-        first: Number of the first such sequence.
-        planes: Plane of each.
-        points: Points on it [m].
-        cosines: Cosines of the angles of incidence.
-    """
-
-    first: int
-    planes: Int[Tensor, " w"]
-    points: Float[Tensor, "b w 3"]
-    cosines: Float[Tensor, "b w"]
-
-
 class Folded(NamedTuple):
     """Paths through the room; a leg is a straight piece from one bounce to the next.
+
+    Legs that start at the last bounces of all sequences come first, then those at the last but one, and so on, and at
+    last those from the transmitter.
 
     Attributes:
         start, end: Ends of all legs [m].
         path: Number of the sequence of each leg.
-        bounces: The last bounce of each sequence, the last but one, and so on.
+        firsts: Number of the first sequence that has a last bounce, a last but one, and so on.
+        planes: Plane of each bounce, of all legs but the last n.
+        normals: Its normal.
+        cosines: Cosines of the angles of incidence.
         exists: True if a path meets its planes in their order, from inside the room (b, n).
     """
 
     start: Float[Tensor, "b s 3"]
     end: Float[Tensor, "b s 3"]
     path: Int[Tensor, " s"]
-    bounces: list[Bounces]
+    firsts: list[int]
+    planes: Int[Tensor, " w"]
+    normals: Float[Tensor, "w 3"]
+    cosines: Float[Tensor, "b w"]
     exists: Bool[Tensor, "b n"]
 
+    @property
+    def bounces(self) -> Float[Tensor, "b w 3"]:
+        """Points where planes reflect [m]."""
+        return self.start[:, : len(self.planes)]
+
     def reflected(
-        self, strengths: Complex[Tensor, "b n *s"], response: Callable[[Bounces], Complex[Tensor, "b w *s"]]
+        self, strengths: Complex[Tensor, "b n *s"], coefficients: Complex[Tensor, "b w *s"]
     ) -> Complex[Tensor, "b n *s"]:
-        """Strengths of the sequences after all bounces."""
-        for bounce in self.bounces:
-            after = strengths[:, bounce.first :] * response(bounce)
-            strengths = torch.cat((strengths[:, : bounce.first], after), 1)
+        """Strengths of the sequences after all bounces, by the reflection coefficients there."""
+        parts = coefficients.split([strengths.shape[1] - first for first in self.firsts], 1)
+        for first, part in zip(self.firsts, parts, strict=True):
+            strengths = torch.cat((strengths[:, :first], strengths[:, first:] * part), 1)
         return strengths
 
 
@@ -97,12 +94,16 @@ def images(
     Each transmitter may have offsets of its own.
     """
     found = [points[:, None].expand(-1, len(sequences), -1)]
-    for column in sequences.unbind(1):
-        first = int((column < 0).sum())
+    for first, column in zip(_firsts(sequences), sequences.unbind(1), strict=True):
         here = column[first:]
         moved = reflect(found[-1][:, first:], normals[here], offsets[..., here])
         found.append(torch.cat((found[-1][:, :first], moved), 1))
     return found
+
+
+def _firsts(sequences: Int[Tensor, "n order"]) -> list[int]:
+    """Number of the first sequence with a plane in each column."""
+    return (sequences < 0).sum(0).tolist()
 
 
 def fold(
@@ -120,36 +121,32 @@ def fold(
     here = receivers[:, None].expand(-1, len(sequences), -1)
     numbers = torch.arange(len(sequences), device=here.device)
     exists = torch.ones(here.shape[:2], dtype=torch.bool, device=here.device)
-    starts, ends, path, bounces = [], [], [], []
-    for step in reversed(range(sequences.shape[1])):
-        first = int((sequences[:, step] < 0).sum())
-        plane = sequences[first:, step]
+    firsts, rounding = _firsts(sequences)[::-1], torch.finfo(here.dtype).eps
+    starts, ends, path = [], [], []
+    planes, facing, cosines = [numbers[:0]], [normals[:0]], [receivers[:, :0]]
+    for back, first in enumerate(firsts, 1):
+        plane = sequences[first:, -back]
         n, d = normals[plane], offsets[plane]
-        begin, target = here[:, first:], seen[step + 1][:, first:]
-        above, below = (begin * n).sum(-1) - d, (target * n).sum(-1) - d
-        fall = above - below
-        share = above / torch.where(fall.abs() > 1e-9, fall, 1e-9)  # [m]; a line along the plane does not meet it
-        at = begin + share.clamp(0, 1)[..., None] * (target - begin)
-        apart = _is_apart(above, begin, d) & _is_apart(below, target, d)
-        exists = torch.cat((exists[:, :first], exists[:, first:] & (share > 0) & (share < 1) & apart), 1)
-        cosines = (functional.normalize(target - begin, dim=-1) * n).sum(-1).abs()
-        bounces.append(Bounces(first, plane, at, cosines))
+        begin = here[:, first:]
+        way = seen[-back][:, first:] - begin
+        height, rise, length = (begin * n).sum(-1) - d, (way * n).sum(-1), way.norm(dim=-1)
+        with torch.no_grad():
+            beyond = height + rise
+            # An end within 4 roundings of its own and the plane's distance from the origin is on the plane.
+            least = 4 * rounding * (begin.norm(dim=-1) + length + d.abs())
+            exists[:, first:] &= (height * beyond < 0) & (height.abs() > least) & (beyond.abs() > least)
+        share = -height / torch.where(rise.abs() > 1e-9, rise, 1e-9)  # [m]; a line along the plane does not meet it
+        at = begin + share.clamp(0, 1)[..., None] * way
+        cosines.append(rise.abs() / length.clamp_min(torch.finfo(length.dtype).tiny))
+        planes.append(plane)
+        facing.append(n)
         starts.append(at)
         ends.append(begin)
         path.append(numbers[first:])
         here = torch.cat((here[:, :first], at), 1)
-    starts.append(seen[0])
-    ends.append(here)
-    path.append(numbers)
-    return Folded(torch.cat(starts, 1), torch.cat(ends, 1), torch.cat(path), bounces, exists)
-
-
-def _is_apart(
-    heights: Float[Tensor, "b w"], points: Float[Tensor, "b w 3"], offsets: Float[Tensor, " w"]
-) -> Bool[Tensor, "b w"]:
-    """True if a height over a plane exceeds 4 roundings of the point's and the plane's distance from the origin."""
-    rounding = torch.finfo(points.dtype).eps
-    return heights.abs() > 4 * rounding * (points.detach().norm(dim=-1) + offsets.detach().abs())
+    start, end = torch.cat((*starts, seen[0]), 1), torch.cat((*ends, here), 1)
+    met = torch.cat(planes), torch.cat(facing), torch.cat(cosines, 1)
+    return Folded(start, end, torch.cat((*path, numbers)), firsts, *met, exists)
 
 
 def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "3"]]:

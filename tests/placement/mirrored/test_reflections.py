@@ -107,21 +107,19 @@ def test_legs_run_from_the_transmitter_over_the_planes_to_the_receiver(order):
 def test_planes_mirror_at_the_angle_of_incidence():
     sequences, _, receivers, paths = folded(2)
     normals, _ = BOX
-    assert [bounce.first for bounce in paths.bounces] == [1, 7]
-    last = paths.bounces[0]
-    assert torch.equal(last.planes, sequences[1:, -1])
-    arriving = receivers[:, None] - last.points
-    expected = ((arriving * normals[last.planes]).sum(-1) / arriving.norm(dim=-1)).abs()
+    assert paths.firsts == [1, 7]
+    assert torch.equal(paths.planes, torch.cat((sequences[1:, -1], sequences[7:, -2])))
+    assert torch.equal(paths.normals, normals[paths.planes])
+    last, first = paths.bounces[:, :36], paths.bounces[:, 36:]
+    arriving = receivers[:, None] - last
+    expected = ((arriving * paths.normals[:36]).sum(-1) / arriving.norm(dim=-1)).abs()
     exists = paths.exists[:, 1:]
-    torch.testing.assert_close(last.cosines[exists], expected[exists])
+    torch.testing.assert_close(paths.cosines[:, :36][exists], expected[exists])
     # At the bounce before, the wave comes from the transmitter and leaves for the next point at the same angle.
-    first = paths.bounces[1]
-    coming = places(20)[:, None] - first.points
-    leaving = last.points[:, 6:] - first.points
-    for ray in (coming, leaving):
-        expected = ((ray * normals[first.planes]).sum(-1) / ray.norm(dim=-1)).abs()
+    for ray in (places(20)[:, None] - first, last[:, 6:] - first):
+        expected = ((ray * paths.normals[36:]).sum(-1) / ray.norm(dim=-1)).abs()
         exists = paths.exists[:, 7:]
-        torch.testing.assert_close(first.cosines[exists], expected[exists])
+        torch.testing.assert_close(paths.cosines[:, 36:][exists], expected[exists])
 
 
 def test_a_plane_behind_both_ends_mirrors_nothing():
@@ -147,7 +145,7 @@ def test_a_ray_along_a_plane_meets_it_nowhere_and_has_gradients():
     seen = images(transmitters, sequences, normals, offsets)
     paths = fold(seen, torch.tensor([[3.0, 2, 1]]), sequences, normals, offsets)
     assert paths.exists.tolist() == [[True, False]]
-    total = paths.start.square().sum() + paths.end.square().sum() + paths.bounces[0].cosines.sum()
+    total = paths.start.square().sum() + paths.end.square().sum() + paths.cosines.sum()
     for gradient in torch.autograd.grad(total, (normals, offsets, transmitters)):
         assert gradient.isfinite().all()
 
