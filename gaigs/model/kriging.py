@@ -143,7 +143,9 @@ class Kriging(Wrapper):
         self._make_fields(False)
         held, trend = links.split.validation, values[len(links.split.train) :]
         model = self._validation_model(links, values)
-        if len(held) and not self.is_scalar and self._is_unlearnt(links, trend, model.fallback):
+        own, other = self._validation_scores(links, (trend, predicted(model.fallback, links, held)))
+        is_unlearnt = is_surely_better(other, own)
+        if is_unlearnt and not self.is_scalar:
             # The likelihood may still mix it in: where the score is higher without it, it is left out.
             models = model, self._validation_model(links, values, (0.0,))
             scores = self._validation_scores(links, (predicted(one, links, held) for one in models))
@@ -152,8 +154,14 @@ class Kriging(Wrapper):
                 getattr(self, name).copy_(getattr(model, name))
         if is_final:
             self._solve(links, values)
-            if len(held):
-                self._is_unlearnt(links, trend, model.fallback, says=True)
+            if is_unlearnt:
+                name = self.fallback_options["name"]
+                log.warning(
+                    "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
+                    "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
+                    *(links.task.monitor, own.mean().abs(), name, other.mean().abs(), name),
+                    100 * (1 - self.weight * (1 - self.trend_weight)),
+                )
             self._log()
         return model
 
@@ -255,20 +263,6 @@ class Kriging(Wrapper):
             else:
                 found[own] = field.deviations(places[own], process).square()
         return found.sqrt()
-
-    def _is_unlearnt(self, links: Links, trend: Tensor, fallback: Model, says: bool = False) -> bool:
-        """True if the trend's values of the validation links score worse than the fallback's by more than chance."""
-        own, other = self._validation_scores(links, (trend, predicted(fallback, links, links.split.validation)))
-        is_unlearnt = is_surely_better(other, own)
-        if is_unlearnt and says:
-            name = self.fallback_options["name"]
-            log.warning(
-                "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
-                "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
-                *(links.task.monitor, own.mean().abs(), name, other.mean().abs(), name),
-                100 * (1 - self.weight * (1 - self.trend_weight)),
-            )
-        return is_unlearnt
 
     def _fit_trend_weight(self, links: Links, values: Tensor, weights: Sequence[float]) -> None:
         """Fits the trend weight, one of ``weights``, and the hyperparameters; ``values`` as for ``_krige_labels``."""

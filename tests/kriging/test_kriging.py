@@ -101,7 +101,7 @@ def half(monkeypatch):
 
     costs = []
     monkeypatch.setattr(kriging, "fit_hyperparameters", fixed)
-    monkeypatch.setattr(Kriging, "_is_unlearnt", lambda *_, **__: False)
+    monkeypatch.setattr(kriging, "is_surely_better", lambda *_, **__: False)
     monkeypatch.setattr(ScalarProcess, "fit", fixed_scalar)
     monkeypatch.setattr(ScalarProcess, "refit", fixed_scalar)
 
