@@ -386,10 +386,13 @@ class Mirrored(Placement):
         """Depth of each path through the obstacles; 0 for no path and, of levels, for a ``FAINT`` one."""
         depths = torch.zeros_like(strengths.real if obstacles.turns is None else strengths)
         with torch.no_grad():
-            lengths = depths.real.index_add(1, folded.path, (folded.end - folded.start).norm(dim=-1)).clamp_min(NEAREST)
-            powers = (strengths.abs() / lengths).square()
-            least = FAINT * powers.sum(1, keepdim=True) if self.skips_faint else 0
-            legs = (powers > least)[:, folded.path].flatten().nonzero()[:, 0]
+            heard = strengths != 0
+            if self.skips_faint:
+                spans = (folded.end - folded.start).norm(dim=-1)
+                lengths = depths.real.index_add(1, folded.path, spans).clamp_min(NEAREST)
+                powers = (strengths.abs() / lengths).square()
+                heard = powers > FAINT * powers.sum(1, keepdim=True)
+            legs = heard[:, folded.path].flatten().nonzero()[:, 0]
         ends = (end.flatten(0, 1).index_select(0, legs) for end in (folded.start, folded.end))
         count, n = strengths.shape
         paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
