@@ -114,7 +114,7 @@ def principal_components(residuals: Inexact[Tensor, "k m"]) -> Inexact[Tensor, "
             torch.manual_seed(0)
             _, values, columns = torch.svd_lowrank(residuals, q=MOST + 16)
         squares, components = values.square().double(), columns.mH
-    energy = residuals.norm().double().square()
+    energy = residuals.norm(dim=1).double().square().sum()
     left = energy - squares.cumsum(0)
     components = components[: min(int((left > LEFT * energy).sum()) + 1, MOST) if energy > 0 else 0]
     return components / components.abs().amax(1, keepdim=True)

@@ -187,10 +187,7 @@ class GaussianSplatting(Model):
         query = batch.query
         # Receivers share what a place excites, unless a part looks at the receiver.
         parts = self.placement, self.tokenizer, self.deformation
-        if len(self.scene.receivers) > 1:
-            places, which = query.unique(with_receivers=any(getattr(part, "sees_receivers", False) for part in parts))
-        else:
-            places, which = query, torch.arange(len(query), device=query.receivers.device)
+        places, which = query.unique(with_receivers=any(getattr(part, "sees_receivers", False) for part in parts))
         return self.respond(self.excite(places), which, batch)
 
     def respond(self, excited: Excited, which: Int[Tensor, " b"], batch: Batch) -> Prediction:

@@ -89,9 +89,10 @@ class LagPooling(PathPooling):
 
             sum |A|² exp(-(2 pi)² D' S D / 2 + j 2 pi D . u)
 
-        with u a path's direction cosines and S their covariance: the Gaussian's, and that of ``LEAST_SPREAD``. Two
-        paths interfere by the product of their coherences, and over a band by sinc(bandwidth (t - t')), with t their
-        delays: the mean over the band of cos(2 pi f (t - t')).
+        with u a path's direction cosines, which shrink to 0 within ``NEAREST`` of the array's middle, and S their
+        covariance: the Gaussian's, and that of ``LEAST_SPREAD``. Two paths interfere by the product of their
+        coherences, and over a band by sinc(bandwidth (t - t')), with t their delays: the mean over the band of
+        cos(2 pi f (t - t')).
         """
         array, amplitudes, coherences = paths.receiver.array, paths.amplitudes, paths.coherences
         steps, pairs, counts = (part.to(amplitudes.device) for part in array.lags)
@@ -135,7 +136,7 @@ def _steering(paths: ReceivedPaths) -> Callable[[Float[Tensor, "k 3"]], Complex[
     return response
 
 
-def _seen(paths: ReceivedPaths) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b 1 1"], Float[Tensor, "c n 3 3"]]:
+def _seen(paths: ReceivedPaths) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b 1 1"], Float[Tensor, "b n 3 3"]]:
     """Gaussians' centres in the array's frame [m], wavenumbers [1/m], and semi-axes across the way [rad/m].
 
     The last are angles as the middle of the array sees them, times the wavenumber.
@@ -145,11 +146,8 @@ def _seen(paths: ReceivedPaths) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "
     wavenumbers = 2 * math.pi / speed_of_light * paths.carriers.to(points)[:, None, None]
     ways = points.norm(dim=-1, keepdim=True).clamp_min(NEAREST)
     units = (points / ways)[..., None]
-    return (
-        points,
-        wavenumbers,
-        (semi_axes - units * (units * semi_axes).sum(-2, keepdim=True)) * (wavenumbers / ways)[..., None],
-    )
+    across = semi_axes - units * (units * semi_axes).sum(-2, keepdim=True)
+    return points, wavenumbers, across * (wavenumbers / ways)[..., None]
 
 
 def _spreads(across: Float[Tensor, "b n 3 3"], steps: Float[Tensor, "k 3"]) -> Float[Tensor, "b n k"]:

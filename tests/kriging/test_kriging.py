@@ -327,6 +327,16 @@ def test_components_are_the_fewest_that_leave_little_out(dtype, exact, monkeypat
     assert len(principal_components(residuals)) == 3
 
 
+def test_components_of_millions_of_numbers_leave_as_little_out():
+    """A single sum in single precision would be wrong by more than ``LEFT``."""
+    generator = torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.randn(*shape, generator=generator)
+    residuals = draw(500, 150) * torch.logspace(0, -2.5, 150) @ draw(150, 32400)
+    basis, _ = torch.linalg.qr(principal_components(residuals).T)
+    over = residuals - residuals @ basis @ basis.T
+    assert over.double().square().sum() < 1.01 * field.LEFT * residuals.double().square().sum()
+
+
 def test_residuals_of_zero_are_kriged_to_zero():
     """As where a receiver's only known link is its mean."""
     scene = example_links("spectrum").scene

@@ -94,8 +94,7 @@ def trace_paths(placement: Mirrored, query: Query) -> TracedPaths:
         _, stands, folded = placement.folded(part)
         receivers.append(placement.scene.positions(stands)[part.receivers])
         points = stands.new_full((len(part), *sequences.shape, 3), torch.nan)
-        parts = folded.bounces.split([len(sequences) - first for first in folded.firsts], 1)
-        for back, (first, met) in enumerate(zip(folded.firsts, parts, strict=True), 1):
+        for back, (first, met) in enumerate(folded.parts(folded.bounces), 1):
             points[:, first:, -back] = met + placement.middle
         bounces.append(points)
     parts = sequences, torch.cat(powers).double(), torch.cat(bounces), query.transmitters, torch.cat(receivers)

@@ -1,6 +1,7 @@
 """Reflection paths: sequences of planes, images, and legs of each path."""
 
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -43,10 +44,13 @@ class Folded(NamedTuple):
         self, strengths: Complex[Tensor, "b n *s"], coefficients: Complex[Tensor, "b w *s"]
     ) -> Complex[Tensor, "b n *s"]:
         """Strengths of the sequences after all bounces, by the reflection coefficients there."""
-        parts = coefficients.split([strengths.shape[1] - first for first in self.firsts], 1)
-        for first, part in zip(self.firsts, parts, strict=True):
+        for first, part in self.parts(coefficients):
             strengths = torch.cat((strengths[:, :first], strengths[:, first:] * part), 1)
         return strengths
+
+    def parts(self, values: Float[Tensor, "b w *s"]) -> Iterator[tuple[int, Float[Tensor, "b k *s"]]]:
+        """Values of the last bounces, of the last but one, and so on, each with the first sequence that has one."""
+        return zip(self.firsts, values.split([self.exists.shape[1] - first for first in self.firsts], 1), strict=True)
 
 
 def seen_from(planes: Float[Tensor, "*w 4"], origin: Float[Tensor, "3"]) -> Float[Tensor, "*w 4"]:
@@ -122,8 +126,7 @@ def fold(
     numbers = torch.arange(len(sequences), device=here.device)
     exists = torch.ones(here.shape[:2], dtype=torch.bool, device=here.device)
     firsts, rounding = _firsts(sequences)[::-1], torch.finfo(here.dtype).eps
-    starts, ends, path = [], [], []
-    planes, facing, cosines = [numbers[:0]], [normals[:0]], [receivers[:, :0]]
+    starts, ends, path, planes, cosines = [], [], [], [numbers[:0]], [receivers[:, :0]]
     for back, first in enumerate(firsts, 1):
         plane = sequences[first:, -back]
         n, d = normals[plane], offsets[plane]
@@ -132,21 +135,20 @@ def fold(
         height, rise, length = (begin * n).sum(-1) - d, (way * n).sum(-1), way.norm(dim=-1)
         with torch.no_grad():
             beyond = height + rise
-            # An end within 4 roundings of its own and the plane's distance from the origin is on the plane.
+            # An end within 4 roundings of the distances of both ends and of the plane is on the plane.
             least = 4 * rounding * (begin.norm(dim=-1) + length + d.abs())
             exists[:, first:] &= (height * beyond < 0) & (height.abs() > least) & (beyond.abs() > least)
-        share = -height / torch.where(rise.abs() > 1e-9, rise, 1e-9)  # [m]; a line along the plane does not meet it
+        share = -height / torch.where(rise.abs() > 1e-9, rise, -1e-9)  # [m]; a line along the plane does not meet it
         at = begin + share.clamp(0, 1)[..., None] * way
         cosines.append(rise.abs() / length.clamp_min(torch.finfo(length.dtype).tiny))
         planes.append(plane)
-        facing.append(n)
         starts.append(at)
         ends.append(begin)
         path.append(numbers[first:])
         here = torch.cat((here[:, :first], at), 1)
     start, end = torch.cat((*starts, seen[0]), 1), torch.cat((*ends, here), 1)
-    met = torch.cat(planes), torch.cat(facing), torch.cat(cosines, 1)
-    return Folded(start, end, torch.cat((*path, numbers)), firsts, *met, exists)
+    plane = torch.cat(planes)
+    return Folded(start, end, torch.cat((*path, numbers)), firsts, plane, normals[plane], torch.cat(cosines, 1), exists)
 
 
 def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "3"]]:
