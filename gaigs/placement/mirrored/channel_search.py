@@ -224,7 +224,7 @@ class ChannelSearch(PlaneSearch):
     def seed(self, room: Room) -> Room:
         """The upright plane along the axes of a room that explains most alone, if there is any."""
         none, normals, trials = (room[0][:0], room[1][:0]), axes(room[0]), []
-        for plane in self.along(*none, normals[normals[:, 2].abs() < 0.01], 0.0)[:6]:
+        for plane in self.along(*none, normals[normals[:, 2].abs() < 0.01], 0.0):
             for moved, material in self.proposals(plane[None], 0, self.reach, 0.04, SLABS[::3]):
                 upright = moved * moved.new_tensor([1.0, 1.0, 0.0, 1.0]) / moved[:2].norm()
                 trials.append((upright[None], material[None]))
@@ -240,7 +240,7 @@ class ChannelSearch(PlaneSearch):
         while len(planes) < self.most:
             before = self.cost((planes, slabs))
             new = [plane for plane in others if not self.alike(planes, plane).any()]
-            for candidates in filter(None, (self.along(planes, slabs, axes(planes), LITTLE)[:4], new)):
+            for candidates in filter(None, (self.along(planes, slabs, axes(planes), LITTLE), new)):
                 found = self.with_best(planes, slabs, candidates)
                 if self.cost(found) < before - LITTLE / 2:  # more than what keeps a plane
                     break
@@ -251,8 +251,14 @@ class ChannelSearch(PlaneSearch):
         return self.settled(planes, slabs, polishes=True) if len(planes) > count else (planes, slabs)
 
     def along(self, planes, slabs, normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "4"]]:
-        """Planes with these normals that explain a share of what real strengths leave, the best first."""
-        lines, found = self.grid(normals, 400, BEYOND), []
+        """Planes with these normals that explain a share of what real strengths leave.
+
+        At most four, the best first, and as many that have all places on one side, as walls have: planes amid the
+        places score higher by what is left of others.
+        """
+        amid: list[tuple[float, Tensor]] = []
+        walls: list[tuple[float, Tensor]] = []
+        lines = self.grid(normals, 400, BEYOND)
         rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
         shares = [log_share(rest, receiver.flat) for receiver, rest in zip(self.many, rests, strict=True)]
         least = least * torch.cat(shares).mean().exp().item()  # a share of what is left lowers its log by about as much
@@ -260,8 +266,12 @@ class ChannelSearch(PlaneSearch):
         for line, scores in zip(lines, self.scores(self.many, profiles, lines), strict=True):
             for plane in planes:
                 scores[self.alike(line, plane)] = 0
-            found += [(scores[at].item(), line[at]) for at in maxima(scores, 11)]
-        return [plane for score, plane in sorted(found, key=lambda pair: -pair[0]) if score > least]
+            heights = self.points.to(line) @ line[0, :3]
+            is_wall = (line[:, 3] < heights.min()) | (line[:, 3] > heights.max())
+            for found, own in ((amid, scores * ~is_wall), (walls, scores * is_wall)):
+                found += [(own[at].item(), line[at]) for at in maxima(own, 11)]
+        best = (sorted(found, key=lambda pair: -pair[0])[:4] for found in (amid, walls))
+        return [plane for found in best for score, plane in found if score > least]
 
     def with_best(self, planes, slabs, candidates: list[Float[Tensor, "4"]]) -> Room:
         """The planes with the best candidate."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Inexact, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -48,7 +48,7 @@ class Folded(NamedTuple):
             strengths = torch.cat((strengths[:, :first], strengths[:, first:] * part), 1)
         return strengths
 
-    def parts(self, values: Float[Tensor, "b w *s"]) -> Iterator[tuple[int, Float[Tensor, "b k *s"]]]:
+    def parts(self, values: Inexact[Tensor, "b w *s"]) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
         """Values of the last bounces, of the last but one, and so on, each with the first sequence that has one."""
         return zip(self.firsts, values.split([self.exists.shape[1] - first for first in self.firsts], 1), strict=True)
 

@@ -219,3 +219,15 @@ def test_real_strengths_are_not_negative_unless_signed(monkeypatch):
         (both, right) = parts
         expected, _ = nnls(both.T, right)
         np.testing.assert_allclose(rest[k], labels[k] - expected @ columns, rtol=0, atol=1e-9)
+
+
+def test_walls_are_tried_beside_planes_amid_the_places(monkeypatch):
+    """Here three planes amid the places have higher scores than the wall."""
+    links, _ = room()
+    own, normal = search(links), torch.tensor([[1.0, 0, 0]]).double()
+    wall = float(own.points[:, 0].max()) + 0.3
+    peaks = torch.tensor([[-1.5, 1.0], [0.0, 0.9], [1.5, 0.8], [wall, 0.5]]).double()
+    score = lambda _, __, grid: (peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()).sum(-1)
+    monkeypatch.setattr(own, "scores", score)
+    found = own.along(torch.zeros(0, 4).double(), torch.zeros(0, 3).double(), normal, 0.1)
+    assert [plane[3].item() for plane in found] == pytest.approx([-1.5, 0.0, wall], abs=0.03)
