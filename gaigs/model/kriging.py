@@ -143,10 +143,10 @@ class Kriging(Wrapper):
         self._make_fields(False)
         held, trend = links.split.validation, values[len(links.split.train) :]
         model = self._validation_model(links, values)
-        own = other = torch.zeros(0)
+        is_unlearnt = False
         if len(held):
             own, other = self._validation_scores(links, (trend, predicted(model.fallback, links, held)))
-        is_unlearnt = is_surely_better(other, own)
+            is_unlearnt = is_surely_better(other, own)
         if is_unlearnt and not self.is_scalar:
             # The likelihood may still mix it in: where the score is higher without it, it is left out.
             models = model, self._validation_model(links, values, (0.0,))
@@ -272,11 +272,9 @@ class Kriging(Wrapper):
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
         residuals: dict[float, Any] = {trend_weight: [] for trend_weight in weights}
         for part in torch.arange(len(index)).split(PART):
-            read = links.labels[index[part]], values[part], predicted(self.fallback, links, index[part])
-            # Labels that are aligned, as channels, are so by all of their numbers.
-            labels, trend, fallback = map(thin_labels, read) if type(links.task).align is Task.align else read
+            labels, fallback = links.labels[index[part]], predicted(self.fallback, links, index[part])
             for trend_weight, parts in residuals.items():
-                mean = blend(links.task, trend, fallback, trend_weight)
+                mean = blend(links.task, values[part], fallback, trend_weight)
                 parts.append(thin_labels(links.task.align(labels, mean) - mean))
 
         if self.is_scalar:
