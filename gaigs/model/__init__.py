@@ -88,6 +88,11 @@ class Model(nn.Module):
         super().__init__()
         self.scene = scene
 
+    @property
+    def device(self) -> torch.device:
+        """The device of the model's tensors; the CPU for a look-up, which has none."""
+        return next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
+
     def fit(self, links: Links) -> None:
         """Learns from the training links without gradients; by default nothing.
 
@@ -257,8 +262,7 @@ class Model(nn.Module):
         if not isinstance(transmitters, Query):
             for message in messages + extrapolations(query, scene):
                 warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # names the line that called ``predict``
-        device = next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
-        query, directions = query.to(device), None if directions is None else directions.to(device)
+        query, directions = query.to(self.device), None if directions is None else directions.to(self.device)
         batches = (Batch(part, directions) for part in query.parts(batch_size))
         if interval is not None:
             if messages or model is not self:

@@ -102,7 +102,8 @@ class MirroredSplatting(GaussianSplatting):
             if search.receivers:
                 self._find_planes(search)
         if searches and isinstance(self.pooling, PathRssi):
-            trend = 0 * links.labels if self.trend is None else self.trend(Batch(links.query)).value
+            batch = Batch(links.query).to(self.device)
+            trend = 0 * links.labels if self.trend is None else self.trend(batch).value.cpu()
             own = trend, self._start(), self.placement.used.tolist(), self.placement.order
             self.levels = LevelSearch(links, carriers(self.scene, links.query), *own)
         if not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling)) or self.trend is not None:
@@ -111,10 +112,10 @@ class MirroredSplatting(GaussianSplatting):
         labels, query = links.labels[train], links.query[train]
         waves = direct_gains(self.scene, query)[:, None, None] * direct_waves(self.scene, query, frequencies, sign)
         own = [query.receivers == receiver for receiver in range(len(self.scene.receivers))]
-        gains = torch.stack([fit_gain(labels[some], waves[some]) for some in own]) / self.pooling.strength
+        gains = torch.stack([fit_gain(labels[some], waves[some]) for some in own]) / self.pooling.strength.cpu()
         gains = torch.where((gains != 0) & (sign != 0), gains, 0.1)
         placement = self.placement
-        start = placement.planes[placement.used if placement.walls else placement.used[:0]]
+        start = placement.planes[placement.used if placement.walls else placement.used[:0]].cpu()
         placement.start_from_free_space(gains.conj() if sign > 0 else gains)
         placement.enable_phases(speed_of_light / frequencies.mean().item())
         if placement.fixed or not placement.order or labels[0].numel() < FEWEST:

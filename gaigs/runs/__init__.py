@@ -132,7 +132,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "data": links.remarks,
         "split": links.split.name,
         "seed": config["seed"],
-        "device": evaluation.device_name(evaluation.device_of(model)),
+        "device": evaluation.device_name(model.device),
         "rasterizer": None,
         "train_seconds": fitted.seconds,
         "inference_ms": evaluation.inference_ms(model, links),

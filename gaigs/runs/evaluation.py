@@ -82,7 +82,7 @@ def fitted(look_up: Model, links: Links) -> Model:
 def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:
     """The model's own deviations of some links, ``Model.spread``, on the CPU; ``values`` are its predictions."""
     parts = zip(links.query[index].parts(BATCH), values.split(BATCH), strict=True)
-    device, directions = device_of(model), links.task.directions
+    device, directions = model.device, links.task.directions
     batches = ((Batch(query, directions).to(device), part.to(device)) for query, part in parts)
     return torch.cat([model.spread(batch, part).cpu() for batch, part in batches])
 
@@ -140,7 +140,7 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
     if not len(validation):
         return
     for own, other in (parts, parts[::-1]) if all(map(len, parts)) else ((validation, validation),):
-        kriged = Kriging(links.scene, model.trend, model.fallback_options).to(device_of(model))
+        kriged = Kriging(links.scene, model.trend, model.fallback_options).to(model.device)
         kind = {"is_final": False, "by_paths": model.by_paths}
         yield kriged.krige(replace(links, split=split.choosing(own)), **kind), other, split.train
 
@@ -211,7 +211,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
         baselines = composed([f"task={task.name}"], {})["baselines"] if files_of("task", task.name) else ()
     baselines = [baselines] if isinstance(baselines, str) else baselines
     scores = score(models, build_baselines(baselines, own, links.scene), links)
-    return Evaluation(task, links.split.name, scores, device_name(device_of(model)))
+    return Evaluation(task, links.split.name, scores, device_name(model.device))
 
 
 def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
@@ -336,7 +336,7 @@ def inference_ms(model: Model, links: Links) -> float:
 
 def render_ms(model: Model, links: Links) -> float | None:
     """Time of rendering alone [ms]; None for a model that renders nothing."""
-    work = call_optional(model, "rendering", links.batch(links.split.test[:1]).to(device_of(model)))
+    work = call_optional(model, "rendering", links.batch(links.split.test[:1]).to(model.device))
     if work is None:
         return None
     with torch.no_grad():
@@ -354,11 +354,6 @@ def median_ms(work: Callable, warm_up: int = 5, repeats: int = 25) -> float:
         wait()
         seconds.append(time.perf_counter() - start)
     return 1e3 * statistics.median(seconds[warm_up:])
-
-
-def device_of(model: Model) -> torch.device:
-    """The device of a model."""
-    return next((tensor.device for tensor in model.state_dict().values()), torch.device("cpu"))
 
 
 def device_name(device: torch.device) -> str:

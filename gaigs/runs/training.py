@@ -29,7 +29,7 @@ from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
 from gaigs.registry import call, configuration_of, registry
-from gaigs.runs.evaluation import calibrated, device_of, is_trained
+from gaigs.runs.evaluation import calibrated, is_trained
 from gaigs.runs.folder import check_same_links, claim, fingerprint
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS, make_budget
@@ -53,7 +53,8 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
         options: Values by their keys or names, as in ``gaigs.compose``: ``max_steps=300, seed=0``.
 
     Returns:
-        The model with the best validation score, in evaluation mode; with ``mirrored`` a kriged model.
+        The model with the best validation score, on the CPU and in evaluation mode, as ``gaigs.load`` gives it; with
+        ``mirrored`` a kriged model.
 
     Raises:
         TypeError: An option has the wrong type.
@@ -95,7 +96,7 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
         loss = registry("loss").build(parts.pop("loss", config["loss"]), task=links.task)
         if parts:
             own = registry("model").build(config["model"] | parts, scene=links.scene)
-        return fit(own, loss, links, config, place).models[config["model"]["name"]].eval()
+        return fit(own, loss, links, config, place).models[config["model"]["name"]].eval().cpu()
 
 
 class Fitted(NamedTuple):
@@ -155,7 +156,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         checkpoint.add_calibration(best, model)
         return Fitted({name: model}, {name: model}, start, seconds)
     began = time.monotonic()
-    validation_model = kriged.to(device_of(model)).krige(links)
+    validation_model = kriged.to(model.device).krige(links)
     kriging_seconds = time.monotonic() - began
     kriged.calibration = calibrated(validation_model, links)
     checkpoint.exchange_model(best, kriged, ".".join(filter(None, ("trend", trained))))
@@ -177,7 +178,7 @@ def with_others(model: Model, loss: Loss, links: Links, config: dict, folder: Pa
         other, seconds = descend(other, loss, links, config | {"seed": seed}, place, searched)
         members.append(other)
         total += seconds
-    ensemble = Ensemble(links.scene, members).eval().to(device_of(model))
+    ensemble = Ensemble(links.scene, members).eval().to(model.device)
     ensemble.fit(links)
     return ensemble, total
 

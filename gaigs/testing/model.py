@@ -16,7 +16,7 @@ from gaigs.registry import registry
 from gaigs.scene import Scene
 from gaigs.task.csi import Csi
 from gaigs.testing import checks
-from gaigs.testing.checks import require, require_close, require_tensor
+from gaigs.testing.checks import require, require_close, require_same, require_tensor
 
 
 def check_model(build: Callable[[Scene], Model], links: Links, device: torch.device | str = "cpu") -> None:
@@ -28,7 +28,7 @@ def check_model(build: Callable[[Scene], Model], links: Links, device: torch.dev
     model.fit(links)
     index = torch.cat((links.split.train, links.split.test))
     receivers = links.query.receivers[index]
-    batch = links.batch(index[receivers == receivers[0]][:5]).to(device)
+    batch = links.batch(index[receivers == receivers[0]][:5]).to(model.device)
     query = batch.query.to("cpu")
     stand = links.receivers[query.receivers[0]].pose.position[None]
     places = torch.cat((query.transmitters, stand, stand + 1e3))
@@ -37,7 +37,7 @@ def check_model(build: Callable[[Scene], Model], links: Links, device: torch.dev
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExtrapolationWarning)  # one place of the query is far away
         _check_predictions(model, links, query)
-        _check_evaluation(model, batch, links.batch(index[:8]).to(device))
+        _check_evaluation(model, batch, links.batch(index[:8]).to(model.device))
         _check_report(model, batch)
         checks.require_groups(model.parameter_groups(), model)
         if not model.state_dict():
@@ -48,7 +48,7 @@ def check_model(build: Callable[[Scene], Model], links: Links, device: torch.dev
         twin.load_state_dict(model.state_dict())
         # Predicted again, because a training step may move running statistics, as of a batch normalisation.
         values, twice = (predictor.train().predict(query) for predictor in (model, twin))
-        require(torch.equal(values, twice), "a model's state dict must restore its predictions")
+        require_same(values, twice, "a model's state dict must restore its predictions")
 
 
 def _check_predictions(model: Model, links: Links, query: Query) -> None:
@@ -60,7 +60,7 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
     require(model.training, "predict must leave the model in the mode it was in")
     require_tensor("predictions", values, (len(places), *task.shape), task.dtype)
     require(not values.requires_grad, "predictions must not carry a gradient")
-    require(torch.equal(values, model.predict(query)), "two calls must give the same predictions")
+    require_same(values, model.predict(query), "two calls must give the same predictions")
     require_close(predict(places, batch_size=1), values, 1e-4, "the batch size must not change predictions")
     require(tuple(predict(places[:0]).shape) == (0, *task.shape), "no transmitters must give no predictions")
     grid = predict(places.expand(2, *places.shape))

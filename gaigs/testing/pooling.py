@@ -16,7 +16,7 @@ from gaigs.pooling import Pooling
 from gaigs.pooling.paths import PathPooling, ReceivedPaths
 from gaigs.query import Query
 from gaigs.scene import Scene
-from gaigs.testing.checks import PRECISION, require, require_close, require_gradients, require_tensor
+from gaigs.testing.checks import PRECISION, require, require_close, require_gradients, require_same, require_tensor
 
 
 def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch.device | str = "cpu") -> None:
@@ -61,8 +61,8 @@ def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch
         value = module(received, query)
         wanted = dtype.to_complex() if task.dtype.is_complex else dtype
         require_tensor("the value", value, (b, *task.shape), wanted, device)
-        require(torch.equal(value, module(received, query)), "two calls must give the same value")
-        require(torch.equal(value, other(received, query)), "a pooling's state dict must restore it")
+        require_same(value, module(received, query), "two calls must give the same value")
+        require_same(value, other(received, query), "a pooling's state dict must restore it")
         alone = module(rows_of(received, slice(-1, None)), query[-1:])
         require_close(alone, value[-1:], PRECISION[dtype], f"a value must not depend on the other {noun}")
         require_gradients([value], dict(module.named_parameters()) | leaves)

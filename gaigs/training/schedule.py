@@ -30,8 +30,9 @@ def make_optimizer(
     parts = [{"params": list(parameters), "lr": rates[name], "name": name} for name, parameters in groups.items()]
     parameters = [parameter for group in groups.values() for parameter in group]
     implementations = {"fused", "foreach", "differentiable"} & inspect.signature(kind).parameters.keys()
-    if "fused" in implementations and not implementations & options.keys():
-        options["fused"] = all(p.is_floating_point() and p.device.type == "cpu" for p in parameters)
+    on_cpu = all(p.is_floating_point() and p.device.type == "cpu" for p in parameters)
+    if "fused" in implementations and on_cpu and not implementations & options.keys():
+        options["fused"] = True  # False would keep torch from the grouped steps that it takes by itself on a GPU
     optimizer = call("training.optimizer", kind, options, params=parts)
     for group in optimizer.param_groups:
         if group["name"] != "network" and "weight_decay" in group:

@@ -39,6 +39,7 @@ class Squares(Benchmark):
 
 @pytest.fixture(autouse=True)
 def named(monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     monkeypatch.setattr("gaigs.benchmark.device_name", lambda device: f"a {device}")
 
 
@@ -100,8 +101,7 @@ def test_a_foreign_or_damaged_file_is_kept(tmp_path, content):
         ({"device": "cuda"}, r"benchmark\.device must be null or one of cpu, got 'cuda'"),
     ],
 )
-def test_bad_options(options, message, monkeypatch, tmp_path):
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+def test_bad_options(options, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         Squares([1]).run(tmp_path, **options)
 

@@ -44,7 +44,11 @@ def composed_once(monkeypatch):
 
 @pytest.fixture
 def fake(monkeypatch):
-    """Trainings are made up: they have a score, by their configuration, or an error. Their models are noted."""
+    """Trainings are made up: they have a score, by their configuration, or an error. Their models are noted.
+
+    Each is made once, on any machine: a benchmark trains on its GPU too.
+    """
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     trained = []
 
     def install(score=lambda config: 0.5):

@@ -223,7 +223,7 @@ class Mirrored(Placement):
         planes = planes[:most]
         for number, plane in enumerate(planes):
             self.place(number, plane)
-        self.kept.copy_(self.sequences_of(torch.arange(len(planes), device=self.kept.device)))
+        self.kept.copy_(self.sequences_of(torch.arange(len(planes))))
         self.most.copy_(self.kept.sum())
 
     @property
@@ -261,7 +261,8 @@ class Mirrored(Placement):
 
     def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
         """True for each sequence of these planes alone."""
-        return torch.isin(self.sequences, torch.cat((planes, planes.new_tensor([-1])))).all(1)
+        planes = torch.cat((planes, planes.new_tensor([-1]))).to(self.sequences.device)
+        return torch.isin(self.sequences, planes).all(1)
 
     @torch.no_grad()
     def enable_phases(self, wavelength: float) -> None:
