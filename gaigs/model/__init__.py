@@ -1,6 +1,7 @@
 """Models predict a task's value from transmitter, receiver, carrier and, for spectra, directions."""
 
 import copy
+import itertools
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -91,7 +92,8 @@ class Model(nn.Module):
     @property
     def device(self) -> torch.device:
         """The device of the model's tensors; the CPU for a look-up, which has none."""
-        return next((tensor.device for tensor in self.state_dict().values()), torch.device("cpu"))
+        tensors = itertools.chain(self.parameters(), self.buffers())
+        return next((tensor.device for tensor in tensors), torch.device("cpu"))
 
     def fit(self, links: Links) -> None:
         """Learns from the training links without gradients; by default nothing.

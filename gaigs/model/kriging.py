@@ -261,7 +261,7 @@ class Kriging(Wrapper):
             if self.by_paths:
                 variances = field.variances(places[own].double(), process)
                 squares = trend.margins(query[own]).abs().square()
-                found[own] = (variances.to(squares)[..., None, None] * squares).sum(1)
+                found[own] = (variances.to(squares)[..., None, None] * squares).sum(1).to(found)
             else:
                 found[own] = field.deviations(places[own], process).square()
         return found.sqrt()
@@ -323,7 +323,7 @@ class Kriging(Wrapper):
             for part in torch.arange(len(rows)).split(PART):
                 some = rows[part]
                 mean = blend(links.task, values[some], predicted(self.fallback, links, index[some]), trend_weight)
-                left[part] = links.task.align(labels[some], mean) - mean
+                left[part] = (links.task.align(labels[some], mean) - mean).to(left)
             if left.is_complex():
                 left = left * damping(left, labels[rows], query.receivers[rows])[:, None, None]
             return left

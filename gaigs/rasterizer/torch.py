@@ -16,7 +16,8 @@ TILE = 16
 
 CHUNK, LARGE_CHUNK = 2**20, 2**24
 """(transmitter, splat, pixel) triples worked on at a time, on the CPU and on others: an array of float32 then has
-4 MiB, which a core's cache holds, or 64 MiB, since a GPU starts an operation as slowly as it does a million triples."""
+4 MiB, which a core's cache holds, or 64 MiB, since a GPU starts an operation as slowly as it does a million triples.
+Some sixteen arrays live at a time."""
 
 
 @register("rasterizer", "torch")

@@ -71,9 +71,7 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
         require_close(predict(places, directions=rays), values.flatten(1)[:, 3::7], 1e-4, rule)
     if isinstance(task, Csi):
         own = task.frequencies
-        require(
-            torch.equal(predict(places, frequencies=own[-1:]), values[..., -1:]), "own subcarriers must keep values"
-        )
+        require_same(predict(places, frequencies=own[-1:]), values[..., -1:], "own subcarriers must keep values")
         # In another order, and so little beside their own that values hardly change.
         beside = predict(places, frequencies=own.flip(0) * (1 + 1e-8))
         require_close(beside, values.flip(-1), 2e-3, "predict must give the subcarriers of its argument")

@@ -140,6 +140,17 @@ def test_the_model_contract_holds(task, half):
 
 
 @TASKS
+def test_a_trend_in_double_precision_is_kriged_too(task):
+    links = make(task, smooth=1.0, trained=1.0)
+    single, double = (Kriging(links.scene, trend) for trend in (Trained(links.scene), Trained(links.scene).double()))
+    values = []
+    for model in (single, double):
+        model.krige(links)
+        values.append(model.predict(links.query[links.split.test]))
+    torch.testing.assert_close(values[1].to(values[0]), values[0], rtol=1e-3, atol=1e-3)
+
+
+@TASKS
 @pytest.mark.parametrize("carriers", [(), (1e9, 1.7e9, 2.9e9)])
 def test_predictions_are_the_formula(task, carriers, half, monkeypatch):
     links = make(task, carriers=carriers, smooth=1.0, trained=0.5, noise=0.1)
