@@ -143,6 +143,9 @@ def test_variance_grows_away_from_known_places():
     near, far = (model.fields[0].variances(at, process) for at in (places, places + 20))
     assert (near < far).all()
     torch.testing.assert_close(far, torch.full_like(far, process.deviation**2), rtol=1e-2, atol=0)
+    trend.double()
+    double = model.deviations(links.batch(torch.arange(5))).square()
+    torch.testing.assert_close(double, variance, rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize(("smooth", "noise", "validation"), [(0.0, 1.0, 20), (0.4, 0.0, 0)])
