@@ -35,6 +35,7 @@ def run(config: DictConfig) -> float | None:
     words = OmegaConf.to_container(settings.overrides.task)
     overrides = [word for word in words if not word.lstrip("+~").startswith(("command=", "benchmark=", "benchmark."))]
     jobs = settings.launcher.get("n_jobs", 1) if is_sweep else 1
+    processes.keep_memory()
     try:
         # A process of joblib runs several jobs.
         with processes.stopping(waits=is_sweep and launcher == "JoblibLauncher"):

@@ -1,6 +1,9 @@
 """Resources and signals of a run: threads, memory, Ctrl-C and SIGTERM, other processes, locked folders."""
 
+import atexit
 import contextlib
+import ctypes
+import gc
 import os
 import signal
 import sys
@@ -31,6 +34,20 @@ class Stopped(KeyboardInterrupt):
     def __init__(self, message: str, number: int):
         super().__init__(message)
         self.number = number
+
+
+def keep_memory() -> None:
+    """Makes this process faster and its memory larger.
+
+    Freed arrays stay with the process: with glibc each step would map their pages anew, a tenth of the time of a run.
+    Imports make half a million objects that stay: looking for cycles among them is rarer, and left out at the end.
+    """
+    gc.set_threshold(50_000)
+    atexit.register(gc.freeze)
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
+        trim, mapped = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h, in bytes
+        libc.mallopt(trim, 2**31 - 1)
+        libc.mallopt(mapped, 2**30) or libc.mallopt(mapped, 2**25)  # older ones take no more
 
 
 @contextlib.contextmanager
