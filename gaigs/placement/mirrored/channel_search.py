@@ -54,6 +54,9 @@ CELLS = 64, 40
 over the room's diagonal; cells its cube. At 60 GHz they reach 2 cm, and 0.004 rad in a room of 10 m; in a hall of 100 m
 0.007 rad at 3.5 GHz."""
 
+ENTRIES = 40_000_000
+"""Most waves of one axis of coordinates in ``aligned``, some seconds' work: offsets times places times numbers."""
+
 FEWEST = 8
 """Fewest numbers of a channel in which planes can be searched: one path explains any single number."""
 
@@ -161,8 +164,9 @@ class ChannelSearch(PlaneSearch):
     each place, so neither phases nor blockage are assumed. Then phases count: a periodogram over offset and two tilts
     proposes planes and slabs whose reflections have like phases at all places, and the residual decides, with strengths
     that are real and not negative. It sees delays too, so it tells planes half a wavelength apart. Planes that explain
-    hardly anything are dropped, and what they explained is searched anew. At last the room grows along its axes, which
-    shows planes that hide behind the direct path.
+    hardly anything are dropped, and what they explained is searched anew. Where planes are tilted, a second room has
+    walls along the axes of coordinates, see ``aligned``. At last the room grows along its axes, which shows planes that
+    hide behind the direct path.
 
     Args:
         links: Their training links count; of the task ``csi``.
@@ -200,12 +204,17 @@ class ChannelSearch(PlaneSearch):
     def found(self) -> Room:
         """``run`` about the middle of the room."""
         planes = self.find(self.start)
-        if not len(planes):
-            return planes, planes[:, :3]
-        best = self.without_false(*self.resolve(self.refine(planes, 300, 5e-3)))
+        best = planes, planes[:, :3]
+        if len(planes):
+            best = self.without_false(*self.resolve(self.refine(planes, 300, 5e-3)))
+        if not len(best[0]) or not is_square(best[0]):  # tilted planes may stand for several upright ones
+            walls = self.aligned()
+            if len(walls[0]) and self.cost(walls) < self.cost(best):
+                moved = self.without_false(*self.grown(*self.settled(*walls, polishes=True)))
+                return min(walls, moved, key=lambda room: self.in_common(self.many, *room)[0])
         if not len(best[0]):
             return best
-        if not is_square(best[0]):  # tilted planes may stand for several upright ones
+        if not is_square(best[0]):
             first = (self.start, SLABS[1].repeat(len(self.start), 1)) if len(self.start) else self.seed(best)
             upright = self.without_false(*self.grown(*first, best[0]))
             if self.cost(upright) < self.cost(best):
@@ -218,6 +227,73 @@ class ChannelSearch(PlaneSearch):
     def cost(self, room: Room) -> float:
         """What is left, and the least that each plane must explain."""
         return self.left(*self.some(room[0]), *room).item() + LITTLE * len(room[0])
+
+    # --- walls along the axes of coordinates ---
+
+    def aligned(self) -> Room:
+        """Planes square to the axes of coordinates, one after the other: a matching pursuit.
+
+        Each image has one real gain for all places, as by a half-space. One gain explains hardly anything by chance, so
+        offsets show to millimetres also where free strengths at each place explain any few numbers of a channel.
+
+        Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
+        """
+        elements = max(len(receiver.elements) for receiver in self.receivers)
+        subcarriers, count = max(4, 32 // elements), math.ceil(16 * self.diagonal / self.wavelength)
+        planes, most = self.start, min(200, ENTRIES // (count * elements * subcarriers))
+        parts = self.drawn(most, subcarriers)
+        lines = self.grid(torch.eye(3).to(planes), count, BEYOND)
+        places = sum(len(part.places) for part in parts)
+        while len(planes) < self.most and most >= 50:  # fewer places agree by chance
+            left, rests = self.in_common(parts, planes, SLABS[1].repeat(len(planes), 1))
+            shares = torch.stack([self.explained(parts, rests, line) for line in lines])
+            for plane in planes:
+                shares[self.alike(lines.flatten(0, 1), plane).view(shares.shape)] = 0
+            if shares.max() < 6 / places * left:  # by chance one in as many as the places have numbers, of thousands
+                break
+            planes = torch.cat((planes, lines.flatten(0, 1)[shares.argmax(), None]))
+        return planes, SLABS[1].repeat(len(planes), 1)
+
+    def in_common(self, receivers, planes, slabs) -> tuple[float, list[Complex[Tensor, "b k"]]]:
+        """Mean share of power that paths with a real gain each for all places leave, and what they leave.
+
+        These are the direct path and single reflections.
+        """
+        sequences = torch.arange(-1, len(planes))[:, None]
+        waves, channels, powers = [], [], []
+        for receiver, turn in zip(receivers, self.phases(planes[:0], receivers), strict=True):
+            waves.append(receiver.single().reflected(planes, slabs, sequences))
+            channels.append((receiver.flat * turn[:, None].conj()).to(torch.complex64))
+            powers.append(receiver.flat.abs().square().sum(1).float()[:, None, None])
+        rests = []
+        for _ in range(1 if self.common else 3):
+            gram, right = torch.zeros(1, 1), torch.zeros(1, 1)
+            for w, channel, power in zip(waves, channels, powers, strict=True):
+                gram = gram + ((w.conj() @ w.mT).real / power).sum(0, keepdim=True)
+                right = right + ((w.conj() @ channel[..., None]).real / power).sum(0, keepdim=True)
+            gains = torch.linalg.solve(_ridged(gram, 1e-6), right).mT.to(waves[0])
+            known = [(gains @ w)[:, 0] for w in waves]
+            if not self.common:  # phases of the places follow what is known of them
+                for number, (one, channel) in enumerate(zip(known, channels, strict=True)):
+                    turn = (one * channel.conj()).sum(1, keepdim=True).sgn()
+                    channels[number] = torch.where(turn == 0, channel, channel * turn)
+            rests = [channel - one for channel, one in zip(channels, known, strict=True)]
+        shares = [rest.abs().square().sum(1) / power[:, 0, 0] for rest, power in zip(rests, powers, strict=True)]
+        return torch.cat(shares).mean().item(), rests
+
+    def explained(self, receivers, rests, line: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
+        """Share of power that one more image explains with a gain in common, for planes of a line."""
+        found = []
+        for planes in line.split(64):
+            number = torch.arange(len(planes))[:, None]
+            total, size = line.new_zeros(len(planes)), line.new_zeros(len(planes))
+            for receiver, rest in zip(receivers, rests, strict=True):
+                waves = receiver.single().reflected(planes, SLABS[1].repeat(len(planes), 1), number)
+                powers = receiver.flat.abs().square().sum(1, keepdim=True).float()
+                total += ((waves.conj() @ rest[..., None]).real[..., 0] / powers).sum(0)
+                size += (waves.abs().square().sum(2) / powers).sum(0)
+            found.append(total.clamp_min(0).square() / size.clamp_min(torch.finfo(line.dtype).tiny))
+        return torch.cat(found) / sum(len(receiver.places) for receiver in receivers)
 
     # --- planes along axes ---
 

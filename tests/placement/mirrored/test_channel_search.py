@@ -162,6 +162,18 @@ def test_tilted_plane_is_turned_square():
 WALL, PARALLEL, FLOOR = [1.0, 0, 0, -0.4], [1.0, 0, 0, 6.3], [0, 0, 1.0, -0.2]
 
 
+def test_walls_along_axes_show_where_channels_have_few_numbers():
+    """One element and 8 subcarriers: free strengths at each place explain these channels by many planes."""
+    walls = np.array([[1.0, 0, 0, -0.1], [0, 1.0, 0, 0.1]])
+    links, _ = room(count=200, walls=walls)
+    few = Csi(1, links.task.frequencies[:8])
+    receiver = replace(links.receivers[0], array=Array(links.receivers[0].array.elements[:1]))
+    links = replace(links, receivers=(receiver,), labels=links.labels[:, :1, :8], task=few)
+    planes, _ = search(links).run()
+    planes = planes[planes[:, 1].argsort()]
+    torch.testing.assert_close(planes, torch.from_numpy(walls), rtol=0, atol=5e-3)
+
+
 @pytest.mark.parametrize("walls", [[WALL], [WALL, PARALLEL], [WALL, FLOOR]])
 def test_room_grows_by_planes_along_its_axes(walls):
     links, walls = room(walls=np.array(walls))
