@@ -39,7 +39,7 @@ class Stopped(KeyboardInterrupt):
 def keep_memory() -> None:
     """Makes this process faster and its memory larger.
 
-    Freed arrays stay with the process: with glibc each step would map their pages anew, a tenth of the time of a run.
+    Freed arrays stay with the process: with glibc each step would map their pages anew.
     Imports make half a million objects that stay: looking for cycles among them is rarer, and left out at the end.
     """
     gc.set_threshold(50_000)

@@ -241,15 +241,17 @@ class ChannelSearch(PlaneSearch):
         elements = max(len(receiver.elements) for receiver in self.receivers)
         subcarriers, count = max(4, 32 // elements), math.ceil(16 * self.diagonal / self.wavelength)
         planes, most = self.start, min(200, ENTRIES // (count * elements * subcarriers))
+        if most < 50:  # too few places for the many wavelengths of a large hall
+            return planes, SLABS[1].repeat(len(planes), 1)
         parts = self.drawn(most, subcarriers)
         lines = self.grid(torch.eye(3).to(planes), count, BEYOND)
         places = sum(len(part.places) for part in parts)
-        while len(planes) < self.most and most >= 50:  # fewer places agree by chance
+        while len(planes) < self.most:
             left, rests = self.in_common(parts, planes, SLABS[1].repeat(len(planes), 1))
             shares = torch.stack([self.explained(parts, rests, line) for line in lines])
             for plane in planes:
                 shares[self.alike(lines.flatten(0, 1), plane).view(shares.shape)] = 0
-            if shares.max() < 6 / places * left:  # by chance one in as many as the places have numbers, of thousands
+            if shares.max() < 6 / places * left:  # the best of thousands of offsets reaches it by chance
                 break
             planes = torch.cat((planes, lines.flatten(0, 1)[shares.argmax(), None]))
         return planes, SLABS[1].repeat(len(planes), 1)
