@@ -57,6 +57,9 @@ over the room's diagonal; cells its cube. At 60 GHz they reach 2 cm, and 0.004 r
 ENTRIES = 40_000_000
 """Most waves of one axis of coordinates in ``aligned``, some seconds' work: offsets times places times numbers."""
 
+DRAWN = 0.2
+"""Largest error of a wall in a floor plan [m]."""
+
 FEWEST = 8
 """Fewest numbers of a channel in which planes can be searched: one path explains any single number."""
 
@@ -155,6 +158,11 @@ Room = tuple[Float[Tensor, "_ 4"], Float[Tensor, "_ 3"]]
 """Planes, and their slabs as in ``SLABS``."""
 
 
+def half_spaces(planes: Float[Tensor, "w 4"]) -> Room:
+    """A room with walls without a far side."""
+    return planes, SLABS[1].repeat(len(planes), 1)
+
+
 class ChannelSearch(PlaneSearch):
     """Planes whose images explain the training channels.
 
@@ -164,9 +172,9 @@ class ChannelSearch(PlaneSearch):
     each place, so neither phases nor blockage are assumed. Then phases count: a periodogram over offset and two tilts
     proposes planes and slabs whose reflections have like phases at all places, and the residual decides, with strengths
     that are real and not negative. It sees delays too, so it tells planes half a wavelength apart. Planes that explain
-    hardly anything are dropped, and what they explained is searched anew. Where planes are tilted, a second room has
-    walls along the axes of coordinates, see ``aligned``. At last the room grows along its axes, which shows planes that
-    hide behind the direct path.
+    hardly anything are dropped, and what they explained is searched anew. Where planes are tilted, or walls known, a
+    second room has walls along the axes of coordinates, see ``aligned``. At last the room grows along its axes, which
+    shows planes that hide behind the direct path.
 
     Args:
         links: Their training links count; of the task ``csi``.
@@ -207,7 +215,8 @@ class ChannelSearch(PlaneSearch):
         best = planes, planes[:, :3]
         if len(planes):
             best = self.without_false(*self.resolve(self.refine(planes, 300, 5e-3)))
-        if not len(best[0]) or not is_square(best[0]):  # tilted planes may stand for several upright ones
+        # Tilted planes may stand for several upright ones; free strengths may move known walls away.
+        if len(self.start) or not len(best[0]) or not is_square(best[0]):
             walls = self.aligned()
             if len(walls[0]) and self.cost(walls) < self.cost(best):
                 moved = self.without_false(*self.grown(*self.settled(*walls, polishes=True)))
@@ -215,7 +224,7 @@ class ChannelSearch(PlaneSearch):
         if not len(best[0]):
             return best
         if not is_square(best[0]):
-            first = (self.start, SLABS[1].repeat(len(self.start), 1)) if len(self.start) else self.seed(best)
+            first = half_spaces(self.start) if len(self.start) else self.seed(best)
             upright = self.without_false(*self.grown(*first, best[0]))
             if self.cost(upright) < self.cost(best):
                 return upright
@@ -234,7 +243,8 @@ class ChannelSearch(PlaneSearch):
         """Planes square to the axes of coordinates, one after the other: a matching pursuit.
 
         Each image has one real gain for all places, as by a half-space. One gain explains hardly anything by chance, so
-        offsets show to millimetres also where free strengths at each place explain any few numbers of a channel.
+        offsets show to millimetres also where free strengths at each place explain any few numbers of a channel. Walls
+        of the start come first. One is moved along its normal if that explains more than by chance.
 
         Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
         """
@@ -242,19 +252,32 @@ class ChannelSearch(PlaneSearch):
         subcarriers, count = max(4, 32 // elements), math.ceil(16 * self.diagonal / self.wavelength)
         planes, most = self.start, min(200, ENTRIES // (count * elements * subcarriers))
         if most < 50:  # too few places for the many wavelengths of a large hall
-            return planes, SLABS[1].repeat(len(planes), 1)
+            return half_spaces(planes)
         parts = self.drawn(most, subcarriers)
+        by_chance = 6 / sum(len(part.places) for part in parts)  # the best of thousands of offsets, of what is left
+        moves = torch.cat((torch.zeros(1), torch.arange(-DRAWN, DRAWN, self.wavelength / 16))).to(planes)
+        planes, waiting = planes.clone(), torch.ones(len(planes), dtype=torch.bool)
+        while waiting.any():  # walls of a drawing move to where they stand, those that explain most first
+            left, rests = self.in_common(parts, *half_spaces(planes[~waiting]))
+            best = []
+            for number in waiting.nonzero()[:, 0].tolist():
+                line = planes[number].repeat(len(moves), 1)
+                line[:, 3] += moves
+                shares = self.explained(parts, rests, line)
+                shares[0] += by_chance * left
+                best.append((shares.max().item(), number, line[shares.argmax()]))
+            _, number, moved = max(best, key=lambda found: found[:2])
+            planes[number], waiting[number] = moved, False
         lines = self.grid(torch.eye(3).to(planes), count, BEYOND)
-        places = sum(len(part.places) for part in parts)
         while len(planes) < self.most:
-            left, rests = self.in_common(parts, planes, SLABS[1].repeat(len(planes), 1))
+            left, rests = self.in_common(parts, *half_spaces(planes))
             shares = torch.stack([self.explained(parts, rests, line) for line in lines])
             for plane in planes:
                 shares[self.alike(lines.flatten(0, 1), plane).view(shares.shape)] = 0
-            if shares.max() < 6 / places * left:  # the best of thousands of offsets reaches it by chance
+            if shares.max() < by_chance * left:
                 break
             planes = torch.cat((planes, lines.flatten(0, 1)[shares.argmax(), None]))
-        return planes, SLABS[1].repeat(len(planes), 1)
+        return half_spaces(planes)
 
     def in_common(self, receivers, planes, slabs) -> tuple[float, list[Complex[Tensor, "b k"]]]:
         """Mean share of power that paths with a real gain each for all places leave, and what they leave.
@@ -287,10 +310,10 @@ class ChannelSearch(PlaneSearch):
         """Share of power that one more image explains with a gain in common, for planes of a line."""
         found = []
         for planes in line.split(64):
-            number = torch.arange(len(planes))[:, None]
+            room, number = half_spaces(planes), torch.arange(len(planes))[:, None]
             total, size = line.new_zeros(len(planes)), line.new_zeros(len(planes))
             for receiver, rest in zip(receivers, rests, strict=True):
-                waves = receiver.single().reflected(planes, SLABS[1].repeat(len(planes), 1), number)
+                waves = receiver.single().reflected(*room, number)
                 powers = receiver.flat.abs().square().sum(1, keepdim=True).float()
                 total += ((waves.conj() @ rest[..., None]).real[..., 0] / powers).sum(0)
                 size += (waves.abs().square().sum(2) / powers).sum(0)
@@ -531,7 +554,7 @@ class ChannelSearch(PlaneSearch):
 
     def resolve(self, planes: Float[Tensor, "w 4"]) -> Room:
         """Moves planes to where real strengths of slabs leave least. Planes not yet resolved keep complex strengths."""
-        slabs, resolved = SLABS[1].repeat(len(planes), 1), torch.zeros(len(planes), dtype=torch.bool)
+        (planes, slabs), resolved = half_spaces(planes), torch.zeros(len(planes), dtype=torch.bool)
         parts = self.some(planes)
         for reach, tilt, materials in ((0.07, 0.04, SLABS[::3]), (0.05, 0.006, SLABS), (0.05, 0.006, SLABS)):
             for k in range(len(planes)):

@@ -174,6 +174,19 @@ def test_walls_along_axes_show_where_channels_have_few_numbers():
     torch.testing.assert_close(planes, torch.from_numpy(walls), rtol=0, atol=5e-3)
 
 
+@pytest.mark.parametrize("error", [0.0, 0.15])
+def test_walls_of_a_drawing_stand_where_phases_agree(error, monkeypatch):
+    """Free strengths may move walls away that are drawn where they stand, or not move those that are drawn beside."""
+    links, walls = room(walls=np.array([WALL, FLOOR]))
+    own = search(links)
+    own.start = seen_from(walls, own.middle) + torch.tensor([0, 0, 0, error])
+    monkeypatch.setattr(own, "find", lambda start: start)
+    monkeypatch.setattr(own, "refine", lambda planes, *options: planes + torch.tensor([0, 0, 0, 0.3]))
+    monkeypatch.setattr(own, "resolve", channel_search.half_spaces)
+    planes, _ = own.run()
+    torch.testing.assert_close(planes, walls, rtol=0, atol=5e-3)
+
+
 @pytest.mark.parametrize("walls", [[WALL], [WALL, PARALLEL], [WALL, FLOOR]])
 def test_room_grows_by_planes_along_its_axes(walls):
     links, walls = room(walls=np.array(walls))
