@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from matplotlib import rc_context
@@ -34,6 +33,9 @@ MEMORY = 2e9
 
 COMPARED = 1500
 """Most readings of a receiver among which those that could be left out are searched."""
+
+AROUND = 8
+"""Measured places around another that tell whether a receiver hears it."""
 
 TOLERATED = 1.05
 """Largest rise of the mean error for which known places count as superfluous together."""
@@ -108,8 +110,9 @@ def survey(
 ) -> SurveyPlan:
     """The next places to measure: each lowers the mean variance over a region most, at all receivers together.
 
-    Labels do not enter beyond the fitted process, so a plan is made before anything is measured. The largest variance
-    would be a poor guide: it is in the corners. The first places of a longer plan are those of a shorter one.
+    A receiver counts at a place as much as it is likely to hear it, by the measured places around. Labels do not enter
+    beyond the fitted process, so a plan is made before anything is measured. The largest variance would be a poor
+    guide: it is in the corners. The first places of a longer plan are those of a shorter one.
 
     Args:
         model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet, and a default
@@ -179,25 +182,28 @@ def survey(
         centres = scene.positions(asked) if scene.task.is_scalar else [None] * len(processes)
         processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
         factor = 1.0 if model.calibration is None else model.calibration.sizes.square().mean().sqrt().item()
-    posteriors = [posterior(process, asked) for process in processes]
+    posteriors, hearing = [posterior(process, asked) for process in processes], heard(processes, asked)
     noises = [process.noise for process in processes]
 
     def error(parts: list[Tensor]) -> float:
-        variances = (part.diagonal()[stated].clamp_min(0) + noise for part, noise in zip(parts, noises, strict=True))
-        return MEAN * factor * float(np.mean([own.sqrt().mean().item() for own in variances]))
+        variances = torch.stack([part.diagonal()[stated] for part in parts]).clamp_min(0)
+        deviations = (variances + variances.new_tensor(noises)[:, None]).sqrt()
+        return MEAN * factor * mean_of_heard(deviations, hearing[:, stated])
 
     chosen, errors = [], [error(posteriors)]
     free = torch.ones(len(places), dtype=torch.bool)
     for _ in range(min(count, len(places))):
         gains = sum(
-            part[stated, : len(places)].square().mean(0) / (part.diagonal()[: len(places)] + noise)
-            for part, noise in zip(posteriors, noises, strict=True)
+            own[: len(places)]
+            * (own[stated] @ part[stated, : len(places)].square())
+            / (part.diagonal()[: len(places)] + noise)
+            for part, noise, own in zip(posteriors, noises, hearing, strict=True)
         )
         best = int(gains.cpu().masked_fill(~free, -math.inf).argmax())
         free[best] = False
         chosen.append(best)
-        for part, noise in zip(posteriors, noises, strict=True):
-            part -= torch.outer(part[best], part[best]) / (part[best, best] + noise)
+        for part, noise, own in zip(posteriors, noises, hearing, strict=True):
+            part -= own[best] * torch.outer(part[best], part[best]) / (part[best, best] + noise)
         errors.append(error(posteriors))
     if model is None:
         return SurveyPlan(places[chosen], None, places[:0], places[:0, 0], torch.zeros(0, dtype=torch.bool))
@@ -271,9 +277,9 @@ def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process
     """The process with the coefficients of its trend, which readings have to determine too.
 
     They are a constant and, for labels of one number, a slope over the logarithm of the distance to the receiver, with
-    a standard deviation of ten times that of the readings (universal kriging).
+    a standard deviation of twice that of the readings: as much as receivers of one survey may differ.
     """
-    scale = 10 * float(process.covariances(process.places[:1], process.places[:1])[0, 0] + process.noise) ** 0.5
+    scale = 2 * float(process.covariances(process.places[:1], process.places[:1])[0, 0] + process.noise) ** 0.5
     decades = lambda places: (places[:, :3] - receiver).norm(dim=1).clamp_min(0.1).log10()
     middle = decades(process.places).mean() if receiver is not None else 0.0
 
@@ -293,6 +299,24 @@ def posterior(process: Process, asked: Float[Tensor, "g d"]) -> Float[Tensor, "g
     return process.covariances(asked, asked) - left.mT @ left
 
 
+def heard(processes: list[Process], asked: Float[Tensor, "g d"]) -> Float[Tensor, "r g"]:
+    """Shares of the measured places around others that each receiver hears, drawn towards its share of all."""
+    known, rows = torch.cat([process.places[:, :3] for process in processes]).unique(dim=0, return_inverse=True)
+    if not len(known):
+        return asked.new_ones(len(processes), len(asked))
+    hears = known.new_zeros(len(processes), len(known))
+    for own, some in zip(hears, rows.split([len(process.places) for process in processes]), strict=True):
+        own[some] = 1
+    count = min(AROUND, len(known))
+    around = torch.cat([distances(part[:, :3], known).topk(count, largest=False).indices for part in asked.split(256)])
+    return (hears[:, around].sum(2) + hears.mean(1, keepdim=True)) / (count + 1)
+
+
+def mean_of_heard(values: Float[Tensor, "r g"], hearing: Float[Tensor, "r g"]) -> float:
+    """Mean over links that are likely to be heard."""
+    return ((values * hearing).sum() / hearing.sum()).item()
+
+
 def without(
     processes: list[Process], asked: Float[Tensor, "g d"], factor: float
 ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Bool[Tensor, " k"]]:
@@ -302,17 +326,17 @@ def without(
     known = torch.cat(measured).unique(dim=0)
     which = [distances(places, known).argmin(1) for places in measured]
     variances = lambda process: torch.cat([process.covariances(x, x).diagonal() for x in asked.split(16)])
-    prior = [variances(process) for process in processes]
+    prior, hearing = [variances(process) for process in processes], heard(processes, asked)
 
     def error(kept: Bool[Tensor, " k"]) -> float:
         parts = []
         for process, own, place, variance in zip(processes, rows, which, prior, strict=True):
             left, _ = process.whitened(asked, own[kept[place]])
-            parts.append(((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt().mean().item())
-        return float(np.mean(parts))
+            parts.append(((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt())
+        return mean_of_heard(torch.stack(parts), hearing)
 
     losses = known.new_zeros(len(known))
-    for process, own, place, variance in zip(processes, rows, which, prior, strict=True):
+    for process, own, place, variance, hears in zip(processes, rows, which, prior, hearing, strict=True):
         left, root = process.whitened(asked, own)
         deviations = ((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt()
         weights = torch.linalg.solve_triangular(root.mT, left, upper=True)
@@ -322,7 +346,7 @@ def without(
             gone = weights[there]
             # Variances rise by w' (inverse of these rows)^-1 w; roots by half of it over themselves.
             rises = (gone * torch.linalg.solve(inverse[there[:, None], there], gone)).sum(0)
-            losses[number] += (rises / (2 * deviations)).mean() / len(processes)
+            losses[number] += hears @ (rises / (2 * deviations)) / hearing.sum()
     order, before = losses.argsort(), error(torch.ones(len(known), dtype=torch.bool, device=known.device))
     fewest, most = 0, len(known) - 1  # places that may, and may not be left out together
     superfluous = torch.zeros(len(known), dtype=torch.bool)

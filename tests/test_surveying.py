@@ -11,7 +11,7 @@ import gaigs
 from gaigs.geometry import even_places
 from gaigs.kriging import scalar
 from gaigs.kriging.kernel import Process
-from gaigs.surveying import MEAN, POINTS, posterior, with_trend, without
+from gaigs.surveying import MEAN, POINTS, heard, posterior, with_trend, without
 
 
 @pytest.fixture(autouse=True)
@@ -80,6 +80,19 @@ def test_each_place_lowers_the_mean_variance_most():
         assert torch.equal(candidates[int(np.argmin(means))], place)
         known.append(place)
     assert (plan.errors.diff() < 0).all()
+
+
+def test_a_receiver_counts_where_it_is_likely_to_be_heard():
+    near, far = (torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) * 3 + x for x in (0.0, 9.0))
+    both, first = process(), process()
+    both, first = (
+        replace(own, places=part.double(), noises=torch.full((len(part),), 0.3))
+        for own, part in ((both, torch.cat((near, far))), (first, near))
+    )
+    hearing = heard([both, first], torch.cat((near[:5], far[:5])).double())
+    assert (hearing[0] == 1).all()
+    assert (hearing[1, :5] > 0.9).all()
+    assert (hearing[1, 5:] < 0.1).all()
 
 
 def test_planned_places_are_worth_more_than_random_ones():

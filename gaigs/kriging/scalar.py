@@ -23,10 +23,10 @@ MANY = 300
 """Readings of a receiver that all enter a variance; of more the nearest, which then take less time."""
 
 DEVIATIONS = (0.25, 0.15, 0.15)
-"""Standard deviations between receivers of the logarithms of length, signal and noise: the prior of each receiver's."""
+"""Scatter between receivers of the logarithms of length, signal and noise: the prior of each receiver's."""
 
 DEGREES = 4.0
-"""Degrees of freedom of Student's t, the other candidate for the noise beside a normal distribution."""
+"""Degrees of freedom of Student's t: of the scatter, and of the noise where it is not normal."""
 
 ROUNDS = 3
 """Repetitions of expectation and maximisation for the variances of single readings."""
@@ -81,7 +81,8 @@ class ScalarProcess(nn.Module):
     """y = z + noise: residuals of a trend, z a Gaussian process over places at each receiver.
 
     Each receiver has a correlation length l [m], a standard deviation of z and one of the noise, in the label's unit.
-    Their logarithms scatter about those of all receivers by ``DEVIATIONS``. Kernel (Matern-1/2 or -3/2) and noise
+    Their logarithms scatter about those of all receivers by ``DEVIATIONS``, as Student's t with ``DEGREES`` degrees of
+    freedom: one receiver may be far noisier than the others. Kernel (Matern-1/2 or -3/2) and noise
     (normal, or Student's t with ``DEGREES`` degrees of freedom) are the same for all receivers. All maximise the
     likelihood of held-out readings, each given ``NEAREST`` ones around it.
 
@@ -260,7 +261,7 @@ class ScalarProcess(nn.Module):
         bounds = np.log([lengths, sizes, sizes, *([scale_bounds(scene)] if scene.has_band else [])])
         shared = len(bounds)
         if has_deviations:
-            bounds = np.concatenate((bounds, np.tile([-4.0, 4.0], (3 * count, 1))))
+            bounds = np.concatenate((bounds, np.tile([-20.0, 20.0], (3 * count, 1))))
         spread, heard = torch.tensor(DEVIATIONS, dtype=torch.float64), values[around.rows].where(around.found, 0)
         factors = torch.ones_like(heard)
 
@@ -277,7 +278,7 @@ class ScalarProcess(nn.Module):
                 noises, between = (2 * own[around.receivers, 2]).exp(), covariances(around, own.exp(), made)
                 means, variances = conditional(between, heard, noises[:, None] * factors)
                 total = -log_density(values[asked] - means, variances, noises, made.degrees).sum()
-                total = total + leaf[shared:].square().sum() / 2
+                total = total + ((DEGREES + 1) / 2 * (leaf[shared:].square() / DEGREES).log1p()).sum()
                 if prior is not None:
                     total = total + ((leaf[:3] - prior) / spread).square().sum() / 2
                 (gradient,) = torch.autograd.grad(total, leaf)

@@ -19,7 +19,7 @@ from rich.jupyter import JupyterMixin
 from torch import Tensor
 
 from gaigs.configuration import composed, files_of
-from gaigs.data import Links
+from gaigs.data import Links, with_places
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
 from gaigs.kriging.intervals import Calibration, holds, interval_scores, nearest, summarise_intervals, thin
@@ -112,9 +112,10 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
 def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"], Int[Tensor, " j"]]]:
     """Models like a model, links that they have not seen, and the links that they know; each when it is asked for.
 
-    A look-up is fitted anew without each fold of the known links. A trained model has the validation links; the step of
-    its training stays the one chosen on all of them. Kriging is fitted anew to the training links, and its weights and
-    hyperparameters are chosen for each half of the validation links by the other half; one group alone chooses, too.
+    A look-up is fitted anew without each fold of the known links; so are estimated places of receivers. A trained model
+    has the validation links; the step of its training stays the one chosen on all of them. Kriging is fitted anew to
+    the training links, and its weights and hyperparameters are chosen for each half of the validation links by the
+    other half; one group alone chooses, too.
     """
     split, validation, receivers = links.split, links.split.validation, links.query.receivers
     if not (is_trained(model) or isinstance(model, Kriging)):
@@ -127,7 +128,12 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
             known, part = index[is_known], index[~is_known & torch.isin(index, asked)]
             if len(part):
                 rest = replace(links, split=split.only(known))
-                copied = copy.deepcopy(model, {id(model.links): model.links} if hasattr(model, "links") else None)
+                memo: dict[int, Any] = {id(model.links): model.links} if hasattr(model, "links") else {}
+                if links.uncertainties is not None and links.uncertainties.any():
+                    at_all = torch.where(links.uncertainties > 0, math.inf, 0.0)
+                    rest = with_places(replace(rest, uncertainties=at_all))
+                    memo[id(model.scene)] = replace(model.scene, receivers=rest.receivers)
+                copied = copy.deepcopy(model, memo)
                 (copied.refit if hasattr(copied, "refit") else copied.fit)(rest)
                 yield copied, part, known
         return

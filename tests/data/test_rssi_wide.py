@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+import gaigs
 from gaigs.data import divide
 from gaigs.data.gateways import estimate_place
 from gaigs.data.readings import marks_of
 from gaigs.data.rssi_wide import read
+from gaigs.runs.evaluation import unseen
 
 PLACES = np.array([[x, y] for x in range(8) for y in range(5)]) + 0.25
 GATEWAYS = {"00:cd:1a": (0.0, 0.0, 2.5), "00:cd:1b": (7.0, 4.0, 2.5), "00:cd:1c": (2.0, 4.5, 2.0)}
@@ -135,6 +137,16 @@ def test_test_links_do_not_move_a_gateway(survey, tmp_path):
     second = divide(survey("\n".join(text)), {"name": "random"})
     for a, b in zip(first.receivers, second.receivers, strict=True):
         assert torch.equal(a.pose.position, b.pose.position)
+
+
+def test_links_that_calibrate_do_not_move_a_gateway(survey):
+    links = divide(survey(table()), {"name": "random"})
+    model = gaigs.train("path_loss", links)
+    for fold, _, known in unseen(model, links):
+        own = known[links.query.receivers[known] == 0]
+        place, _ = estimate_place(links.query.transmitters[own], links.labels[own])
+        assert torch.equal(fold.scene.receivers[0].pose.position, place)
+    assert model.scene.receivers == links.scene.receivers
 
 
 def test_receivers_without_training_links_are_left_out(survey):

@@ -170,6 +170,15 @@ def test_each_receiver_has_a_length_of_its_own():
     assert long > 1.5 * short
 
 
+def test_each_receiver_has_a_noise_of_its_own():
+    links = drawn(signal=1.0, noise=0.5, count=60)
+    links.labels[60:] += 8 * torch.randn(60, generator=torch.Generator().manual_seed(0))
+    process = fitted(links).scalar[0]
+    quiet, noisy = process.deviations(process.places[:1].expand(2, -1), torch.arange(2))
+    assert quiet < 2
+    assert noisy > 5
+
+
 @pytest.mark.parametrize("law", [False, True])
 def test_the_trend_is_that_of_the_labels(law):
     links = drawn(signal=2.0)
