@@ -54,11 +54,15 @@ CELLS = 64, 40
 over the room's diagonal; cells its cube. At 60 GHz they reach 2 cm, and 0.004 rad in a room of 10 m; in a hall of 100 m
 0.007 rad at 3.5 GHz."""
 
-ENTRIES = 40_000_000
-"""Most waves of one axis of coordinates in ``aligned``, some seconds' work: offsets times places times numbers."""
+ENTRIES = 100_000_000
+"""Most waves of ``aligned``, some seconds' work for each plane: offsets times places times numbers."""
 
 DRAWN = 0.2
 """Largest error of a wall in a floor plan [m]."""
+
+FEW = 37
+"""Numbers of a channel, elements times delays, below which free strengths explain it by any planes: a room of six has
+as many paths of up to two reflections."""
 
 FEWEST = 8
 """Fewest numbers of a channel in which planes can be searched: one path explains any single number."""
@@ -138,16 +142,24 @@ class ReceiverChannels:
         return torch.polar((1 / lengths).expand_as(turns), -2 * math.pi * turns).flatten(-2)
 
     def reflected(
-        self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"], sequences: Int[Tensor, "n order"]
+        self,
+        planes: Float[Tensor, "w 4"],
+        slabs: Float[Tensor, "w 3"],
+        sequences: Int[Tensor, "n order"],
+        at: Float[Tensor, " s"] | None = None,
     ) -> Complex[Tensor, "b n k"]:
-        """Waves of all paths after their reflections at slabs; 0 for a path that does not meet its planes."""
+        """Waves of all paths after their reflections at slabs; 0 for a path that does not meet its planes.
+
+        Slabs reflect as ``at`` some frequencies; None: at each one's own. Half-spaces reflect all alike.
+        """
+        at = self.frequencies if at is None else at
         planes, slabs = planes.to(self.places), slabs.to(self.places)
         normals, offsets = planes[:, :3], planes[:, 3]
         seen = images(self.places, sequences, normals, offsets)
         folded = fold(seen, self.position.expand(len(self.places), 3), sequences, normals, offsets)
         permittivities, thickness = _materials(slabs)
-        depths = thickness[:, None] * self.frequencies / speed_of_light
-        gains = folded.exists[..., None].to(self.channels.dtype).expand(-1, -1, len(self.frequencies))
+        depths = thickness[:, None] * at / speed_of_light
+        gains = folded.exists[..., None].to(self.channels.dtype).expand(-1, -1, len(at))
         materials = permittivities[folded.planes, None], folded.cosines[..., None].clamp(1e-3, 1), depths[folded.planes]
         gains = folded.reflected(gains, polarised(folded.normals[:, None], *slab(*materials)))
         waves = self.waves(seen[-1]).unflatten(-1, (len(self.elements), -1))
@@ -201,6 +213,7 @@ class ChannelSearch(PlaneSearch):
         self.reach = max(0.07, speed_of_light / 8 / max(band, 1.0))
         # Profiles of a gigabyte at most, also in a hall with a large band.
         size = max(receiver.channels.shape[1] * self.delays(receiver) for receiver in self.receivers)
+        self.numbers = size / 32  # an eighth of the resolution, over four diagonals
         self.many = self.drawn(min(200, 60_000_000 // size))
 
     @torch.no_grad()
@@ -215,12 +228,12 @@ class ChannelSearch(PlaneSearch):
         best = planes, planes[:, :3]
         if len(planes):
             best = self.without_false(*self.resolve(self.refine(planes, 300, 5e-3)))
-        # Tilted planes may stand for several upright ones; free strengths may move known walls away.
-        if len(self.start) or not len(best[0]) or not is_square(best[0]):
+        # Free strengths may find tilted planes in place of upright ones, or none, and move known walls away.
+        if not len(best[0]) or (self.numbers < FEW and (len(self.start) or not is_square(best[0]))):
             walls = self.aligned()
-            if len(walls[0]) and self.cost(walls) < self.cost(best):
-                moved = self.without_false(*self.grown(*self.settled(*walls, polishes=True)))
-                return min(walls, moved, key=lambda room: self.in_common(self.many, *room)[0])
+            left = lambda room: self.in_common(self.many, room[0], room[1], self.order)[0]
+            if len(walls[0]) and left(walls) < left(best):
+                return min(walls, self.without_false(*self.grown(*self.settled(*walls, polishes=True))), key=left)
         if not len(best[0]):
             return best
         if not is_square(best[0]):
@@ -248,43 +261,74 @@ class ChannelSearch(PlaneSearch):
 
         Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
         """
+        steps = 10 * (self.points.amax(0) - self.points.amin(0) + 2 * BEYOND * self.diagonal) / self.wavelength
+        axes = torch.eye(3).to(self.points)
+        lines = torch.cat(
+            [self.grid(axis, int(count), BEYOND)[0] for axis, count in zip(axes.split(1), steps, strict=True)]
+        )
         elements = max(len(receiver.elements) for receiver in self.receivers)
-        subcarriers, count = max(4, 32 // elements), math.ceil(16 * self.diagonal / self.wavelength)
-        planes, most = self.start, min(200, ENTRIES // (count * elements * subcarriers))
+        subcarriers = max(4, 32 // elements)
+        most = min(200, ENTRIES // (len(lines) * elements * subcarriers))
         if most < 50:  # too few places for the many wavelengths of a large hall
-            return half_spaces(planes)
-        parts = self.drawn(most, subcarriers)
+            return half_spaces(self.start[:0])
+        parts = [part for part in map(one_of_each_place, self.drawn(most, subcarriers, 1)) if len(part.places)]
         by_chance = 6 / sum(len(part.places) for part in parts)  # the best of thousands of offsets, of what is left
-        moves = torch.cat((torch.zeros(1), torch.arange(-DRAWN, DRAWN, self.wavelength / 16))).to(planes)
-        planes, waiting = planes.clone(), torch.ones(len(planes), dtype=torch.bool)
-        while waiting.any():  # walls of a drawing move to where they stand, those that explain most first
-            left, rests = self.in_common(parts, *half_spaces(planes[~waiting]))
-            best = []
-            for number in waiting.nonzero()[:, 0].tolist():
-                line = planes[number].repeat(len(moves), 1)
-                line[:, 3] += moves
-                shares = self.explained(parts, rests, line)
-                shares[0] += by_chance * left
-                best.append((shares.max().item(), number, line[shares.argmax()]))
-            _, number, moved = max(best, key=lambda found: found[:2])
-            planes[number], waiting[number] = moved, False
-        lines = self.grid(torch.eye(3).to(planes), count, BEYOND)
+        planes, waiting = self.start.clone(), list(range(len(self.start)))
+        while waiting:  # walls of a drawing, those that explain most first
+            placed = planes[[number for number in range(len(planes)) if number not in waiting]]
+            tried = [(*self.moved(parts, placed, planes[number], by_chance), number) for number in waiting]
+            _, moved, number = max(tried, key=lambda found: found[0])
+            planes[number] = moved
+            waiting.remove(number)
         while len(planes) < self.most:
             left, rests = self.in_common(parts, *half_spaces(planes))
-            shares = torch.stack([self.explained(parts, rests, line) for line in lines])
+            shares = self.explained(parts, rests, lines)
             for plane in planes:
-                shares[self.alike(lines.flatten(0, 1), plane).view(shares.shape)] = 0
+                shares[self.alike(lines, plane)] = 0
             if shares.max() < by_chance * left:
                 break
-            planes = torch.cat((planes, lines.flatten(0, 1)[shares.argmax(), None]))
+            planes = torch.cat((planes, lines[shares.argmax(), None]))
+        for number in range(len(planes)):  # once more, as the others are known now
+            others = torch.cat((planes[:number], planes[number + 1 :]))
+            bonus = by_chance if number < len(self.start) else 0.0
+            _, planes[number] = self.moved(parts, others, planes[number], bonus)
+        planes = self.in_best_lobes(parts, planes)
+        for number in reversed(range(len(self.start), len(planes))):
+            others = torch.cat((planes[:number], planes[number + 1 :]))
+            left, without = (self.in_common(parts, *half_spaces(some))[0] for some in (planes, others))
+            planes = others if without < (1 + by_chance) * left else planes
         return half_spaces(planes)
 
-    def in_common(self, receivers, planes, slabs) -> tuple[float, list[Complex[Tensor, "b k"]]]:
-        """Mean share of power that paths with a real gain each for all places leave, and what they leave.
+    def in_best_lobes(self, parts, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "w 4"]:
+        """The planes, each in the lobe of its phases, and there at the place, where paths of all orders leave least."""
+        left = lambda tried: self.in_common(parts, *half_spaces(tried), self.order)[0]
+        for step in (1 / 16, 1 / 32, 1 / 64):
+            for number in range(len(planes)):
+                tried = [planes]
+                for move in (-step, step, -0.5, 0.5, -1, 1, -1.5, 1.5):
+                    tried.append(planes.clone())
+                    tried[-1][number, 3] += move * self.wavelength
+                planes = min(tried, key=left)
+        return planes
 
-        These are the direct path and single reflections.
+    def moved(
+        self, parts, others: Float[Tensor, "v 4"], plane: Float[Tensor, "4"], bonus: float
+    ) -> tuple[float, Float[Tensor, "4"]]:
+        """Share that a plane explains where it explains most near its place, beside others; and the plane there.
+
+        The place itself has a bonus, as a share of what the others leave.
         """
-        sequences = torch.arange(-1, len(planes))[:, None]
+        left, rests = self.in_common(parts, *half_spaces(others))
+        moves = torch.cat((torch.zeros(1), torch.arange(-DRAWN, DRAWN, self.wavelength / 16))).to(plane)
+        line = plane.repeat(len(moves), 1)
+        line[:, 3] += moves
+        shares = self.explained(parts, rests, line)
+        shares[0] += bonus * left
+        return shares.max().item(), line[shares.argmax()]
+
+    def in_common(self, receivers, planes, slabs, order: int = 1) -> tuple[float, list[Complex[Tensor, "b k"]]]:
+        """Mean share of power that paths with a real gain each for all places leave, and what they leave."""
+        sequences = all_sequences(len(planes), order)
         waves, channels, powers = [], [], []
         for receiver, turn in zip(receivers, self.phases(planes[:0], receivers), strict=True):
             waves.append(receiver.single().reflected(planes, slabs, sequences))
@@ -296,7 +340,10 @@ class ChannelSearch(PlaneSearch):
             for w, channel, power in zip(waves, channels, powers, strict=True):
                 gram = gram + ((w.conj() @ w.mT).real / power).sum(0, keepdim=True)
                 right = right + ((w.conj() @ channel[..., None]).real / power).sum(0, keepdim=True)
-            gains = torch.linalg.solve(_ridged(gram, 1e-6), right).mT.to(waves[0])
+            gram = _ridged(gram, 1e-6)
+            kept = (torch.linalg.solve(gram, right) >= 0).to(gram)  # slabs have the signs
+            gains = torch.linalg.solve(gram * kept * kept.mT + torch.diag_embed(1 - kept[..., 0]), right * kept)
+            gains = gains.mT.to(waves[0])
             known = [(gains @ w)[:, 0] for w in waves]
             if not self.common:  # phases of the places follow what is known of them
                 for number, (one, channel) in enumerate(zip(known, channels, strict=True)):
@@ -308,17 +355,16 @@ class ChannelSearch(PlaneSearch):
 
     def explained(self, receivers, rests, line: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
         """Share of power that one more image explains with a gain in common, for planes of a line."""
-        found = []
-        for planes in line.split(64):
-            room, number = half_spaces(planes), torch.arange(len(planes))[:, None]
-            total, size = line.new_zeros(len(planes)), line.new_zeros(len(planes))
-            for receiver, rest in zip(receivers, rests, strict=True):
-                waves = receiver.single().reflected(*room, number)
-                powers = receiver.flat.abs().square().sum(1, keepdim=True).float()
-                total += ((waves.conj() @ rest[..., None]).real[..., 0] / powers).sum(0)
-                size += (waves.abs().square().sum(2) / powers).sum(0)
-            found.append(total.clamp_min(0).square() / size.clamp_min(torch.finfo(line.dtype).tiny))
-        return torch.cat(found) / sum(len(receiver.places) for receiver in receivers)
+        total, size = line.new_zeros(2, len(line))
+        for receiver, rest in zip(receivers, rests, strict=True):
+            one, middle = receiver.single(), receiver.frequencies.mean().float()[None]
+            powers = receiver.flat.abs().square().sum(1, keepdim=True).float()
+            for rows in torch.arange(len(line)).split(64):
+                waves = one.reflected(*half_spaces(line[rows]), torch.arange(len(rows))[:, None], middle)
+                total[rows] += ((waves.conj() @ rest[..., None]).real[..., 0] / powers).sum(0)
+                size[rows] += (torch.view_as_real(waves).square().sum((2, 3)) / powers).sum(0)
+        found = total.clamp_min(0).square() / size.clamp_min(torch.finfo(line.dtype).tiny)
+        return found / sum(len(receiver.places) for receiver in receivers)
 
     # --- planes along axes ---
 
@@ -422,9 +468,9 @@ class ChannelSearch(PlaneSearch):
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
         return all_sequences(len(planes), self.order)
 
-    def drawn(self, count: int, subcarriers: int | None = None) -> list[ReceiverChannels]:
-        """All receivers with about ``count`` places together, at some subcarriers."""
-        each = max(8, count // len(self.receivers))
+    def drawn(self, count: int, subcarriers: int | None = None, least: int = 8) -> list[ReceiverChannels]:
+        """All receivers with about ``count`` places together, ``least`` each, at some subcarriers."""
+        each = max(least, count // len(self.receivers))
         parts = []
         for receiver in self.receivers:
             places, when = (
@@ -600,11 +646,12 @@ class ChannelSearch(PlaneSearch):
         return turned
 
     def some(self, planes: Float[Tensor, "w 4"]) -> tuple[list[ReceiverChannels], list[Complex[Tensor, " c"]]]:
-        """About a hundred places at a fifth of the subcarriers, and their phases."""
+        """About a hundred places at some subcarriers, a fifth or 64 numbers of a channel, and their phases."""
         parts, turns = [], []
         for receiver, phase in zip(self.receivers, self.phases(planes, self.receivers), strict=True):
             every = slice(None, None, max(1, len(receiver.places) * len(self.receivers) // 100))
-            parts.append(receiver.some(every, slice(None, None, 5)).single())
+            step = min(5, max(1, receiver.flat.shape[1] // 64))
+            parts.append(receiver.some(every, slice(None, None, step)).single())
             turns.append(phase if len(phase) == 1 else phase[every])
         return parts, turns
 
@@ -718,6 +765,14 @@ class ChannelSearch(PlaneSearch):
 
         moved, own = self.descend(loss, planes, [slabs], steps, rate)
         return torch.where(moves[:, None], moved, planes), torch.where(moves[:, None], own, slabs)
+
+
+def one_of_each_place(receiver: ReceiverChannels) -> ReceiverChannels:
+    """One link of each place that is heard: links of one place have one channel, and explain each other."""
+    _, which = receiver.places.unique(dim=0, return_inverse=True)
+    first = {place: row for row, place in reversed([*enumerate(which.tolist())])}
+    rows = torch.tensor(sorted(first.values()))
+    return receiver.some(rows[receiver.channels[rows].abs().amax((1, 2)) > 0])
 
 
 def project(

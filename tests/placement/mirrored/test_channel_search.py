@@ -159,6 +159,13 @@ def test_tilted_plane_is_turned_square():
     assert any((plane[0] - true).abs().max() < 0.03 for plane in turned)
 
 
+def few(links):
+    """One element and 8 subcarriers of the links."""
+    task = Csi(1, links.task.frequencies[:8])
+    receiver = replace(links.receivers[0], array=Array(links.receivers[0].array.elements[:1]))
+    return replace(links, receivers=(receiver,), labels=links.labels[:, :1, :8], task=task)
+
+
 WALL, PARALLEL, FLOOR = [1.0, 0, 0, -0.4], [1.0, 0, 0, 6.3], [0, 0, 1.0, -0.2]
 
 
@@ -166,19 +173,29 @@ def test_walls_along_axes_show_where_channels_have_few_numbers():
     """One element and 8 subcarriers: free strengths at each place explain these channels by many planes."""
     walls = np.array([[1.0, 0, 0, -0.1], [0, 1.0, 0, 0.1]])
     links, _ = room(count=200, walls=walls)
-    few = Csi(1, links.task.frequencies[:8])
-    receiver = replace(links.receivers[0], array=Array(links.receivers[0].array.elements[:1]))
-    links = replace(links, receivers=(receiver,), labels=links.labels[:, :1, :8], task=few)
-    planes, _ = search(links).run()
+    planes, _ = search(few(links)).run()
     planes = planes[planes[:, 1].argsort()]
     torch.testing.assert_close(planes, torch.from_numpy(walls), rtol=0, atol=5e-3)
+
+
+def test_links_that_are_partly_silent_or_repeated_show_no_wall():
+    links, walls = room(count=120, walls=np.array([WALL]))
+    noise = torch.randn(120, 4, 16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    labels = links.labels + 0.1 * links.labels.abs().mean() * noise
+    for link in range(0, 120, 5):
+        labels[link, :, torch.arange(16) != link % 16] = 0
+    often = torch.arange(120).repeat(5)
+    query, split = links.query[often], links.split.only(torch.arange(600))
+    own = search(replace(links, query=query, labels=labels[often], split=split))
+    planes = seen_from(own.aligned()[0], -own.middle)
+    torch.testing.assert_close(planes, walls, rtol=0, atol=5e-3)
 
 
 @pytest.mark.parametrize("error", [0.0, 0.15])
 def test_walls_of_a_drawing_stand_where_phases_agree(error, monkeypatch):
     """Free strengths may move walls away that are drawn where they stand, or not move those that are drawn beside."""
     links, walls = room(walls=np.array([WALL, FLOOR]))
-    own = search(links)
+    own = search(few(links))
     own.start = seen_from(walls, own.middle) + torch.tensor([0, 0, 0, error])
     monkeypatch.setattr(own, "find", lambda start: start)
     monkeypatch.setattr(own, "refine", lambda planes, *options: planes + torch.tensor([0, 0, 0, 0.3]))
