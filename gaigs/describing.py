@@ -13,8 +13,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from gaigs.data import Links, load, shortened
-from gaigs.data.doubts import places_doubts
+from gaigs.data import Links, load, phase_doubts, shortened
+from gaigs.data.doubts import doubts, places_doubts
 from gaigs.data.readings import marks_of
 from gaigs.io.files import write_text
 from gaigs.kriging.links import distances, evenly
@@ -22,6 +22,7 @@ from gaigs.registry import check_type
 from gaigs.report import style
 from gaigs.task.rssi import Rssi
 from gaigs.task.scalar import with_unit
+from gaigs.task.spectrum import Spectrum
 
 LINKS, RECEIVERS = 2000, 12
 """Most links whose spectra or channels are read, evenly spread, and most receivers that the text lists."""
@@ -128,7 +129,10 @@ def suspicions(links: Links, sites: Float[Tensor, "n 3"]) -> Iterator[str]:
     query, receivers = links.query, links.receivers
     stands = torch.stack([receiver.pose.position for receiver in receivers])
     given = torch.ones(len(receivers), dtype=torch.bool) if links.uncertainties is None else links.uncertainties == 0
-    yield from places_doubts(links)
+    if links.split is None:
+        yield from places_doubts(links)
+    else:
+        yield from [*doubts(links), *phase_doubts(links)]
     near = (distances(sites.double(), stands[given].double()) < 0.01).any(1)
     if len(sites) > 1 and near.any():
         yield f"{int(near.sum())} places are where a receiver stands"
@@ -141,6 +145,7 @@ def suspicions(links: Links, sites: Float[Tensor, "n 3"]) -> Iterator[str]:
         yield f"{repeated} links repeat place and receiver of another"
     if isinstance(links.task, Rssi):
         yield from suspicions_of_levels(links, stands, given)
+    if links.task.is_scalar or (isinstance(links.task, Spectrum) and links.split is not None):  # its doubts have told
         return
     labels = [links.labels[part].reshape(len(part), -1) for part in evenly(torch.arange(len(links)), 256).split(64)]
     if constant := sum(int(((own - own[:, :1]).abs().amax(1) == 0).sum()) for own in labels if own.shape[1] > 1):

@@ -83,7 +83,7 @@ def test_links_of_every_task_are_described(task, tmp_path):
 def test_black_spectra_are_named():
     links = example_links("spectrum")
     links.labels[3] = 0
-    assert gaigs.describe(links).suspicious == ("1 of 24 labels have one value throughout",)
+    assert gaigs.describe(links).suspicious == ("1 of 24 spectra are constant, first that of link 3, 0 to 0",)
 
 
 def test_the_command_writes_text_and_figure(tmp_path, capsys):

@@ -203,29 +203,27 @@ def divide(links: Links, split: Mapping) -> Links:
     links = replace(links, split=parts)
     if links.uncertainties is not None:
         links = with_places(only_trained(links))
-    remarks = [links.remarks]
-    for doubt in doubts(links):
+    remarks, phase = [links.remarks], getattr(links.task, "phase", "known")
+    if phase != "known":
+        unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[phase]
+        remarks.append(f"{unknown} of each link unknown, and removed in every score")
+    for doubt in [*doubts(links), *phase_doubts(links)]:
         log.warning(doubt)
         remarks.append(doubt)
-    if isinstance(links.task, Csi):
-        remarks += _phase_remarks(links, links.task)
     return replace(links, remarks="; ".join(filter(None, remarks)))
 
 
-def _phase_remarks(links: Links, task: Csi) -> list[str]:
-    """Sentences if phases of channels are unknown, declared or found, or do not follow the geometry."""
-    found = []
-    if task.phase != "known":
-        unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[task.phase]
-        found.append(f"{unknown} of each link unknown, and removed in every score")
-    if task.phase == "per_link_and_delay":
-        return found
+def phase_doubts(links: Links) -> list[str]:
+    """Sentences if phases of channels do not follow the geometry, or disagree with those that are declared."""
+    task = links.task
+    if not isinstance(task, Csi) or task.phase == "per_link_and_delay":
+        return []
     train, every = links.split.train, links.query.receivers[links.split.train]
     own = (train[every == receiver] for receiver in range(len(links.receivers)))
     train = torch.cat([part[:: max(1, len(part) // 64)] for part in own])
     receivers, labels = links.query.receivers[train], links.labels[train].to(torch.complex128)
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
-    waves, warnings = direct_waves(everywhere, links.query[train], task.frequencies), []
+    waves, found = direct_waves(everywhere, links.query[train], task.frequencies), []
     is_known, strange = task.phase == "known", {}
     sign = phase_sign(labels, waves, receivers) if is_known else 0
     if sign:
@@ -233,17 +231,20 @@ def _phase_remarks(links: Links, task: Csi) -> list[str]:
     is_fixed = any(elements or delay is not None for elements, _, delay in strange.values())
     if not is_fixed and (phase := unknown_phase(labels, waves, receivers, task.frequencies, task.phase)):
         common = "phase" if is_known else "delay"
-        warnings.append(f"channels have no {common} in common, as if each packet had its own; set data.phase={phase}")
+        found.append(
+            f"channels have no {common} in common, as if each packet had its own; set data.phase={phase}, "
+            "or check units, axes and order of tx, rx and elements"
+        )
         strange = {}
     elif is_known and not sign and len(train) >= MANY * len(receivers.unique()):
-        warnings.append(
+        found.append(
             "phases of the channels do not follow the direct distance; unless walls block most direct waves, "
             "check units and order of tx, rx, elements and h, and the frequencies"
         )
     for receiver, (elements, subcarriers, delay) in strange.items():
         unexplained = "have phases that geometry does not explain, the same at all links"
         if elements:
-            warnings.append(
+            found.append(
                 f"the elements of {links.receivers[receiver].name} {unexplained}; check order, axes and unit of "
                 "elements and tx, or calibrate the array"
             )
@@ -251,10 +252,8 @@ def _phase_remarks(links: Links, task: Csi) -> list[str]:
             late = "check their order"
             if delay is not None:
                 late = f"take a delay of {1e9 * delay:.3g} ns off h, or set data.phase=per_link_and_delay"
-            warnings.append(f"the subcarriers of {links.receivers[receiver].name} {unexplained}; {late}")
-    for warning in warnings:
-        log.warning(warning)
-    return found + warnings
+            found.append(f"the subcarriers of {links.receivers[receiver].name} {unexplained}; {late}")
+    return found
 
 
 def only_trained(links: Links) -> Links:
