@@ -26,7 +26,7 @@ def floor():
     shadowing = np.exp(-np.linalg.norm(places[:, None] - places, axis=-1) / 4) + 1e-9 * np.eye(400)
     levels = -45 + 3 * rng.standard_normal(14) - 10 * (3 + 0.3 * rng.standard_normal(14)) * np.log10(apart)
     levels += 4 * np.linalg.cholesky(shadowing) @ rng.standard_normal((400, 14)) + 2 * rng.standard_normal((400, 14))
-    levels[levels < -45 - 30 * np.log10(12)] = np.nan
+    levels[levels < -45 - 30 * np.log10(15)] = np.nan
     return gaigs.links(task="rssi", transmitters=places, receivers=receivers, labels=levels, split="random")
 
 

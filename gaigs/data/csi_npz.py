@@ -300,7 +300,7 @@ def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
                     expected = f"magnitudes below {high:g}, the largest of a link {low:g} or more unless all are 0"
                 case "rx_index":
                     count = len(arrays["rx"])
-                    holds, expected = (array >= 0) & (array < count), f"a row of rx, 0..{count - 1}"
+                    holds, expected = (array >= 0) & (array < count), f"a row of rx, counted from 0, 0..{count - 1}"
                 case "frequencies":
                     low, high = CARRIERS
                     holds, expected = (low <= array) & (array <= high), f"a frequency from {low:g} to {high:g} Hz"

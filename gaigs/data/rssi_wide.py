@@ -213,7 +213,7 @@ def _read_wide(file: Path, content: str) -> Wide:
 
     def number(cell: str) -> float:
         if cell not in numbers:
-            text = cell.replace("−", "-")
+            text = re.sub(r"(?i)\s*dbm$", "", cell.replace("−", "-"))
             value = tables.to_number(text.replace(",", ".") if has_commas else text)
             numbers[cell] = math.inf if math.isnan(value) and cell.lower() not in EMPTY else value
         return numbers[cell]

@@ -133,7 +133,7 @@ DEFECTS = [
     ({"h": np.ones((10, 3, 4))}, "h: expected complex numbers, got float64; data.arrays={h: [RE, IM]} names"),
     ({"rx_index": np.zeros(10)}, "rx_index: expected whole numbers, got float64"),
     ({"h": np.ones((10, 0, 4), complex)}, "h: expected the shape (10, e, 4), got (10, 0, 4)"),
-    (put("rx_index", [3, 5], 3), "rx_index[3]: expected a row of rx, 0..2, got 3 (in 2 of 10 rows)"),
+    (put("rx_index", [3, 5], 3), "rx_index[3]: expected a row of rx, counted from 0, 0..2, got 3 (in 2 of 10 rows)"),
     (put("tx", (6, 1), np.nan), "tx[6, 1]: expected a number, got NaN (in 1 of 10 rows)"),
     (put("rx", (1, 0), -1e5), f"rx[1, 0]: {NEAR} -100000.0"),
     ({"frequencies": np.array([-3e7, -1e7, 1e7, 3e7])}, f"frequencies[0]: {CARRIER} -30000000.0 (in 2 of 4 rows)"),

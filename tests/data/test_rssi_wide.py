@@ -55,6 +55,7 @@ def heard(links):
     [
         table(),
         table(mark="-200"),
+        re.sub(r",-\d+", r"\g<0> dBm", table()),
         table(mark="-105"),
         table(mark=""),
         table(mark="NaN", separator="\t"),
