@@ -21,7 +21,7 @@ from gaigs.data.matching import check_fit
 from gaigs.geometry import ExtrapolationWarning, even_places
 from gaigs.io.files import write_text
 from gaigs.kriging.intervals import fewest
-from gaigs.kriging.links import distances, evenly, folds_of
+from gaigs.kriging.links import distances, evenly, folds_of, hearing
 from gaigs.model import Model
 from gaigs.model.knn import COUNTS
 from gaigs.query import ROUNDING, as_positions, as_tensor
@@ -132,6 +132,7 @@ class Fingerprints:
         axes: Of the numbers of a label, of independent errors of the same size (m, k).
         values: Predictions at the candidates along these axes (g, r, k).
         deviations: Standard deviations of labels of one number (g, r); else 1.
+        hearing: Probability that each receiver hears a transmitter there (g, r); without links a half.
         degrees, temper: Of the likelihood, see ``log_likelihood``.
         held: Held-out fingerprints of each fold, which calibrate regions; empty without links.
 
@@ -150,6 +151,7 @@ class Fingerprints:
     axes: Float[Tensor, "m k"]
     values: Float[Tensor, "g r k"]
     deviations: Float[Tensor, "g r"]
+    hearing: Float[Tensor, "g r"]
     degrees: float = 4.0
     temper: float = 1.0
     held: tuple[Held, ...] = ()
@@ -227,8 +229,10 @@ def fingerprints(
     def mapped(one: Model, known: Tensor) -> Fingerprints:
         places, prior, density = candidates(box, points, links if region is None else None, known)
         values, deviations = predicted(one, places, frequency)
-        axes = torch.eye(values.shape[2])
-        return Fingerprints(scene.task, frequency, places, prior, density, axes, values, deviations)
+        axes, hears = torch.eye(values.shape[2]), torch.full(values.shape[:2], 0.5)
+        if len(known):
+            hears = hearing(places, *heard(links, known), towards=0.5)
+        return Fingerprints(scene.task, frequency, places, prior, density, axes, values, deviations, hears)
 
     known = torch.zeros(0).long() if links is None else at_carrier(links, frequency, "train", "validation")
     if links is not None and region is None and not len(known):
@@ -508,6 +512,14 @@ def received(links: Links, index: Int[Tensor, " k"]) -> tuple[Float[Tensor, "n r
     return found, places
 
 
+def heard(links: Links, index: Int[Tensor, " k"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n r"]]:
+    """Places of the transmissions of some links, and 1 for each receiver that has a link of them, else 0."""
+    rows, which = rows_of(links)[index].unique(return_inverse=True)
+    places, hears = torch.zeros(len(rows), 3), torch.zeros(len(rows), len(links.receivers))
+    places[which], hears[which, links.query.receivers[index]] = links.query.transmitters[index], 1
+    return places, hears
+
+
 def as_fingerprints(value: object, prints: Fingerprints, is_track: bool = False) -> Float[Tensor, "n r m"]:
     """The fingerprints of values that a user gives; raises a ``ValueError`` for other shapes.
 
@@ -554,10 +566,11 @@ def independent(errors: Float[Tensor, "n m"]) -> Float[Tensor, "m k"]:
 
 def squares(
     prints: Fingerprints, asked: Float[Tensor, "n r k"], unknown_power: bool = False
-) -> tuple[Float[Tensor, "n g"], Float[Tensor, "n g"], Float[Tensor, " n"]]:
-    """Squared distances of values from the candidates' over the deviations, sums of the deviations' logarithms, and
-    numbers of receivers; with ``unknown_power`` the least distance with any offset of the value, or any factor of the
-    prediction, which a factor of the value leaves as it is."""
+) -> tuple[Float[Tensor, "n g"], Float[Tensor, "n g"], Float[Tensor, " n"], Float[Tensor, "n g"]]:
+    """Squared distances of values from the candidates' over the deviations, sums of the deviations' logarithms, numbers
+    of receivers, and logarithms of the probability that these receivers hear the value and no other; with
+    ``unknown_power`` the least distance with any offset of the value, or any factor of the prediction, which a factor
+    of the value leaves as it is, and 0 in place of these logarithms."""
     shape = len(asked), len(prints.places)
     total, logarithms, count = torch.zeros(shape), torch.zeros(shape), torch.zeros(len(asked))
     with_all, alone, powers = torch.zeros(shape), torch.zeros(shape), torch.zeros(len(asked), 1)
@@ -583,22 +596,27 @@ def squares(
         total = alone - 2 * with_all + powers
     elif unknown_power:
         total, count = total - with_all.square() / alone.clamp_min(tiny), count - 1
-    return total.clamp_min(0), logarithms, count
+    hears = (~asked[..., 0].isnan()).float()
+    likely = hears @ prints.hearing.log().mT + (1 - hears) @ (-prints.hearing).log1p().mT
+    # Of a track, a value that no receiver has heard may not have been sent.
+    return total.clamp_min(0), logarithms, count, likely * (count > 0)[:, None] * (not unknown_power)
 
 
 def log_likelihood(
     total: Float[Tensor, "n g"],
     logarithms: Float[Tensor, "n g"],
     count: Float[Tensor, " n"],
+    likely: Float[Tensor, "n g"],
     degrees: float,
     temper: float,
 ) -> Float[Tensor, "n g"]:
-    """Student's t of all receivers together, to the power ``temper``; arguments as ``squares`` gives them.
+    """Student's t of all receivers together, to the power ``temper``, and who hears; arguments are from ``squares``.
 
     The t lets one unlike place or receiver count little. The exponent stands for what the errors of receivers
     have in common, and for what ``axes`` miss.
     """
-    return -temper * ((degrees + count[:, None]) / 2 * torch.log1p(total / degrees) + logarithms).double()
+    together = (degrees + count[:, None]) / 2 * torch.log1p(total / degrees) + logarithms
+    return (likely - temper * together).double()
 
 
 class Try(NamedTuple):
@@ -608,7 +626,7 @@ class Try(NamedTuple):
     """
 
     prints: Fingerprints
-    squares: Sequence[tuple[Tensor, Tensor, Tensor]]
+    squares: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]]
     truth: Float[Tensor, "n 3"]
 
     def score(self, degrees: float, temper: float) -> float:

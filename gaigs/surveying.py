@@ -15,7 +15,7 @@ from torch import Tensor
 from gaigs.geometry import even_places
 from gaigs.io.files import write_text
 from gaigs.kriging.kernel import LIMIT, Process, kernel
-from gaigs.kriging.links import coordinates, distances, evenly
+from gaigs.kriging.links import coordinates, distances, evenly, hearing
 from gaigs.model import Model, call_optional
 from gaigs.query import Query, as_positions
 from gaigs.registry import call, check_type
@@ -33,9 +33,6 @@ MEMORY = 2e9
 
 COMPARED = 1500
 """Most readings of a receiver among which those that could be left out are searched."""
-
-AROUND = 8
-"""Measured places around another that tell whether a receiver hears it."""
 
 TOLERATED = 1.05
 """Largest rise of the mean error for which known places count as superfluous together."""
@@ -182,13 +179,13 @@ def survey(
         centres = scene.positions(asked) if scene.task.is_scalar else [None] * len(processes)
         processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
         factor = 1.0 if model.calibration is None else model.calibration.sizes.square().mean().sqrt().item()
-    posteriors, hearing = [posterior(process, asked) for process in processes], heard(processes, asked)
+    posteriors, hears = [posterior(process, asked) for process in processes], heard(processes, asked)
     noises = [process.noise for process in processes]
 
     def error(parts: list[Tensor]) -> float:
         variances = torch.stack([part.diagonal()[stated] for part in parts]).clamp_min(0)
         deviations = (variances + variances.new_tensor(noises)[:, None]).sqrt()
-        return MEAN * factor * mean_of_heard(deviations, hearing[:, stated])
+        return MEAN * factor * mean_of_heard(deviations, hears[:, stated])
 
     chosen, errors = [], [error(posteriors)]
     free = torch.ones(len(places), dtype=torch.bool)
@@ -197,12 +194,12 @@ def survey(
             own[: len(places)]
             * (own[stated] @ part[stated, : len(places)].square())
             / (part.diagonal()[: len(places)] + noise)
-            for part, noise, own in zip(posteriors, noises, hearing, strict=True)
+            for part, noise, own in zip(posteriors, noises, hears, strict=True)
         )
         best = int(gains.cpu().masked_fill(~free, -math.inf).argmax())
         free[best] = False
         chosen.append(best)
-        for part, noise, own in zip(posteriors, noises, hearing, strict=True):
+        for part, noise, own in zip(posteriors, noises, hears, strict=True):
             part -= own[best] * torch.outer(part[best], part[best]) / (part[best, best] + noise)
         errors.append(error(posteriors))
     if model is None:
@@ -304,17 +301,15 @@ def heard(processes: list[Process], asked: Float[Tensor, "g d"]) -> Float[Tensor
     known, rows = torch.cat([process.places[:, :3] for process in processes]).unique(dim=0, return_inverse=True)
     if not len(known):
         return asked.new_ones(len(processes), len(asked))
-    hears = known.new_zeros(len(processes), len(known))
-    for own, some in zip(hears, rows.split([len(process.places) for process in processes]), strict=True):
-        own[some] = 1
-    count = min(AROUND, len(known))
-    around = torch.cat([distances(part[:, :3], known).topk(count, largest=False).indices for part in asked.split(256)])
-    return (hears[:, around].sum(2) + hears.mean(1, keepdim=True)) / (count + 1)
+    hears = known.new_zeros(len(known), len(processes))
+    for receiver, some in enumerate(rows.split([len(process.places) for process in processes])):
+        hears[some, receiver] = 1
+    return hearing(asked, known, hears, hears.mean(0)).mT
 
 
-def mean_of_heard(values: Float[Tensor, "r g"], hearing: Float[Tensor, "r g"]) -> float:
+def mean_of_heard(values: Float[Tensor, "r g"], hears: Float[Tensor, "r g"]) -> float:
     """Mean over links that are likely to be heard."""
-    return ((values * hearing).sum() / hearing.sum()).item()
+    return ((values * hears).sum() / hears.sum()).item()
 
 
 def without(
@@ -326,17 +321,17 @@ def without(
     known = torch.cat(measured).unique(dim=0)
     which = [distances(places, known).argmin(1) for places in measured]
     variances = lambda process: torch.cat([process.covariances(x, x).diagonal() for x in asked.split(16)])
-    prior, hearing = [variances(process) for process in processes], heard(processes, asked)
+    prior, hears = [variances(process) for process in processes], heard(processes, asked)
 
     def error(kept: Bool[Tensor, " k"]) -> float:
         parts = []
         for process, own, place, variance in zip(processes, rows, which, prior, strict=True):
             left, _ = process.whitened(asked, own[kept[place]])
             parts.append(((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt())
-        return mean_of_heard(torch.stack(parts), hearing)
+        return mean_of_heard(torch.stack(parts), hears)
 
     losses = known.new_zeros(len(known))
-    for process, own, place, variance, hears in zip(processes, rows, which, prior, hearing, strict=True):
+    for process, own, place, variance, likely in zip(processes, rows, which, prior, hears, strict=True):
         left, root = process.whitened(asked, own)
         deviations = ((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt()
         weights = torch.linalg.solve_triangular(root.mT, left, upper=True)
@@ -346,7 +341,7 @@ def without(
             gone = weights[there]
             # Variances rise by w' (inverse of these rows)^-1 w; roots by half of it over themselves.
             rises = (gone * torch.linalg.solve(inverse[there[:, None], there], gone)).sum(0)
-            losses[number] += hears @ (rises / (2 * deviations)) / hearing.sum()
+            losses[number] += likely @ (rises / (2 * deviations)) / hears.sum()
     order, before = losses.argsort(), error(torch.ones(len(known), dtype=torch.bool, device=known.device))
     fewest, most = 0, len(known) - 1  # places that may, and may not be left out together
     superfluous = torch.zeros(len(known), dtype=torch.bool)

@@ -25,13 +25,14 @@ from gaigs.locating import (
 from gaigs.task.csi import Csi
 
 
-def scalars(values, deviations, **options):
+def scalars(values, deviations, hearing=None, **options):
     """Fingerprints of RSSI at places along a line, one row a place."""
     count = len(values)
     places = torch.stack((torch.arange(count).float(), *torch.zeros(2, count)), 1)
     even = torch.full((count,), -math.log(count)), torch.zeros(count)
     task = gaigs.registries["task"].build("rssi")
     parts = torch.tensor(values)[..., None], torch.tensor(deviations)
+    parts = *parts, torch.full_like(parts[1], 0.5) if hearing is None else torch.tensor(hearing)
     return Fingerprints(task, None, places, *even, torch.eye(1), *parts, **options)
 
 
@@ -44,14 +45,16 @@ def rssi():
 
 def test_posterior_is_that_of_a_plain_sum_over_the_receivers_that_hear():
     values, deviations = [[-40.0, -60.0], [-50.0, -52.0], [-60.0, -45.0]], [[2.0, 3.0], [4.0, 3.0], [2.0, 1.5]]
-    prints = scalars(values, deviations, degrees=5.0, temper=0.7)
+    hearing = [[0.9, 0.2], [0.5, 0.4], [0.3, 0.8]]
+    prints = scalars(values, deviations, hearing, degrees=5.0, temper=0.7)
     for asked in ([-48.0, -55.0], [-48.0, math.nan]):
         found = gaigs.locate(prints, asked)
         logs = []
-        for value, deviation in zip(values, deviations, strict=True):
+        for value, deviation, chance in zip(values, deviations, hearing, strict=True):
             heard = [i for i in range(2) if not math.isnan(asked[i])]
             q = sum(((asked[i] - value[i]) / deviation[i]) ** 2 for i in heard)
             logs.append(-0.7 * ((5 + len(heard)) / 2 * np.log1p(q / 5) + sum(np.log(deviation[i]) for i in heard)))
+            logs[-1] += sum(np.log(chance[i] if i in heard else 1 - chance[i]) for i in range(2))
         p = np.exp(logs) / np.exp(logs).sum()
         np.testing.assert_allclose(found.probabilities[0], p, rtol=1e-5)
         np.testing.assert_allclose(found.mean[0], [p @ [0, 1, 2], 0, 0], rtol=1e-5, atol=1e-6)
@@ -61,7 +64,7 @@ def test_posterior_is_that_of_a_plain_sum_over_the_receivers_that_hear():
 def test_unknown_power_takes_the_offset_with_the_least_error():
     prints = scalars([[-40.0, -60.0, -50.0], [-50.0, -52.0, -70.0]], [[2.0, 3.0, 1.0], [4.0, 3.0, 2.0]])
     asked = torch.tensor([[[-47.0], [-66.0], [-58.0]]])
-    total, _, count = squares(prints, asked, unknown_power=True)
+    total, _, count, _ = squares(prints, asked, unknown_power=True)
     for place in range(2):
         errors, deviations = asked[0, :, 0] - prints.values[place, :, 0], prints.deviations[place]
         best = min(((errors - x) / deviations).square().sum().item() for x in torch.arange(-20, 20, 0.01))
@@ -254,7 +257,7 @@ def test_median_place_has_the_least_expected_distance():
 
 
 def test_likelihood_of_a_perfect_value_is_finite():
-    found = log_likelihood(torch.zeros(1, 2), torch.zeros(1, 2), torch.ones(1), 0.25, 16.0)
+    found = log_likelihood(torch.zeros(1, 2), torch.zeros(1, 2), torch.ones(1), torch.zeros(1, 2), 0.25, 16.0)
     assert found.isfinite().all()
 
 

@@ -88,6 +88,22 @@ def distances(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"]) -> Float[T
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
+AROUND = 8
+"""Measured places around another that tell whether a receiver hears it."""
+
+
+def hearing(
+    asked: Float[Tensor, "g d"], known: Float[Tensor, "k 3"], hears: Float[Tensor, "k r"], towards: float | Tensor
+) -> Float[Tensor, "g r"]:
+    """Probability that each receiver hears a place: the share of the known places around that it hears.
+
+    One place more is counted, of which it hears the part ``towards``; ``hears`` has 1 where it hears a known place.
+    """
+    count = min(AROUND, len(known))
+    parts = (distances(part[:, :3], known).topk(count, largest=False).indices for part in asked.split(PART))
+    return torch.cat([(hears[around].sum(1) + towards) / (count + 1) for around in parts])
+
+
 def scale_bounds(scene: Scene) -> tuple[float, float]:
     """Least and largest ``scale`` of ``coordinates`` that the training links can distinguish [m].
 
