@@ -21,7 +21,7 @@ from gaigs.data.matching import check_fit
 from gaigs.geometry import ExtrapolationWarning, even_places
 from gaigs.io.files import write_text
 from gaigs.kriging.intervals import fewest
-from gaigs.kriging.links import distances, evenly, folds_of, hearing
+from gaigs.kriging.links import chance_to_hear, distances, evenly, folds_of
 from gaigs.model import Model
 from gaigs.model.knn import COUNTS
 from gaigs.query import ROUNDING, as_positions, as_tensor
@@ -230,14 +230,18 @@ def fingerprints(
         places, prior, density = candidates(box, points, links if region is None else None, known)
         values, deviations = predicted(one, places, frequency)
         axes, hears = torch.eye(values.shape[2]), torch.full(values.shape[:2], 0.5)
-        if len(known):
-            hears = hearing(places, *heard(links, known), towards=0.5)
+        if len(known) and tells:
+            hears = chance_to_hear(places, *heard_places(links, known), towards=0.5)
         return Fingerprints(scene.task, frequency, places, prior, density, axes, values, deviations, hears)
 
-    known = torch.zeros(0).long() if links is None else at_carrier(links, frequency, "train", "validation")
+    known = tested = torch.zeros(0).long()
+    if links is not None:
+        known, tested = (at_carrier(links, frequency, *parts) for parts in (("train", "validation"), ("test",)))
     if links is not None and region is None and not len(known):
         carriers = ", ".join(f"{carrier:.7g}" for carrier in scene.frequencies.tolist())
         raise ValueError(f"frequency must be that of known links, {carriers} Hz, got {frequency:.7g}; or give a region")
+    # A receiver may have no link of a transmission because that is in the test.
+    tells = links is None or not torch.isin(*(rows_of(links)[part] for part in (known, tested))).any()
     made = mapped(model, known)
     tries: list[Any] = []
     for one, part, others in unseen(model, links) if links is not None else ():
@@ -512,7 +516,7 @@ def received(links: Links, index: Int[Tensor, " k"]) -> tuple[Float[Tensor, "n r
     return found, places
 
 
-def heard(links: Links, index: Int[Tensor, " k"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n r"]]:
+def heard_places(links: Links, index: Int[Tensor, " k"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n r"]]:
     """Places of the transmissions of some links, and 1 for each receiver that has a link of them, else 0."""
     rows, which = rows_of(links)[index].unique(return_inverse=True)
     places, hears = torch.zeros(len(rows), 3), torch.zeros(len(rows), len(links.receivers))

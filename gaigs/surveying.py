@@ -15,7 +15,7 @@ from torch import Tensor
 from gaigs.geometry import even_places
 from gaigs.io.files import write_text
 from gaigs.kriging.kernel import LIMIT, Process, kernel
-from gaigs.kriging.links import coordinates, distances, evenly, hearing
+from gaigs.kriging.links import chance_to_hear, coordinates, distances, evenly
 from gaigs.model import Model, call_optional
 from gaigs.query import Query, as_positions
 from gaigs.registry import call, check_type
@@ -297,14 +297,19 @@ def posterior(process: Process, asked: Float[Tensor, "g d"]) -> Float[Tensor, "g
 
 
 def heard(processes: list[Process], asked: Float[Tensor, "g d"]) -> Float[Tensor, "r g"]:
-    """Shares of the measured places around others that each receiver hears, drawn towards its share of all."""
-    known, rows = torch.cat([process.places[:, :3] for process in processes]).unique(dim=0, return_inverse=True)
-    if not len(known):
+    """Shares of the measured places around others that each receiver hears at the asked carrier, or the nearest one."""
+    places = torch.cat([process.places for process in processes])
+    if not len(places):
         return asked.new_ones(len(processes), len(asked))
+    apart = (places[:, 3:] - asked[:1, 3:]).abs().sum(1)  # of carriers
+    own = torch.repeat_interleave(torch.tensor([len(process.places) for process in processes])).to(places.device)
+    known, rows = places[apart <= apart.min() + 1e-6, :3].unique(dim=0, return_inverse=True)
     hears = known.new_zeros(len(known), len(processes))
-    for receiver, some in enumerate(rows.split([len(process.places) for process in processes])):
-        hears[some, receiver] = 1
-    return hearing(asked, known, hears, hears.mean(0)).mT
+    hears[rows, own[apart <= apart.min() + 1e-6]] = 1
+    for receiver, process in enumerate(processes):
+        if len(process.places) >= LIMIT:  # a part of its readings, so their places do not tell
+            hears[:, receiver] = 1
+    return chance_to_hear(asked, known, hears, hears.mean(0)).mT
 
 
 def mean_of_heard(values: Float[Tensor, "r g"], hears: Float[Tensor, "r g"]) -> float:

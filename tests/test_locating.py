@@ -61,6 +61,24 @@ def test_posterior_is_that_of_a_plain_sum_over_the_receivers_that_hear():
         assert found.likeliest[0, 0] == np.argmax(p)
 
 
+@pytest.mark.parametrize("parted", [False, True])
+def test_a_receiver_that_hears_nothing_tells_where_a_transmitter_is(parted):
+    """Unless its link may be in another part of the split."""
+    rng = torch.Generator().manual_seed(0)
+    places = torch.rand(100, 3, generator=rng) * torch.tensor([10.0, 4.0, 1.0])
+    labels = -50 + torch.randn(100, 2, generator=rng)
+    labels[places[:, 0] > 5, 1] = math.nan
+    stands = torch.tensor([[5.0, -5, 2], [5, 9, 2]])
+    links = gaigs.links(task="rssi", transmitters=places, receivers=stands, labels=labels, split="random")
+    if parted:
+        links = replace(links, split=links.split.only(torch.arange(len(links))[::2]))
+        links = replace(links, split=replace(links.split, test=torch.arange(len(links))[1::2]))
+    prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=400)
+    for value, is_right in (([-50.0, -50.0], False), ([-50.0, math.nan], True)):
+        likely = gaigs.locate(prints, value).probabilities[0] @ (prints.places[:, 0] > 5).double()
+        assert abs(likely - 0.5) < 0.35 if parted else (likely > 0.85) == is_right and abs(likely - 0.5) > 0.3
+
+
 def test_unknown_power_takes_the_offset_with_the_least_error():
     prints = scalars([[-40.0, -60.0, -50.0], [-50.0, -52.0, -70.0]], [[2.0, 3.0, 1.0], [4.0, 3.0, 2.0]])
     asked = torch.tensor([[[-47.0], [-66.0], [-58.0]]])

@@ -95,6 +95,27 @@ def test_a_receiver_counts_where_it_is_likely_to_be_heard():
     assert (hearing[1, 5:] < 0.1).all()
 
 
+def test_plans_count_a_receiver_where_it_is_heard():
+    """One receiver is heard at x < 5 alone: plans do not go where it is unknown, and the error leaves it out there."""
+    rng = torch.Generator().manual_seed(0)
+    places = torch.rand(80, 3, generator=rng) * torch.tensor([10.0, 4.0, 1.0])
+    labels = -50 + 4 * torch.randn(80, 2, generator=rng)
+    labels[places[:, 0] > 5, 1] = torch.nan
+    stands = torch.tensor([[0.0, 0, 2], [10, 4, 2]])
+    model = fitted(gaigs.links(task="rssi", transmitters=places, receivers=stands, labels=labels, split="random"))
+    region = torch.stack((places.amin(0), places.amax(0)))
+    plan = gaigs.survey(model, region=region, count=6)
+    assert (plan.places[:, 0] < 6).sum() >= 4
+    asked, stands = even_places(*region, POINTS).double(), model.scene.positions(places.double())
+    processes = [with_trend(model.process_at(k), stands[k]) for k in range(2)]
+    deviations = [(posterior(own, asked).diagonal() + own.noise).sqrt() for own in processes]
+    left, right = asked[:, 0] < 4, asked[:, 0] > 6
+    parts = torch.cat((deviations[0], deviations[1][left])), torch.cat((deviations[0], deviations[1][left | right]))
+    heard, all_over = (MEAN * part.mean() for part in parts)
+    assert abs(plan.errors[0] - heard) < 0.3 * (all_over - heard)
+    assert plan.losses[plan.known[:, 0] > 6].mean() < plan.losses[plan.known[:, 0] < 4].mean()
+
+
 def test_planned_places_are_worth_more_than_random_ones():
     links = gaigs.links("synthetic", transmitters=200, order=1)
     split, places = links.split, links.query.transmitters

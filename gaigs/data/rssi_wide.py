@@ -215,7 +215,7 @@ def _read_wide(file: Path, content: str) -> Wide:
         if cell not in numbers:
             text = re.sub(r"(?i)\s*dbm$", "", cell.replace("−", "-"))
             value = tables.to_number(text.replace(",", ".") if has_commas else text)
-            numbers[cell] = math.inf if math.isnan(value) and cell.lower() not in EMPTY else value
+            numbers[cell] = math.inf if math.isnan(value) and text.strip().lower() not in EMPTY else value
         return numbers[cell]
 
     rows, wrong = [], {}

@@ -92,7 +92,7 @@ AROUND = 8
 """Measured places around another that tell whether a receiver hears it."""
 
 
-def hearing(
+def chance_to_hear(
     asked: Float[Tensor, "g d"], known: Float[Tensor, "k 3"], hears: Float[Tensor, "k r"], towards: float | Tensor
 ) -> Float[Tensor, "g r"]:
     """Probability that each receiver hears a place: the share of the known places around that it hears.

@@ -60,9 +60,12 @@ ENTRIES = 100_000_000
 DRAWN = 0.2
 """Largest error of a wall in a floor plan [m]."""
 
+CHANCE = 6.0
+"""Share of what is left that the best of thousands of planes explains by chance, times the number of places."""
+
 FEW = 37
-"""Numbers of a channel, elements times delays, below which free strengths explain it by any planes: a room of six has
-as many paths of up to two reflections."""
+"""Numbers of a channel, elements times delays that its band tells apart in the room, below which free strengths explain
+it by any planes: a room of six has as many paths of up to two reflections."""
 
 FEWEST = 8
 """Fewest numbers of a channel in which planes can be searched: one path explains any single number."""
@@ -213,7 +216,8 @@ class ChannelSearch(PlaneSearch):
         self.reach = max(0.07, speed_of_light / 8 / max(band, 1.0))
         # Profiles of a gigabyte at most, also in a hall with a large band.
         size = max(receiver.channels.shape[1] * self.delays(receiver) for receiver in self.receivers)
-        self.numbers = size / 32  # an eighth of the resolution, over four diagonals
+        # Delays are an eighth of the resolution apart, over four diagonals.
+        self.numbers = min(size / 32, max(receiver.flat.shape[1] for receiver in self.receivers))
         self.many = self.drawn(min(200, 60_000_000 // size))
 
     @torch.no_grad()
@@ -233,7 +237,9 @@ class ChannelSearch(PlaneSearch):
             walls = self.aligned()
             left = lambda room: self.in_common(self.many, room[0], room[1], self.order)[0]
             if len(walls[0]) and left(walls) < left(best):
-                return min(walls, self.without_false(*self.grown(*self.settled(*walls, polishes=True))), key=left)
+                moved = self.without_false(*self.grown(*self.settled(*walls, polishes=True)))
+                by_chance = CHANCE / sum(len(receiver.places) for receiver in self.many)
+                return moved if left(moved) < (1 - by_chance) * left(walls) else walls
         if not len(best[0]):
             return best
         if not is_square(best[0]):
@@ -269,10 +275,10 @@ class ChannelSearch(PlaneSearch):
         elements = max(len(receiver.elements) for receiver in self.receivers)
         subcarriers = max(4, 32 // elements)
         most = min(200, ENTRIES // (len(lines) * elements * subcarriers))
-        if most < 50:  # too few places for the many wavelengths of a large hall
-            return half_spaces(self.start[:0])
         parts = [part for part in map(one_of_each_place, self.drawn(most, subcarriers, 1)) if len(part.places)]
-        by_chance = 6 / sum(len(part.places) for part in parts)  # the best of thousands of offsets, of what is left
+        if most < 50 or not parts:  # too few places for the many wavelengths of a large hall
+            return half_spaces(self.start[:0])
+        by_chance = CHANCE / sum(len(part.places) for part in parts)
         planes, waiting = self.start.clone(), list(range(len(self.start)))
         while waiting:  # walls of a drawing, those that explain most first
             placed = planes[[number for number in range(len(planes)) if number not in waiting]]
@@ -292,23 +298,30 @@ class ChannelSearch(PlaneSearch):
             others = torch.cat((planes[:number], planes[number + 1 :]))
             bonus = by_chance if number < len(self.start) else 0.0
             _, planes[number] = self.moved(parts, others, planes[number], bonus)
-        planes = self.in_best_lobes(parts, planes)
+        planes = self.in_best_lobes(parts, planes, by_chance)
         for number in reversed(range(len(self.start), len(planes))):
             others = torch.cat((planes[:number], planes[number + 1 :]))
             left, without = (self.in_common(parts, *half_spaces(some))[0] for some in (planes, others))
             planes = others if without < (1 + by_chance) * left else planes
         return half_spaces(planes)
 
-    def in_best_lobes(self, parts, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "w 4"]:
-        """The planes, each in the lobe of its phases, and there at the place, where paths of all orders leave least."""
+    def in_best_lobes(self, parts, planes: Float[Tensor, "w 4"], by_chance: float) -> Float[Tensor, "w 4"]:
+        """The planes, each in the lobe of its phases, and there at the place, where paths of all orders leave least.
+
+        Walls of the start move at most ``DRAWN`` in all, and only where that leaves less than by chance.
+        """
         left = lambda tried: self.in_common(parts, *half_spaces(tried), self.order)[0]
+        least = left(planes)
         for step in (1 / 16, 1 / 32, 1 / 64):
             for number in range(len(planes)):
-                tried = [planes]
-                for move in (-step, step, -0.5, 0.5, -1, 1, -1.5, 1.5):
-                    tried.append(planes.clone())
-                    tried[-1][number, 3] += move * self.wavelength
-                planes = min(tried, key=left)
+                moves = self.wavelength * planes.new_tensor([-step, step, -0.5, 0.5, -1, 1, -1.5, 1.5])
+                if is_known := number < len(self.start):
+                    moves = moves[(planes[number, 3] + moves - self.start[number, 3]).abs() <= DRAWN]
+                tried = planes.repeat(len(moves), 1, 1)
+                tried[:, number, 3] += moves
+                lefts = [left(one) for one in tried]
+                if lefts and min(lefts) < least * (1 - by_chance * is_known):
+                    least, planes = min(lefts), tried[lefts.index(min(lefts))]
         return planes
 
     def moved(
@@ -769,10 +782,10 @@ class ChannelSearch(PlaneSearch):
 
 def one_of_each_place(receiver: ReceiverChannels) -> ReceiverChannels:
     """One link of each place that is heard: links of one place have one channel, and explain each other."""
+    receiver = receiver.some(receiver.channels.abs().amax((1, 2)) > 0)
     _, which = receiver.places.unique(dim=0, return_inverse=True)
     first = {place: row for row, place in reversed([*enumerate(which.tolist())])}
-    rows = torch.tensor(sorted(first.values()))
-    return receiver.some(rows[receiver.channels[rows].abs().amax((1, 2)) > 0])
+    return receiver.some(torch.tensor(sorted(first.values()), dtype=torch.long))
 
 
 def project(

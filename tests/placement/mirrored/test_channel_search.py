@@ -191,6 +191,25 @@ def test_links_that_are_partly_silent_or_repeated_show_no_wall():
     torch.testing.assert_close(planes, walls, rtol=0, atol=5e-3)
 
 
+def test_drawn_walls_that_phases_do_not_show_stay():
+    links, walls = room(count=120, walls=np.array([WALL]))
+    links = few(links)
+    noise = torch.randn(links.labels.shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    own = search(replace(links, labels=links.labels + 0.1 * links.labels.abs().mean() * noise))
+    drawn = torch.cat((walls, torch.tensor([[0, 1.0, 0, 5.2], PARALLEL]).double()))
+    own.order, own.most, own.start = 2, 3, seen_from(drawn, own.middle)
+    torch.testing.assert_close(own.run()[0], drawn, rtol=0, atol=5e-3)
+
+
+def test_walls_find_the_right_lobe():
+    links, walls = room(count=120, walls=np.array([WALL, FLOOR]))
+    own = search(few(links))
+    true = seen_from(walls, own.middle)
+    beside = true + torch.tensor([0, 0, 0, own.wavelength / 2])
+    planes = own.in_best_lobes(own.drawn(120), beside, 0.05)
+    torch.testing.assert_close(planes, true, rtol=0, atol=2e-3)
+
+
 @pytest.mark.parametrize("error", [0.0, 0.15])
 def test_walls_of_a_drawing_stand_where_phases_agree(error, monkeypatch):
     """Free strengths may move walls away that are drawn where they stand, or not move those that are drawn beside."""
