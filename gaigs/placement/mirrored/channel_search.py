@@ -308,7 +308,7 @@ class ChannelSearch(PlaneSearch):
     def in_best_lobes(self, parts, planes: Float[Tensor, "w 4"], by_chance: float) -> Float[Tensor, "w 4"]:
         """The planes, each in the lobe of its phases, and there at the place, where paths of all orders leave least.
 
-        Walls of the start move at most ``DRAWN`` in all, and only where that leaves less than by chance.
+        Walls of the start move at most ``DRAWN`` in all, and only if that lowers what is left by more than chance.
         """
         left = lambda tried: self.in_common(parts, *half_spaces(tried), self.order)[0]
         least = left(planes)
