@@ -302,10 +302,11 @@ def heard(processes: list[Process], asked: Float[Tensor, "g d"]) -> Float[Tensor
     if not len(places):
         return asked.new_ones(len(processes), len(asked))
     apart = (places[:, 3:] - asked[:1, 3:]).abs().sum(1)  # of carriers
+    at_carrier = apart <= apart.min() + 1e-6
     own = torch.repeat_interleave(torch.tensor([len(process.places) for process in processes])).to(places.device)
-    known, rows = places[apart <= apart.min() + 1e-6, :3].unique(dim=0, return_inverse=True)
+    known, rows = places[at_carrier, :3].unique(dim=0, return_inverse=True)
     hears = known.new_zeros(len(known), len(processes))
-    hears[rows, own[apart <= apart.min() + 1e-6]] = 1
+    hears[rows, own[at_carrier]] = 1
     for receiver, process in enumerate(processes):
         if len(process.places) >= LIMIT:  # a part of its readings, so their places do not tell
             hears[:, receiver] = 1

@@ -268,16 +268,14 @@ class ChannelSearch(PlaneSearch):
         Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
         """
         steps = 10 * (self.points.amax(0) - self.points.amin(0) + 2 * BEYOND * self.diagonal) / self.wavelength
-        axes = torch.eye(3).to(self.points)
-        lines = torch.cat(
-            [self.grid(axis, int(count), BEYOND)[0] for axis, count in zip(axes.split(1), steps, strict=True)]
-        )
         elements = max(len(receiver.elements) for receiver in self.receivers)
         subcarriers = max(4, 32 // elements)
-        most = min(200, ENTRIES // (len(lines) * elements * subcarriers))
+        most = min(200, ENTRIES // (int(steps.sum()) * elements * subcarriers))
         parts = [part for part in map(one_of_each_place, self.drawn(most, subcarriers, 1)) if len(part.places)]
         if most < 50 or not parts:  # too few places for the many wavelengths of a large hall
             return half_spaces(self.start[:0])
+        axes = torch.eye(3).to(self.points).split(1)
+        lines = torch.cat([self.grid(axis, int(count), BEYOND)[0] for axis, count in zip(axes, steps, strict=True)])
         by_chance = CHANCE / sum(len(part.places) for part in parts)
         planes, waiting = self.start.clone(), list(range(len(self.start)))
         while waiting:  # walls of a drawing, those that explain most first
