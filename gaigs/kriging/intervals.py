@@ -22,6 +22,9 @@ BINS = 8
 NUMBERS = 1024
 """Most numbers of a label that intervals are calibrated and scored with; arrays resolve fewer."""
 
+USUAL = 0.9
+"""Level of the intervals that tables have."""
+
 STEPS = 200
 """Levels of the stored quantiles of errors."""
 
@@ -60,13 +63,14 @@ class Calibration:
     deviation also by the distance to the nearest known place of their receiver, if errors rise with it. Pixels of a
     spectrum are in ``BINS`` groups by their predicted amplitude too. A group of n links has an interval of level p by
     the quantile p (n + 1) / n of its errors: it then holds a new link's label with probability p, if links are
-    exchangeable.
+    exchangeable. Of labels of several numbers n is the number of single ones whose share within the interval would
+    scatter as much.
 
     Attributes:
         edges: Of the distances (r or 1, g - 1) [m].
         amplitudes: Edges of the predicted amplitudes (bins - 1,).
         counts: Links of each group (groups,).
-        quantiles: Of the errors at levels 0 to 1 (groups, bins, ``STEPS`` + 1).
+        quantiles: Of the errors at levels 0 to 1 (groups, bins, ``STEPS`` + 1); of single numbers at ranks over n.
         sizes: Root mean square of the errors (groups, bins).
         places, receivers: Of the known links, for the distance; empty with one group of distances.
         lowest: Least possible label.
@@ -126,15 +130,21 @@ class Calibration:
         bins = torch.bucketize(values.double(), amplitudes) if len(amplitudes) else torch.zeros_like(errors).long()
         quantiles = errors.new_zeros(len(counts), len(amplitudes) + 1, STEPS + 1, dtype=torch.float64)
         sizes = quantiles[..., 0].clone()
+        levels = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)
         for group in range(len(counts)):
+            there, which = errors[own == group].double(), bins[own == group]
+            parts = []
             for bin_ in range(len(amplitudes) + 1):
-                inside = errors[own == group][bins[own == group] == bin_].double()
                 # A bin without pixels in a group, as of receivers in different surroundings, has those of all groups.
-                inside = inside if len(inside) else errors[bins == bin_].double()
-                inside = inside if len(inside) else errors.flatten().double()
-                ranks = (torch.linspace(0, 1, STEPS + 1, dtype=torch.float64) * len(inside)).ceil().long() - 1
-                quantiles[group, bin_] = inside.sort().values[ranks.clamp_min(0)]
-                sizes[group, bin_] = inside.square().mean().sqrt()
+                choices = there[which == bin_], errors[bins == bin_].double(), errors.flatten().double()
+                parts.append(next(part for part in choices if len(part)).sort().values)
+                sizes[group, bin_] = parts[-1].square().mean().sqrt()
+            at = lambda levels, parts=parts: torch.stack([part[_ranks(levels, len(part))] for part in parts])
+            if errors.shape[1] > 1:
+                inside = there <= at(levels.new_tensor([USUAL]))[which, 0]
+                quantiles[group] = at(levels * (1 + 1 / independent(inside)))
+            else:
+                quantiles[group] = at(levels)
         known = known if groups > 1 else known[:0]
         lowest = torch.tensor(task.lowest, dtype=torch.float64)
         return cls(edges, amplitudes, counts, quantiles, sizes, known.transmitters, known.receivers, lowest)
@@ -162,7 +172,7 @@ class Calibration:
         if numbers.shape[1] == 1:  # the middle of this link's steps where each link has several
             steps = torch.where(counts < STEPS, ((needed - 0.5) * STEPS / counts).round(), needed * STEPS / counts)
         else:
-            steps = level * (counts + 1) / counts * STEPS
+            steps = torch.full_like(needed, level * STEPS)
         ranks = (steps - 1e-9).ceil().long().clamp_max(STEPS)
         scale = _shaped(deviations, value)
         factors = lambda table: table.reshape(value.shape).to(scale)
@@ -180,6 +190,19 @@ class Calibration:
     def state(self) -> dict[str, Tensor]:
         """Plain tensors for a checkpoint; ``Calibration(**state)`` makes it anew."""
         return {name: getattr(self, name).cpu() for name in self.__dataclass_fields__}
+
+
+def independent(inside: Bool[Tensor, "n m"]) -> float:
+    """Number of single numbers whose share within an interval would scatter as that of the numbers of n links."""
+    shares = inside.double().mean(1)
+    scatter = shares.var().item() if len(shares) > 1 else math.inf
+    share = shares.mean().item()
+    return len(shares) * max(1.0, share * (1 - share) / max(scatter, 1e-12))
+
+
+def _ranks(levels: Float[Tensor, " q"], count: int) -> Int[Tensor, " q"]:
+    """Of the quantiles of ``count`` sorted numbers, from 0."""
+    return ((levels * count - 1e-9).ceil().long() - 1).clamp(0, count - 1)
 
 
 def fewest(level: float) -> int:

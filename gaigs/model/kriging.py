@@ -227,6 +227,11 @@ class Kriging(Wrapper):
         self.fields.to(device)
         return validation_model.to(device)
 
+    @property
+    def scalar(self) -> list[ScalarProcess]:
+        """The process of labels of one real number."""
+        return [self.process] if self.is_scalar else []
+
     def process_at(self, receiver: int) -> Process | None:
         """The process of one receiver; None for kriged paths, whose strengths are processes."""
         if self.is_scalar:

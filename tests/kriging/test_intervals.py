@@ -53,8 +53,8 @@ def shares(task, count, level, repeats=40, **options):
 @pytest.mark.parametrize("level", [0.5, 0.9])
 def test_intervals_hold_their_share_of_new_links(task, count, level):
     share, error = shares(task, count, level)
-    # Of pixels of one link that err alike, a finite number of links gives the share but for one link's weight.
-    assert abs(share - level) <= 3 * error + 1 / (count + 1) * (0.5 if task == "rssi" else 1)
+    # Of single numbers, those of a whole number of links.
+    assert abs(share - level) <= 3 * error + (0.5 / (count + 1) if task == "rssi" else 0)
 
 
 def test_receivers_with_enough_links_have_intervals_of_their_own():
@@ -203,6 +203,17 @@ def test_folds_state_deviations_with_the_hyperparameters_of_all_links(monkeypatc
         assert one.process == model.process or one.scalar
         for process, whole in zip(one.scalar, model.scalar, strict=True):
             torch.testing.assert_close(process.logarithms, whole.logarithms, rtol=0, atol=0)
+
+
+@pytest.mark.usefixtures("quick")
+def test_halves_state_deviations_with_the_hyperparameters_of_all_links(monkeypatch):
+    links = gaigs.links("synthetic_rssi", transmitters=60, order=0, validation=0.3)
+    model, spreads, stating = Kriging(links.scene, barely_trained(links)).krige(links), evaluation.spreads, []
+    monkeypatch.setattr(evaluation, "spreads", lambda one, *rest: stating.append(one) or spreads(one, *rest))
+    evaluation.calibrated(model, links)
+    assert len(stating) == 2
+    for one in stating:
+        torch.testing.assert_close(one.process.logarithms, model.process.logarithms, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(("level", "need"), [(0.9, 9), (0.8, 4), (0.5, 1), (0.99, 99)])
