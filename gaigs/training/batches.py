@@ -52,7 +52,7 @@ class Batches:
             parts = torch.randperm(len(self.places), generator=seeded(self.seed, passed)).split(self.size)
             for chosen in parts[within : within + self.steps - self.position]:
                 self.position += 1
-                yield self._share([self.places[i] for i in chosen])
+                yield self._share([self.places[i] for i in chosen.tolist()])
 
     def _share(self, places: list[Tensor]) -> Batch:
         rank, processes = process()
