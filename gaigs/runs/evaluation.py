@@ -25,6 +25,7 @@ from gaigs.io.files import atomic_write
 from gaigs.kriging.intervals import Calibration, holds, interval_scores, nearest, summarise_intervals, thin
 from gaigs.kriging.links import evenly, folds_of
 from gaigs.model import Model, call_optional
+from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging, predicted
 from gaigs.query import Batch, Query
 from gaigs.registry import name_of, registry
@@ -94,8 +95,9 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
     for one, part, known in unseen(model, links):
         asked.append(part)
         values.append(predicted(one, links, part))
-        for process, whole in zip(getattr(one, "scalar", ()), getattr(model, "scalar", ()), strict=True):
-            process.take(whole)  # a fold's hyperparameters may state larger or smaller deviations everywhere
+        if isinstance(one, GaussianProcess | Kriging) and isinstance(model, GaussianProcess | Kriging):
+            for process, whole in zip(one.scalar, model.scalar, strict=True):
+                process.take(whole)  # a fold's hyperparameters may state larger or smaller deviations everywhere
         deviations.append(spreads(one, links, part, values[-1]))
         there = links.query[known]
         near.append(nearest(links.query[part], there.transmitters, there.receivers))
