@@ -238,9 +238,9 @@ class Query:
         order = np.lexsort(columns[::-1])
         is_new = np.ones(len(order), dtype=bool)
         is_new[1:] = np.any([column[order[1:]] != column[order[:-1]] for column in columns], axis=0)
-        which = np.empty_like(order)
-        which[order] = is_new.cumsum() - 1
-        first, which = (torch.from_numpy(part).to(self.transmitters.device) for part in (order[is_new], which))
+        numbers = np.empty_like(order)
+        numbers[order] = is_new.cumsum() - 1
+        first, which = (torch.from_numpy(part).to(self.transmitters.device) for part in (order[is_new], numbers))
         return self[first], which
 
 
