@@ -23,10 +23,10 @@ NUMBERS = 1024
 """Most numbers of a label that intervals are calibrated and scored with; arrays resolve fewer."""
 
 USUAL = 0.9
-"""Level of the intervals that tables have."""
+"""Level at which shares of links scatter, for the intervals of all levels."""
 
 STEPS = 200
-"""Levels of the stored quantiles of errors."""
+"""Levels of the stored quantiles of errors; one in between has the next higher."""
 
 
 class Estimate(NamedTuple):
@@ -63,14 +63,14 @@ class Calibration:
     deviation also by the distance to the nearest known place of their receiver, if errors rise with it. Pixels of a
     spectrum are in ``BINS`` groups by their predicted amplitude too. A group of n links has an interval of level p by
     the quantile p (n + 1) / n of its errors: it then holds a new link's label with probability p, if links are
-    exchangeable. Of labels of several numbers n is the number of single ones whose share within the interval would
-    scatter as much.
+    exchangeable. Of labels of several numbers, n is the number of single ones whose share within an interval of level
+    ``USUAL`` would scatter as much, so they are held with a probability of about p.
 
     Attributes:
         edges: Of the distances (r or 1, g - 1) [m].
         amplitudes: Edges of the predicted amplitudes (bins - 1,).
         counts: Links of each group (groups,).
-        quantiles: Of the errors at levels 0 to 1 (groups, bins, ``STEPS`` + 1); of single numbers at ranks over n.
+        quantiles: Of the errors, for intervals of levels 0 to 1 (groups, bins, ``STEPS`` + 1).
         sizes: Root mean square of the errors (groups, bins).
         places, receivers: Of the known links, for the distance; empty with one group of distances.
         lowest: Least possible label.
@@ -132,19 +132,15 @@ class Calibration:
         sizes = quantiles[..., 0].clone()
         levels = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)
         for group in range(len(counts)):
-            there, which = errors[own == group].double(), bins[own == group]
-            parts = []
             for bin_ in range(len(amplitudes) + 1):
                 # A bin without pixels in a group, as of receivers in different surroundings, has those of all groups.
-                choices = there[which == bin_], errors[bins == bin_].double(), errors.flatten().double()
-                parts.append(next(part for part in choices if len(part)).sort().values)
-                sizes[group, bin_] = parts[-1].square().mean().sqrt()
-            at = lambda levels, parts=parts: torch.stack([part[_ranks(levels, len(part))] for part in parts])
-            if errors.shape[1] > 1:
-                inside = there <= at(levels.new_tensor([USUAL]))[which, 0]
-                quantiles[group] = at(levels * (1 + 1 / independent(inside)))
-            else:
-                quantiles[group] = at(levels)
+                inside = (bins == bin_) & (own == group)[:, None]
+                inside = inside if inside.any() else bins == bin_
+                inside = inside if inside.any() else torch.ones_like(inside)
+                found = errors[inside].double().sort().values
+                held = (errors <= quantile(found, levels.new_tensor(USUAL))) & inside
+                quantiles[group, bin_] = quantile(found, levels * (1 + 1 / independent(held.sum(1), inside.sum(1))))
+                sizes[group, bin_] = found.square().mean().sqrt()
         known = known if groups > 1 else known[:0]
         lowest = torch.tensor(task.lowest, dtype=torch.float64)
         return cls(edges, amplitudes, counts, quantiles, sizes, known.transmitters, known.receivers, lowest)
@@ -168,15 +164,10 @@ class Calibration:
         bins = (
             torch.bucketize(numbers.double(), amplitudes) if len(amplitudes) else torch.zeros_like(numbers.abs()).long()
         )
-        needed = (level * (counts + 1) - 1e-9).ceil()  # links whose errors the interval holds
-        if numbers.shape[1] == 1:  # the middle of this link's steps where each link has several
-            steps = torch.where(counts < STEPS, ((needed - 0.5) * STEPS / counts).round(), needed * STEPS / counts)
-        else:
-            steps = torch.full_like(needed, level * STEPS)
-        ranks = (steps - 1e-9).ceil().long().clamp_max(STEPS)
+        rank = math.ceil(level * STEPS - 1e-9)
         scale = _shaped(deviations, value)
         factors = lambda table: table.reshape(value.shape).to(scale)
-        half = scale * factors(self.quantiles.to(value.device)[own[:, None], bins, ranks[:, None]])
+        half = scale * factors(self.quantiles.to(value.device)[own[:, None], bins, rank])
         std = scale * factors(self.sizes.to(value.device)[own[:, None], bins])
         if value.is_complex():
             powers, errors = (part.abs().square().flatten(1).sum(1) for part in (value, std))
@@ -192,17 +183,21 @@ class Calibration:
         return {name: getattr(self, name).cpu() for name in self.__dataclass_fields__}
 
 
-def independent(inside: Bool[Tensor, "n m"]) -> float:
-    """Number of single numbers whose share within an interval would scatter as that of the numbers of n links."""
-    shares = inside.double().mean(1)
-    scatter = shares.var().item() if len(shares) > 1 else math.inf
-    share = shares.mean().item()
-    return len(shares) * max(1.0, share * (1 - share) / max(scatter, 1e-12))
+def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float[Tensor, "*q"]:
+    """The least of n sorted numbers that are not below a share of them."""
+    ranks = (levels * len(numbers) - 1e-9).ceil().long()
+    return numbers[(ranks - 1).clamp(0, len(numbers) - 1)]
 
 
-def _ranks(levels: Float[Tensor, " q"], count: int) -> Int[Tensor, " q"]:
-    """Of the quantiles of ``count`` sorted numbers, from 0."""
-    return ((levels * count - 1e-9).ceil().long() - 1).clamp(0, count - 1)
+def independent(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float:
+    """Number of single numbers whose share within an interval would scatter as that of links with ``counts`` numbers.
+
+    ``held`` of them are within; a link's numbers err together, though less than one number with itself.
+    """
+    weights, parts = counts / counts.sum().double(), held / counts.sum().double()
+    share, links = parts.sum().item(), 1 / weights.square().sum().item()
+    scatter = (parts - share * weights).square().sum().item()
+    return max(links, share * (1 - share) * (1 - 1 / links) / max(scatter, 1e-12))
 
 
 def fewest(level: float) -> int:

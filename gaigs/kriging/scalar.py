@@ -242,7 +242,10 @@ class ScalarProcess(nn.Module):
     def take(self, other: "ScalarProcess") -> None:
         """Takes the hyperparameters of another process for ``deviations``; means need ``solve`` again."""
         noises = (2 * (other.logarithms - self.logarithms)[self.receivers, 2]).exp()
+        is_alike = torch.equal(self.choice[:2], other.choice[:2])
         self.variances, self.logarithms, self.choice = self.variances * noises, other.logarithms, other.choice
+        if not is_alike:  # readings that disagree count less with one noise than with another
+            self.variances = (2 * self.logarithms[self.receivers, 2]).exp() * self._factors(self.values)
 
     def _maximise(
         self,

@@ -229,7 +229,7 @@ class Kriging(Wrapper):
 
     @property
     def scalar(self) -> list[ScalarProcess]:
-        """The process of labels of one real number."""
+        """The process of labels of one real number, as ``GaussianProcess`` has it; none of others."""
         return [self.process] if self.is_scalar else []
 
     def process_at(self, receiver: int) -> Process | None:

@@ -11,6 +11,7 @@ from scipy.integrate import quad
 
 import gaigs
 from gaigs.data import Split
+from gaigs.geometry import Rays
 from gaigs.kriging import scalar
 from gaigs.kriging.intervals import Calibration, Estimate, interval_scores, nearest, summarise_intervals
 from gaigs.model.kriging import Kriging
@@ -109,6 +110,34 @@ def test_amplitudes_are_not_negative_and_larger_ones_err_more():
     assert found.lower.min() == 0
     half = found.upper - found.value
     assert half[values > 0.9].mean() > 3 * half[values < 0.1].mean()
+
+
+def test_a_direction_asked_alone_has_the_interval_that_it_has_beside_others():
+    links = example_links("spectrum")
+    model = gaigs.train("knn", links)
+    alone, both = (
+        model.predict([1.0, 1.0, 1.0], directions=Rays(torch.tensor(up), torch.tensor(round_)), interval=0.8).upper
+        for up, round_ in (([0.3], [1.0]), ([0.3, 0.7], [1.0, 2.0]))
+    )
+    torch.testing.assert_close(alone[..., 0], both[..., 0])
+
+
+def test_pixels_of_a_bin_that_err_together_count_as_few_numbers():
+    """Links with one amplitude each, so that a bin has pixels of few links."""
+    kind = example_links("spectrum").task
+    held = []
+    for seed in range(30):
+        generator = torch.Generator().manual_seed(seed)
+        values = torch.rand(220, 1, 1, generator=generator).expand(-1, *kind.shape)
+        scales = torch.rand(220, 1, 1, generator=generator).reciprocal().sqrt()
+        labels = values + 0.1 * scales * torch.randn(220, *kind.shape, generator=generator)
+        query, ones = Query(torch.rand(220, 3), torch.zeros(220, dtype=torch.long)), torch.ones(220)
+        few, new = slice(0, 20), slice(20, None)
+        calibration = Calibration.of(kind, labels[few], values[few], ones[few], query[few], None, query[:1])
+        estimate = calibration.estimate(values[new], ones[new], query[new], 0.9)
+        estimate = estimate._replace(lower=2 * values[new] - estimate.upper)
+        held.append(interval_scores(kind, labels[new], estimate, estimate)["coverage_90"].mean().item())
+    assert abs(np.mean(held) - 0.9) < 0.02
 
 
 def test_discs_and_the_expected_snr_of_channels():
