@@ -127,7 +127,7 @@ class Links:
 
     def batch(self, index: Int[Tensor, " b"]) -> Batch:
         """Links as a batch with labels, in all directions of the task."""
-        return Batch(self.query[index], self.task.directions, self.labels.index_select(0, index))
+        return Batch(self.query[index], self.task.directions, self.labels[index])
 
     def known(self, receiver: int) -> Int[Tensor, " k"]:
         """Training and validation links to a receiver; look-ups use them all."""

@@ -89,6 +89,9 @@ def from_arrays(
         if index is None and len(stands) == len(places) > 1 and np.ndim(labels) == 1 + len(task.shape):
             stands, index = stands.unique(dim=0, return_inverse=True)
         receivers = [gateway(f"rx{k}", place) for k, place in enumerate(stands)]
+    names = [receiver.name for receiver in receivers]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"receivers must have different names, got {twice[0]!r} more than once")
     if np.ma.is_masked(labels):
         raise ValueError("labels must be plain numbers, got a masked array; fill it with nan where nothing was heard")
     convert = as_tensor if task.dtype.is_complex else as_numbers

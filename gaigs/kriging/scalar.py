@@ -37,9 +37,13 @@ ITERATIONS = 50
 PART = 2048
 """Places whose neighbours are held in memory at a time."""
 
+WIDEST = 2.0
+"""Largest deviation of the signal over the residuals' root mean square. Readings millimetres apart show its ratio to a
+power of the length alone: beside them a larger one would give levels that no receiver hears."""
+
 LARGEST = 50.0
-"""Largest deviation of signal and noise over the residuals' root mean square, and the inverse of the least: the noise
-keeps matrices regular where a place is measured twice."""
+"""Largest deviation of the noise over the residuals' root mean square, and the inverse of the least one of both: the
+noise keeps matrices regular where a place is measured twice."""
 
 
 def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
@@ -260,8 +264,8 @@ class ScalarProcess(nn.Module):
         """Least negative log likelihood of the held-out readings, and the hyperparameters that have it."""
         count, scene, size = len(self.logarithms), self.scene, values.square().mean().sqrt().item()
         lengths = scene.spacing, EDGES * (scene.upper - scene.lower).max().item()
-        sizes = ((size or 1.0) / LARGEST, (size or 1.0) * LARGEST)
-        bounds = np.log([lengths, sizes, sizes, *([scale_bounds(scene)] if scene.has_band else [])])
+        signals, noises = ((size or 1.0) * np.array([1 / LARGEST, most]) for most in (WIDEST, LARGEST))
+        bounds = np.log([lengths, signals, noises, *([scale_bounds(scene)] if scene.has_band else [])])
         shared = len(bounds)
         if has_deviations:
             bounds = np.concatenate((bounds, np.tile([-20.0, 20.0], (3 * count, 1))))

@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from gaigs.geometry import Grid
-from gaigs.query import Batch
+from gaigs.query import Batch, as_directions
 from gaigs.registry import register
 from gaigs.task import Metric, Task, Thinning, check_values, need_samples
 
@@ -37,7 +37,8 @@ class Spectrum(Task):
     lowest = 0.0
 
     def __init__(self, elevations: Float[Tensor, " rows"], azimuths: Float[Tensor, " columns"], normalisation: str):
-        self.directions = Grid(elevations, azimuths)
+        grid = Grid(elevations, azimuths)
+        self.directions: Grid = as_directions(grid, grid, self.name)
         self.normalisation = normalisation
 
     @property

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.data.readings import gateway
 from gaigs.task.csi import Csi
 
 PLACES = np.random.default_rng(0).uniform(0, 4, (12, 3))
@@ -51,6 +52,7 @@ def test_each_link_has_a_receiver_of_its_own():
         ({"transmitters": PLACES[:, :2]}, r"transmitters must be \(..., 3\) positions \[m\], got shape \(12, 2\)"),
         ({"transmitters": PLACES * np.nan}, "transmitters must be finite"),
         ({"frequency": 2.4}, "frequency must be a carrier in Hz, from 10000 to 3e.11, got 2.4; in GHz?"),
+        ({"receivers": [gateway("gw", place) for place in GATEWAYS]}, "must have different names, got 'gw' more than"),
         ({"tset": 0.5}, r"there is no option 'tset' \(did you mean 'test'\?\) of split 'random'"),
         ({"task": "rsi"}, r"unknown task 'rsi' \(did you mean 'rssi'\?\)"),
     ],

@@ -10,6 +10,7 @@ from scipy import stats
 from scipy.integrate import quad
 from scipy.spatial.distance import cdist
 
+import gaigs
 from gaigs.data import Split
 from gaigs.kriging import scalar
 from gaigs.kriging.links import coordinates, folds_of
@@ -238,3 +239,17 @@ def test_a_receiver_with_hardly_a_reading_is_predicted():
     links = replace(links, split=replace(links.split, train=few))
     found = fitted(links).predict(links.query.transmitters[:3], 1)
     torch.testing.assert_close(found, links.labels[40].expand(3), rtol=0, atol=1e-3)
+
+
+def test_levels_beside_a_dense_track_stay_those_of_a_receiver():
+    """A robot's two lanes, rows a centimetre apart: a smooth pattern along them shows no deviation of the field."""
+    along = torch.linspace(0, 4, 200).double()
+    places = torch.stack((along.repeat(2), torch.tensor([0.0, 2.0]).repeat_interleave(200), 0 * along.repeat(2)), 1)
+    waves = (10 * places[:, :1] + places[:, 1:2]).sin() - (7 * places[:, :1]).cos()
+    levels = -60 + 6 * waves + torch.randn(400, 1, generator=torch.Generator().manual_seed(0))
+    links = gaigs.links(task="rssi", transmitters=places, receivers=[[9.0, 5.0, 2.0]], labels=levels, test=0.0)
+    process = fitted(links).scalar[0]
+    size = process.values.square().mean().sqrt()
+    assert process.logarithms[0, 1].exp() < 2.5 * size
+    away = torch.tensor([[2.0, 9.0, 0.0]]).double()
+    assert process.deviations(away, torch.zeros(1, dtype=torch.long)) < 3 * size

@@ -69,6 +69,15 @@ def test_spectra_smaller_than_the_window_are_refused():
         small.scores(torch.zeros(2, 6, 24), torch.zeros(2, 6, 24))
 
 
+def test_axes_are_arrays_in_radians():
+    axes = GRID.elevations.numpy(), GRID.azimuths.tolist()
+    directions = Spectrum(*axes, "none").directions
+    assert torch.equal(directions.elevations, GRID.elevations)
+    assert torch.equal(directions.azimuths, GRID.azimuths)
+    with pytest.raises(ValueError, match="elevations must be a list of angles .* rad, got 5; Grid.degrees takes"):
+        Spectrum(np.rad2deg(axes[0]), axes[1], "none")
+
+
 def test_nothing_to_summarise_is_refused():
     with pytest.raises(ValueError, match="at least one sample"):
         TASK.summarise(TASK.scores(torch.zeros(0, 9, 24), torch.zeros(0, 9, 24)))
