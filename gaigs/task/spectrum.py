@@ -1,6 +1,7 @@
 """Spatial spectra: an amplitude in each direction of a grid."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,8 +37,13 @@ class Spectrum(Task):
     normalisation = ""
     lowest = 0.0
 
-    def __init__(self, elevations: Float[Tensor, " rows"], azimuths: Float[Tensor, " columns"], normalisation: str):
-        grid = Grid(elevations, azimuths)
+    def __init__(
+        self,
+        elevations: Float[Tensor, " rows"] | Float[np.ndarray, " rows"] | Sequence[float],
+        azimuths: Float[Tensor, " columns"] | Float[np.ndarray, " columns"] | Sequence[float],
+        normalisation: str,
+    ):
+        grid = Grid(torch.as_tensor(elevations, dtype=torch.float32), torch.as_tensor(azimuths, dtype=torch.float32))
         self.directions: Grid = as_directions(grid, grid, self.name)
         self.normalisation = normalisation
 

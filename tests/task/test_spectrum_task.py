@@ -74,7 +74,7 @@ def test_axes_are_arrays_in_radians():
     directions = Spectrum(*axes, "none").directions
     assert torch.equal(directions.elevations, GRID.elevations)
     assert torch.equal(directions.azimuths, GRID.azimuths)
-    with pytest.raises(ValueError, match="elevations must be a list of angles .* rad, got 5; Grid.degrees takes"):
+    with pytest.raises(ValueError, match=r"elevations must be a list of angles .* rad, got 5; Grid.degrees takes"):
         Spectrum(np.rad2deg(axes[0]), axes[1], "none")
 
 
