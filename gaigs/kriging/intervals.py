@@ -139,7 +139,7 @@ class Calibration:
                 inside = inside if inside.any() else torch.ones_like(inside)
                 found = errors[inside].double().sort().values
                 held = (errors <= quantile(found, levels.new_tensor(USUAL))) & inside
-                quantiles[group, bin_] = quantile(found, levels * (1 + 1 / independent(held.sum(1), inside.sum(1))))
+                quantiles[group, bin_] = quantile(found, levels * (1 + 1 / effective_count(held.sum(1), inside.sum(1))))
                 sizes[group, bin_] = found.square().mean().sqrt()
         known = known if groups > 1 else known[:0]
         lowest = torch.tensor(task.lowest, dtype=torch.float64)
@@ -189,7 +189,7 @@ def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float
     return numbers[(ranks - 1).clamp(0, len(numbers) - 1)]
 
 
-def independent(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float:
+def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float:
     """Number of single numbers whose share within an interval would scatter as that of links with ``counts`` numbers.
 
     ``held`` of them are within; a link's numbers err together, though less than one number with itself.
