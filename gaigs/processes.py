@@ -138,7 +138,8 @@ def only_run(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(f"another run is at work in {folder}\nwait, or choose another hydra.run.dir") from None
+            advice = "wait, or choose another folder (hydra.run.dir)"
+            raise ValueError(f"another run is at work in {folder}\n{advice}") from None
         yield
     finally:
         os.close(handle)

@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import json
+import linecache
 import os
 import re
 import shutil
@@ -25,6 +26,7 @@ from gaigs.geometry import Pose
 from gaigs.placement.mirrored.channel_search import SLABS, ChannelSearch
 from gaigs.processes import Stopped, stopping
 from gaigs.radio_maps import RadioMap
+from gaigs.registry import registry
 from gaigs.report.curves import read_curves
 from gaigs.runs import evaluation
 from gaigs.testing import example_links
@@ -555,6 +557,18 @@ def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch):
         file.write_text(text)
     (tmp_path / "plugins/unrelated.py").write_text("")
     runs.folder.claim(folder, config)
+
+
+def test_a_changed_component_of_a_notebook_is_no_finished_run(monkeypatch):
+    """Cells have no file: their text is where Python looks for that of errors."""
+    monkeypatch.setitem(registry("split")._registered, "cell_split", None)
+    digests = []
+    for number, text in enumerate(("half = 1 / 2", "half = 1 / 3", "half = 1 / 2")):
+        cell = f"@gaigs.register('split', 'cell_split')\ndef cell_split(links):\n    {text}\n# {number}\n"
+        monkeypatch.setitem(linecache.cache, f"cell {number}", (len(cell), None, cell.splitlines(True), ""))
+        exec(compile(cell, f"cell {number}", "exec"), {"__name__": "__main__", "gaigs": gaigs})
+        digests.append(runs.folder.software({"split": {"name": "cell_split"}})["split cell_split"])
+    assert digests[0] == digests[2] != digests[1]
 
 
 def test_a_run_killed_behind_its_training_only_tests_anew(finished, tmp_path, monkeypatch):

@@ -3,22 +3,24 @@
 Names are found without an import; a component is imported when it is built.
 """
 
+import ast
 import contextlib
 import difflib
 import functools
+import hashlib
 import importlib
 import inspect
+import linecache
 import math
 import numbers
 import sys
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, NoneType, UnionType
 from typing import Any
 
 from gaigs.registry.holders import GIVEN, MISSING, Holder, find_holders, is_plain, sources
-from gaigs.registry.holders import digests as digests
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
@@ -193,6 +195,33 @@ def register(kind: str, name: str, /) -> Callable:
         True
     """
     return registry(kind).register(name)
+
+
+def digests(names: Container[str]) -> dict[str, str]:
+    """Digests of the sources of components outside gaigs that have some of these names, by kind and name.
+
+    Of a component of a notebook or a script, the source of its class or function alone counts.
+    """
+    found = {}
+    for kind, components in registries.items():
+        holders = {holder.name: holder for holder in find_holders(kind)[0]}
+        for name in filter(names.__contains__, components.names()):
+            if (holder := holders.get(name)) is None:
+                found[f"{kind} {name}"] = hashlib.sha256(_source(components.get(name)).encode()).hexdigest()
+            elif holder.root is not None or holder.file is None:
+                found[f"{kind} {name}"] = holder.digest
+    return found
+
+
+def _source(component: Any) -> str:
+    """The source of a class or function that was defined in a notebook or a script; empty if it is not kept."""
+    parts = [inspect.unwrap(part) for part in (component, *vars(component).values()) if inspect.isfunction(part)]
+    for file in {part.__code__.co_filename: None for part in parts}:
+        text = "".join(linecache.getlines(file))
+        nodes = [node for node in ast.parse(text).body if getattr(node, "name", None) == component.__name__]
+        if nodes:
+            return ast.get_source_segment(text, nodes[-1]) or ""
+    return ""
 
 
 def is_built(config: object) -> bool:

@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -68,6 +68,17 @@ class Holder:
         spec = find_spec(self.package)  # imports nothing, as the name has no dots
         return next(map(Path, (spec and spec.submodule_search_locations) or ()), None)
 
+    @property
+    def digest(self) -> str:
+        """Digest of the sources: the file in ./plugins or the package, and other plug-ins there that it imports."""
+        place = self.file or self.folder
+        if self.file is not None and self.root is not None and self.file.parent != self.root / "plugins":
+            place = self.root / "plugins" / self.file.relative_to(self.root / "plugins").parts[0]
+        digest = hashlib.sha256()
+        for file in sorted(_with_imports(place)) if place else ():
+            digest.update(file.read_bytes())
+        return digest.hexdigest()
+
 
 def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
     """The holders of a kind's names, or of one name: gaigs, then installed packages, then ./plugins.
@@ -101,26 +112,6 @@ def _installed_holders(kind: str) -> list[Holder]:
 def _installed(group: str, _: tuple) -> metadata.EntryPoints:
     """Entry points of a group. They stand in a file of each package on ``sys.path``, and reading these is slow."""
     return metadata.entry_points(group=group)
-
-
-def digests(names: Container[str]) -> dict[str, str]:
-    """Digests of the sources of plug-ins that hold some of these names, by kind and name.
-
-    A digest covers the file in ./plugins or the package, and other plug-ins there that it imports.
-    """
-    found = {}
-    for kind in GIVEN.keys() | {"task", "data", "rasterizer", "benchmark"}:
-        for holder in find_holders(kind)[0]:
-            if holder.name not in names or (holder.file and holder.root is None):
-                continue
-            place = holder.file or holder.folder
-            if holder.file is not None and holder.file.parent != holder.root / "plugins":
-                place = holder.root / "plugins" / holder.file.relative_to(holder.root / "plugins").parts[0]
-            digest = hashlib.sha256()
-            for file in sorted(_with_imports(place)) if place else ():
-                digest.update(file.read_bytes())
-            found[f"{kind} {holder.name}"] = digest.hexdigest()
-    return dict(sorted(found.items()))
 
 
 def _with_imports(place: Path) -> set[Path]:

@@ -17,6 +17,8 @@ from gaigs.io.files import atomic_write, write_text
 from gaigs.registry import digests
 from gaigs.version import __version__
 
+ANOTHER = "choose another folder (hydra.run.dir)"
+
 
 def claim(folder: Path, config: dict) -> None:
     """Writes the configuration into a run folder, unless a run can be resumed there.
@@ -28,7 +30,7 @@ def claim(folder: Path, config: dict) -> None:
     names = ("config.yaml", "software.json", "best.ckpt", "log", "predictions.npz", "gaussians.ply", "radio_map.npz")
     there = [name for name in (*names, "figures", "last.ckpt", "metrics.json") if (folder / name).exists()]
     if there and not is_configuration(file):
-        raise ValueError(f"{folder} holds {', '.join(there)} of something else\nchoose another hydra.run.dir")
+        raise ValueError(f"{folder} holds {', '.join(there)} of something else\n{ANOTHER}")
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         store(config, folder)
         return
@@ -41,7 +43,7 @@ def claim(folder: Path, config: dict) -> None:
     if differing:
         keys = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
         listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in keys)
-        raise ValueError(f"{folder} holds a run of another configuration: {listed}\nchoose another hydra.run.dir")
+        raise ValueError(f"{folder} holds a run of another configuration: {listed}\n{ANOTHER}")
 
 
 def store(config: dict, folder: Path) -> None:
@@ -74,14 +76,10 @@ def check_software(folder: Path, config: dict) -> None:
     series = lambda version: ".".join(version.split(".")[:2])
     began = str(there.get("gaigs", "0.1 or earlier"))
     if series(began) != series(here["gaigs"]):
-        raise ValueError(
-            f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}\nchoose another hydra.run.dir"
-        )
+        raise ValueError(f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}\n{ANOTHER}")
     changed = sorted(key for key in here.keys() | there.keys() if key != "gaigs" and here.get(key) != there.get(key))
     if changed:
-        raise ValueError(
-            f"the source of {', '.join(changed)} has changed since {folder} was begun\nchoose another hydra.run.dir"
-        )
+        raise ValueError(f"the source of {', '.join(changed)} has changed since {folder} was begun\n{ANOTHER}")
 
 
 def is_configuration(file: Path) -> bool:
@@ -101,7 +99,7 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
     if not same or there["links"] != here["links"]:
         raise ValueError(
             f"the data have changed since {path} was written: another split, or other transmitters, receivers, "
-            "frequencies or labels\nchoose another hydra.run.dir"
+            f"frequencies or labels\n{ANOTHER}"
         )
 
 
