@@ -11,8 +11,8 @@ from torch.autograd.graph import register_multi_grad_hook
 
 from gaigs.benchmark import Benchmark, Context, Row, grouped, median_and_spread, now, table
 from gaigs.data import load
-from gaigs.registry import call, register, registry
-from gaigs.runs.training import check_trainer, count_gaussians
+from gaigs.registry import register, registry
+from gaigs.runs.training import count_gaussians, make_trainer
 from gaigs.training.batches import Batches
 from gaigs.training.budget import make_budget
 
@@ -159,8 +159,7 @@ def train(config: dict, repeats: int, device: str) -> tuple[dict[str, list[float
     watch, steps = Watch(), 6 + 2 * repeats
     options = config["trainer"] | {"max_steps": steps, "max_time": None, "enable_progress_bar": False}
     options |= {"accelerator": "gpu" if device == "cuda" else "cpu", "enable_checkpointing": False}
-    trainer = call("trainer", lightning.Trainer, make_budget(options)[0], callbacks=[watch], logger=False)
-    check_trainer(trainer)
+    trainer = make_trainer(make_budget(options)[0], callbacks=[watch], logger=False)
     rasterizer = model.rasterizer
     with warnings.catch_warnings():
         for message in (".*LeafSpec", "You defined a `validation_step` but have no `val_dataloader`"):

@@ -8,7 +8,7 @@ import threading
 import time
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import lightning
 from hydra.core.hydra_config import HydraConfig
@@ -30,7 +30,7 @@ from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
 from gaigs.registry import call, configuration_of, registry
 from gaigs.runs.evaluation import calibrated, is_trained
-from gaigs.runs.folder import check_same_links, claim, fingerprint
+from gaigs.runs.folder import ANOTHER, check_same_links, claim, fingerprint
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS, make_budget
 from gaigs.training.checkpoints import Interrupted, KeepBest, KeepLast
@@ -214,8 +214,7 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
     for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
         logging.getLogger(name).setLevel(logging.WARNING)
-    trainer = call("trainer", lightning.Trainer, options, **context)
-    check_trainer(trainer)
+    trainer = make_trainer(options, **context)
     steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
     batches = Batches(links, links.split.train, module.batch_size, config["seed"], steps)
     validation = InOrder(links, links.split.validation, module.batch_size) if len(links.split.validation) else None
@@ -267,13 +266,16 @@ def resumable(last: Path, best: Path) -> dict:
     except ValueError as error:
         raise ValueError(
             f"cannot resume the training: {str(error).partition(chr(10))[0]}\n"
-            f"move {last} elsewhere to train again, which overwrites best.ckpt, or choose another hydra.run.dir"
+            f"move {last} elsewhere to train again, which overwrites best.ckpt, or {ANOTHER}"
         ) from error
     return content
 
 
-def check_trainer(trainer: lightning.Trainer) -> None:
-    """Checks that a training can be stopped and resumed at any step, in one process or several."""
+def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
+    """A trainer that can stop and resume at any step, in one process or several; a ``ValueError`` for other options."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "GPU available but not used")  # advice against an option that was chosen
+        trainer = call("trainer", lightning.Trainer, options, **context)
     # The first two set the limits of batches: 1 is one batch, 1.0 is all batches.
     usual = {"fast_dev_run": False, "overfit_batches": 0.0, "accumulate_grad_batches": 1}
     for name, value in (usual | {"limit_train_batches": 1.0, "limit_val_batches": 1.0}).items():
@@ -296,6 +298,7 @@ def check_trainer(trainer: lightning.Trainer) -> None:
             "a job of a multirun must train in one process\n"
             "run it alone, or use hydra/launcher=submitit_slurm, which starts the processes of each job"
         )
+    return trainer
 
 
 def count_gaussians(model: Model) -> int:
