@@ -30,7 +30,7 @@ from gaigs.report import style
 from gaigs.runs import links_of, model_of
 from gaigs.runs.evaluation import is_trained, unseen
 from gaigs.split import rows_of
-from gaigs.task import Task
+from gaigs.task import Task, check_range
 
 POINTS, SECONDS, FEWEST = 20_000, 60.0, 1000
 """Candidate places; fewer, down to the last, where the model takes longer than the seconds for them."""
@@ -545,6 +545,7 @@ def as_fingerprints(value: object, prints: Fingerprints, is_track: bool = False)
         )
     if not flat[~missing].isfinite().all():
         raise ValueError("value must be finite, or NaN where a receiver has not heard it")
+    check_range(prints.task, values.flatten(0, 1), "value")
     found = prints.task.fingerprint(values.flatten(0, 1)).unflatten(0, values.shape[:2])
     return found.masked_fill(missing[..., None], math.nan)
 

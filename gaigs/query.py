@@ -51,7 +51,9 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
         if np.ma.is_masked(values):
             raise TypeError("masked")
         array: Any = np.array(values)  # a copy, since torch warns of arrays that are read-only
-        if array.dtype == object:  # of numbers, such as a column of pandas
+        if array.dtype == object and array.ndim:  # of numbers, such as a column of pandas; None and NA are NaN
+            is_missing = np.frompyfunc(lambda value: value is None or type(value).__name__ == "NAType", 1, 1)
+            array[is_missing(array).astype(bool)] = np.nan
             array = np.array(array.tolist())
         # Torch takes no negative strides and no other byte order.
         return torch.from_numpy(np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(array.shape))

@@ -284,6 +284,7 @@ def test_wrong_values_are_refused(rssi):
     for value, words in (
         ([-50.0, -60.0], "a label of each receiver"),
         ([math.nan] * 4, "heard by no receiver"),
+        ([100.0, -50.0, -60.0, -70.0], "value of task 'rssi' must be from -200 to 30 dBm, nan where nothing was heard"),
         (np.zeros((0, 4)), "a label of each receiver"),
         ([-50.0, math.inf, -60.0, -70.0], "must be finite"),
         ("loud", "value must be labels of 4 receivers"),

@@ -30,7 +30,7 @@ def ask(positions=PLACE, receiver=0, frequency=None, known=NONE):
         ([[1.0, 2, 3], [1.0, 2]], r"in real numbers, got \[\[1.0, 2, 3\], \[1.0, 2\]\]"),
         ("west", "in real numbers, got 'west'"),
         (np.ones((1, 3), dtype=bool), "in real numbers"),
-        (np.array([[1.0, 2, None]]), "in real numbers"),
+        (np.array([[1.0, 2, None]]), r"must be finite, got \[1.0, 2.0, nan\] in row 0"),
         (torch.eye(3).to_sparse(), "got a sparse_coo tensor; give a dense tensor with values"),
         (torch.zeros(1, 3, device="meta"), "got a meta tensor; give a dense tensor"),
         (np.ma.array([[1.0, 2, 3]], mask=[[True, False, False]]), "in real numbers, got masked_array"),

@@ -8,7 +8,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.io.images import GreyImages
-from gaigs.task.spectrum import Spectrum
+from gaigs.task.spectrum import SSIM_WINDOW, Spectrum
 
 SPANS = 0.3, 1000.0
 """Least and largest usual extent of a measured room [m]; others are probably in another unit."""
@@ -21,7 +21,7 @@ def doubts(links: Any) -> list[str]:
     """Sentences about places, walls, arrays and spectra of ``Links`` that do not fit the other data.
 
     Raises:
-        ValueError: All spectra are constant.
+        ValueError: All spectra are constant, or too small for SSIM.
     """
     transmitters, receivers, task = links.query.transmitters, links.receivers, links.task
     stands = torch.stack([receiver.pose.position for receiver in receivers]).to(transmitters)
@@ -93,6 +93,9 @@ def _diagonal(points: Float[Tensor, "k d"]) -> float:
 
 def _spectra_doubts(task: Spectrum, labels: Tensor | GreyImages) -> list[str]:
     """Counts of constant spectra, and of min-max spectra without a pixel of 0 or of 1."""
+    if min(task.shape) < SSIM_WINDOW:
+        rows, columns = task.shape
+        raise ValueError(f"spectra must have {SSIM_WINDOW} x {SSIM_WINDOW} pixels or more, got {rows} x {columns}")
     parts = (labels[index].flatten(1) for index in torch.arange(len(labels)).split(256))
     low, high = torch.cat([torch.stack((part.amin(1), part.amax(1)), 1) for part in parts]).T
     constant = low == high

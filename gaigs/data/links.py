@@ -1,21 +1,27 @@
 """Links of a registered reader, or of arrays in memory."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from gaigs import configuration
-from gaigs.antenna import Receiver
+from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, divide, load
-from gaigs.data.readings import LOUDEST, gateway, loud_remark, marks_of
+from gaigs.data.readings import loud_remark, marks_of
+from gaigs.geometry import Pose
 from gaigs.io.tables import number_places
 from gaigs.query import Query, as_numbers, as_positions, as_tensor, check_carrier
 from gaigs.registry import registry
-from gaigs.task import Task
+from gaigs.task import Task, check_range
+from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import Spectrum
+
+log = logging.getLogger(__name__)
 
 
 def links(reader: str | None = None, /, **options: Any) -> Links:
@@ -56,28 +62,39 @@ def from_arrays(
     labels: Any,
     index: Any = None,
     frequency: Any = None,
-    split: str | Mapping = "random",
+    split: str | Mapping | None = None,
+    test_rows: Any = None,
+    train_rows: Any = None,
     **options: Any,
 ) -> Links:
     """Links of arrays in memory, or of values that torch converts, with their split.
 
     Args:
         task: Task of the labels: ``"rssi"`` (scalars [dBm]), or a task with its axes, e.g.
-            ``gaigs.task.spectrum.Spectrum(elevations, azimuths, "")`` or ``gaigs.task.csi.Csi(elements, frequencies)``.
+            ``gaigs.task.spectrum.Spectrum(elevations, azimuths)`` or ``gaigs.task.csi.Csi(elements, frequencies)``.
         transmitters: Positions, world frame (n, 3) [m].
-        receivers: ``Receiver`` or several, or positions (3,) or (k, 3) [m] of single antennas that look along the axes.
+        receivers: ``Receiver`` or several, or positions (3,) or (k, 3) [m] of antennas that look along the axes; all
+            elements of a channel then stand there.
         labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver, (n, k, ...).
-            Readings of NaN and channels of zeros were not heard, and are left out.
+            Readings of NaN or None and channels of zeros were not heard, and are left out; so are receivers without
+            training links.
         index: Receiver of each link (n,), or of all, from 0; not needed with one receiver, n positions, or labels
             (n, k, ...).
         frequency: Carrier, one or one a link [Hz]; None if unknown, for channels the middle of the subcarriers.
-        split: Name of a registered split; ``options`` are its own.
+        split: Name of a registered split, ``options`` are its own; by default ``official`` with ``test_rows``, else
+            ``random``.
+        test_rows: Rows of ``transmitters`` to test on, as numbers or a mask (n,).
+        train_rows: Rows to train and validate on; by default all others.
 
     Raises:
         TypeError: An option has a wrong type.
         ValueError: Shapes do not fit, a number is not finite or out of range, or there is nothing to split.
     """
+    has_parts = test_rows is not None or train_rows is not None
+    split = split or ("official" if has_parts else "random")
     config = configuration.composed([], {"split": split, **options}, ("split",))["split"]
+    if has_parts and (test_rows is None or config["name"] != "official"):
+        raise ValueError("train_rows and test_rows are for split='official'; give test_rows, and no other split")
     task = registry("task").build(task)
     places = as_positions("transmitters", transmitters).detach()
     if places.ndim != 2 or not len(places):
@@ -87,8 +104,10 @@ def from_arrays(
     if not (isinstance(receivers, Sequence) and all(isinstance(each, Receiver) for each in receivers)):
         stands = as_positions("receivers", receivers).reshape(-1, 3)
         if index is None and len(stands) == len(places) > 1 and np.ndim(labels) == 1 + len(task.shape):
-            stands, index = stands.unique(dim=0, return_inverse=True)
-        receivers = [gateway(f"rx{k}", place) for k, place in enumerate(stands)]
+            distinct, index = number_places(stands.tolist())
+            stands = torch.tensor(distinct)
+        antenna = Array(torch.zeros(task.elements if isinstance(task, Csi) else 1, 3))
+        receivers = [Receiver(f"rx{k}", Pose(place, torch.eye(3)), antenna) for k, place in enumerate(stands)]
     names = [receiver.name for receiver in receivers]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"receivers must have different names, got {twice[0]!r} more than once")
@@ -122,19 +141,16 @@ def from_arrays(
         where = f"; link {int(broken.int().argmax())} is not" if broken.any() else ""
         raise ValueError(f"labels must be finite where something was heard, and something must have been heard{where}")
     remarks = f"{int((~heard).sum())} links were not heard and are left out" if not heard.all() else ""
-    if isinstance(task, Rssi | Spectrum):
-        lowest, highest, unit = (-200.0, LOUDEST, " dBm, nan where nothing was heard") if not shape else (0.0, 1.0, "")
-        wrong = heard & ((flat < lowest) | (flat > highest + 1e-6)).any(1)
-        if wrong.any():
-            link = int(wrong.int().argmax())
-            raise ValueError(
-                f"labels of task {task.name!r} must be from {lowest:g} to {highest:g}{unit}; "
-                f"those of link {link} are from {flat[link].min():g} to {flat[link].max():g}"
-            )
+    check_range(task, labels, "labels")
+    if isinstance(task, Csi):
+        _check_elements(task, labels, receivers, index)
     if isinstance(task, Rssi):
-        remarks += loud_remark(labels[heard].tolist())
+        doubtful = loud_remark(labels[heard].tolist())
         marks = {mark: int((labels == mark).sum()) for mark in marks_of(labels[:, None].numpy())}
-        remarks += "".join(f"; {count} readings of {mark:g} dBm are taken for levels" for mark, count in marks.items())
+        doubtful += "".join(f"; {count} readings of {mark:g} dBm are taken for levels" for mark, count in marks.items())
+        if doubtful:
+            log.warning("%s\ngive nan where nothing was heard, and levels in dBm", doubtful.removeprefix("; "))
+        remarks += doubtful
     carriers = None
     if frequency is None and hasattr(task, "frequencies"):
         frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
@@ -145,12 +161,51 @@ def from_arrays(
         carriers = carriers.expand(count)[rows][heard]
         for carrier in carriers.unique().tolist():
             check_carrier("frequency", carrier)
+    own = rows[heard]
+    parts: Any = None
+    if has_parts:
+        testing = _rows("test_rows", test_rows, count)
+        others = torch.arange(count)[~torch.isin(torch.arange(count), testing)]
+        training = others if train_rows is None else _rows("train_rows", train_rows, count)
+        if (both := training[torch.isin(training, testing)]).numel():
+            raise ValueError(f"train_rows and test_rows must have no row in common, got {both[0].item()} in both")
+        parts = tuple(torch.isin(own, part).nonzero()[:, 0] for part in (training, testing))
     made = Links(
         query=Query(places[rows][heard], index[heard].long(), carriers),
         receivers=tuple(receivers),
         labels=labels[heard],
         task=task,
-        rows=number_places(places.tolist())[1][rows][heard],
+        rows=number_places(places.tolist())[1][own],
+        official=(lambda: parts) if has_parts else None,
+        uncertainties=torch.zeros(len(receivers)),
         remarks=remarks.removeprefix("; "),
     )
     return divide(made, config)
+
+
+def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
+    """Ascending numbers of rows, given as such or as a mask of all ``count`` rows."""
+    rows = as_tensor(name, values, "numbers of rows")
+    if rows.dtype == torch.bool and rows.shape == (count,):
+        rows = rows.nonzero()[:, 0]
+    is_whole = not (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool)
+    if not (is_whole and rows.ndim == 1 and len(rows) and ((rows >= 0) & (rows < count)).all()):
+        raise ValueError(f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got {values!r}")
+    return rows.long().unique()
+
+
+def _check_elements(task: Csi, labels: Tensor, receivers: Sequence[Receiver], index: Tensor) -> None:
+    """A ``ValueError`` unless channels have the elements of their receivers' arrays, and are 0 at all others."""
+    sizes = torch.tensor([len(receiver.array) for receiver in receivers])
+    if sizes.max() != task.elements:
+        raise ValueError(
+            f"the task has {task.elements} elements, and the largest array of the receivers {sizes.max()}; "
+            "give Csi the number of elements of the largest one"
+        )
+    absent = torch.arange(task.elements) >= sizes[index.long()][:, None]
+    if (beyond := (labels != 0).any(2) & absent).any():
+        link, element = beyond.nonzero()[0].tolist()
+        raise ValueError(
+            f"labels must be 0 at elements that an array lacks; that of link {link} is not at element {element}, and "
+            f"{receivers[int(index[link])].name} has {sizes[index[link]]} elements"
+        )

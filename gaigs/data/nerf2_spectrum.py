@@ -28,8 +28,6 @@ from gaigs.task.spectrum import Spectrum
 SHAPE = (90, 360)
 """Elevations 1..90 deg and azimuths 0..359 deg, fixed by the format."""
 
-NORMALISATION = "min-max of each spectrum's amplitude"
-
 
 @register("data", "nerf2_spectrum")
 def read(
@@ -87,7 +85,7 @@ def read(
         query=Query(torch.tensor(positions), torch.zeros(len(files), dtype=torch.long), frequencies),
         receivers=(replace(receiver, array=array),),
         labels=GreyImages(files, SHAPE),
-        task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
+        task=Spectrum(grid.elevations, grid.azimuths),
         rows=tables.number_places(positions)[1] if has_own else None,
         official=partial(_read_official, root, len(files)),
         bandwidth=bandwidth,

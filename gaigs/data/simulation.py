@@ -13,7 +13,6 @@ from torch import Tensor
 
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Parts
-from gaigs.data.nerf2_spectrum import NORMALISATION
 from gaigs.geometry import Grid, Pose
 from gaigs.propagation import bartlett, min_max
 from gaigs.query import Query, check_carrier
@@ -73,7 +72,7 @@ def simulate_spectra(
         query=Query(places[rows], torch.zeros_like(rows), torch.tensor(carriers).float().repeat(transmitters)),
         receivers=(receiver,),
         labels=torch.stack(labels, 1).flatten(0, 1),
-        task=Spectrum(grid.elevations, grid.azimuths, NORMALISATION),
+        task=Spectrum(grid.elevations, grid.azimuths),
         rows=rows,
         official=partial(last_fifth, transmitters, rows),
         bandwidth=bandwidth if spectrum == "band" else 0.0,

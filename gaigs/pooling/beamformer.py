@@ -12,6 +12,7 @@ from gaigs.antenna import Array
 from gaigs.geometry import FAINTEST, Directions, Grid
 from gaigs.query import Query
 from gaigs.scene import Scene, carriers
+from gaigs.task.spectrum import MIN_MAX
 
 
 class Beamformer:
@@ -35,9 +36,9 @@ class Beamformer:
                 f"{owner} gives spectra, not labels of task {task.name!r}\n"
                 "take a pooling of that task, such as mean_power for RSSI or element_sum for channels"
             )
-        if task.normalisation != (needed := "min-max of each spectrum's amplitude"):
+        if task.normalisation != MIN_MAX:
             raise ValueError(
-                f"{owner} takes labels scaled by {needed}, got {task.normalisation!r}; take pooling=spectrum"
+                f"{owner} takes labels scaled by {MIN_MAX}, got {task.normalisation!r}; take pooling=spectrum"
             )
         for receiver in scene.receivers:
             if len(receiver.array) < 2:

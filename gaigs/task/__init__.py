@@ -49,7 +49,7 @@ class Task(ABC):
         dtype: Of labels and predictions.
         is_noisy: True if labels of one place scatter, so that fine detail cannot be learnt.
         directions: Directions of a label's pixels; None for a label without.
-        lowest: Least possible number of a real label.
+        lowest, highest: Bounds of the numbers of a real label.
     """
 
     name: str
@@ -60,6 +60,7 @@ class Task(ABC):
     is_noisy: bool = False
     directions: Grid | None = None
     lowest: float = -math.inf
+    highest: float = math.inf
 
     @property
     @abstractmethod
@@ -160,6 +161,22 @@ class Task(ABC):
 def need_samples(scores: Tensor) -> None:
     if not len(scores):
         raise ValueError("a summary needs at least one sample, got none; the split leaves nothing to test on")
+
+
+def check_range(task: Task, labels: Tensor, name: str) -> None:
+    """Raises a ``ValueError`` unless real labels (k, *shape) are within the task's bounds, or NaN."""
+    if task.dtype.is_complex:
+        return
+    flat = labels.reshape(len(labels), -1)
+    wrong = ((flat < task.lowest) | (flat > task.highest + 1e-6)).any(1)
+    if wrong.any():
+        row = int(wrong.int().argmax())
+        low, high = flat[row][~flat[row].isnan()].aminmax()
+        bounds = f"from {task.lowest:g} to {task.highest:g} {task.unit}".rstrip()
+        raise ValueError(
+            f"{name} of task {task.name!r} must be {bounds}, nan where nothing was heard; "
+            f"those of number {row} are from {low:g} to {high:g}"
+        )
 
 
 def check_values(labels: Tensor, values: Tensor, shape: tuple[int, ...], samples: str) -> None:

@@ -12,3 +12,4 @@ class Rssi(Scalar):
     """
 
     name, quantity, unit, error_unit = "rssi", "RSSI", "dBm", "dB"
+    lowest, highest = -200.0, 30.0

@@ -18,6 +18,9 @@ from gaigs.task import Metric, Task, Thinning, check_values, need_samples
 SSIM_WINDOW = 7
 """Edge of scikit-image's default uniform window [pixels]."""
 
+MIN_MAX = "min-max of each spectrum's amplitude"
+"""Normalisation of the measured sets: (s - min s) / (max s - min s) over the pixels of one spectrum s."""
+
 
 @register("task", "spectrum")
 class Spectrum(Task):
@@ -26,7 +29,8 @@ class Spectrum(Task):
     Args:
         elevations: Of the rows, in the array's frame [rad].
         azimuths: Of the columns, in the array's frame [rad].
-        normalisation: Scale of the labels, in words of docs/data.md.
+        normalisation: Scale of the labels, in words of docs/data.md; by default each spectrum has a pixel of 0 and one
+            of 1.
 
     Source: the protocol of GAI-GS, "Evaluation"; Wang et al., Image Quality Assessment, 2004.
     """
@@ -35,13 +39,13 @@ class Spectrum(Task):
     monitor, higher_is_better = "ssim", True
     pair_score = "SSIM"
     normalisation = ""
-    lowest = 0.0
+    lowest, highest = 0.0, 1.0
 
     def __init__(
         self,
         elevations: Float[Tensor, " rows"] | Float[np.ndarray, " rows"] | Sequence[float],
         azimuths: Float[Tensor, " columns"] | Float[np.ndarray, " columns"] | Sequence[float],
-        normalisation: str,
+        normalisation: str = MIN_MAX,
     ):
         grid = Grid(torch.as_tensor(elevations, dtype=torch.float32), torch.as_tensor(azimuths, dtype=torch.float32))
         self.directions: Grid = as_directions(grid, grid, self.name)
@@ -99,12 +103,13 @@ class Spectrum(Task):
     def thinning(self, stride: int = 1, rays: int | None = None) -> Thinning:
         """Every ``stride``-th row and column, with random first ones, or ``rays`` random pixels for all links alike.
 
-        Neighbouring pixels of a spectrum are far closer than the array resolves.
+        Neighbouring pixels of a spectrum are far closer than the array resolves. Of a small grid at least three rows
+        and columns stay.
         """
         rows, columns = self.shape
-        coarsest = min(rows, columns) // 3  # which leaves the SSIM loss its smallest window
-        if not 1 <= stride <= coarsest:
-            raise ValueError(f"training.thinning.stride must be in 1..{coarsest} for this grid, got {stride}")
+        if stride < 1:
+            raise ValueError(f"training.thinning.stride must be at least 1, got {stride}")
+        stride = max(1, min(stride, min(rows, columns) // 3))  # which leaves the SSIM loss its smallest window
         if rays is not None and not (1 <= rays <= rows * columns and stride == 1):
             most = rows * columns
             raise ValueError(f"training.thinning.rays must be in 1..{most} with stride=1, got {rays}, stride {stride}")

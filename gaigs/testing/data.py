@@ -10,14 +10,13 @@ from torch import Tensor
 
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Split
-from gaigs.data.nerf2_spectrum import NORMALISATION
 from gaigs.geometry import Grid, Pose
 from gaigs.query import CARRIERS, Query
 from gaigs.scene import Scene
 from gaigs.task import Task
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import Spectrum
+from gaigs.task.spectrum import MIN_MAX, Spectrum
 from gaigs.testing.checks import flat, require, require_close, require_tensor
 
 POSES = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)), Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0))
@@ -45,7 +44,7 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
     match task:
         case "spectrum":
             grid = Grid.degrees(range(4, 90, 5), range(0, 360, 10))
-            made = Spectrum(grid.elevations, grid.azimuths, "none" if carrier is None else NORMALISATION)
+            made = Spectrum(grid.elevations, grid.azimuths, "none" if carrier is None else MIN_MAX)
             if carrier is not None:
                 array = Array.planar(3, 3, speed_of_light / carrier / 2, "cosine")
             labels, rows = torch.rand(24, *grid.shape, generator=generator), None

@@ -10,7 +10,6 @@ from scipy.constants import speed_of_light
 
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Split
-from gaigs.data.nerf2_spectrum import NORMALISATION
 from gaigs.data.simulation import patch_array, rss_dbm
 from gaigs.data.synthetic import POSE, ROOM, place, respond_in_parts, spectra
 from gaigs.data.synthetic.image_source import permittivity
@@ -79,7 +78,7 @@ def simulated(places, receiver, offsets, order):
 def room_spectra(spectrum, count=12):
     grid, receiver = Grid.degrees(range(1, 91, 3), range(0, 360, 6)), patch_array(POSE, CARRIER)
     labels = spectra(EMPTY, place(count, 0), receiver, grid, spectrum, CARRIER, BANDWIDTH, 2)
-    task = Spectrum(grid.elevations, grid.azimuths, NORMALISATION)
+    task = Spectrum(grid.elevations, grid.azimuths)
     return links_of(labels, task, receiver, BANDWIDTH if spectrum == "band" else 0.0)
 
 

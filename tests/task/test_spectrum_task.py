@@ -10,7 +10,7 @@ from gaigs.query import Batch, Query
 from gaigs.task.spectrum import Spectrum
 
 GRID = Grid.degrees(range(5, 90, 10), range(0, 360, 15))
-TASK = Spectrum(GRID.elevations, GRID.azimuths, "min-max of each spectrum's amplitude")
+TASK = Spectrum(GRID.elevations, GRID.azimuths)
 
 
 @pytest.fixture
@@ -96,9 +96,10 @@ def seeded(seed):
     return torch.Generator().manual_seed(seed)
 
 
-@pytest.mark.parametrize("stride", [1, 2, 3])
-def test_a_stride_keeps_every_nth_row_and_column_from_a_random_first(stride):
-    thin, firsts = TASK.thinning(stride=stride), set()
+@pytest.mark.parametrize("asked", [1, 2, 3, 4])
+def test_a_stride_keeps_every_nth_row_and_column_from_a_random_first(asked):
+    """A quarter of nine rows would be too few for the loss."""
+    thin, firsts, stride = TASK.thinning(stride=asked), set(), min(asked, 3)
     for seed in range(60):
         part = thin(batch(), seeded(seed))
         row, column = divmod(int(part.labels[0, 0, 0]), 24)
@@ -146,8 +147,7 @@ def test_links_and_shares_stay():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"stride": 0}, r"training\.thinning\.stride must be in 1\.\.3 for this grid, got 0"),
-        ({"stride": 4}, r"stride must be in 1\.\.3 for this grid, got 4"),
+        ({"stride": 0}, r"training\.thinning\.stride must be at least 1, got 0"),
         ({"rays": 0}, r"training\.thinning\.rays must be in 1\.\.216 with stride=1, got 0, stride 1"),
         ({"rays": 217}, r"rays must be in 1\.\.216"),
         ({"rays": 20, "stride": 2}, "with stride=1, got 20, stride 2"),

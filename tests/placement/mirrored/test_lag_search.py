@@ -142,7 +142,7 @@ def test_spectra_give_back_the_covariances_of_their_elements():
     """Up to a scale, though labels have lost their least amplitude."""
     links = example_links("spectrum")
     grid = links.task.directions
-    task = Spectrum(grid.elevations, grid.azimuths, "min-max of each spectrum's amplitude")
+    task = Spectrum(grid.elevations, grid.azimuths)
     receiver = replace(links.receivers[0], array=Array.planar(3, 4, pitch=0.05))
     links = replace(links, task=task, receivers=(receiver, receiver))
     pooling = MirroredSplatting(links.scene).pooling
