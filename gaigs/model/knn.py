@@ -30,20 +30,23 @@ class KNearestNeighbours(Model):
     predicted from those at other places.
 
     Args:
-        k: Number of neighbours; with fewer known links, all of them. None: that of ``COUNTS`` with the least error of
-            known links that are predicted from those of other folds, see ``gaigs.kriging.links.folds_of``.
-        power: Exponent of the distance; 0 weights all neighbours equally.
+        k: Number of neighbours; with fewer known links, all of them. None: 3, or of noisy labels that of ``COUNTS``
+            with the least error of known links that are predicted from those of other folds, see
+            ``gaigs.kriging.links.folds_of``.
+        power: Exponent of the distance; 0 weights all neighbours equally. None: 2, or 1 of noisy labels.
 
     Source: reference look-up of the data sets' own README; Shepard, 1968.
     """
 
-    def __init__(self, scene: Scene, k: int | None = 3, power: float = 2.0):
+    def __init__(self, scene: Scene, k: int | None = None, power: float | None = None):
         super().__init__(scene)
         if k is not None and k < 1:
             raise ValueError(f"model.k must be at least 1 or null, got {k}")
-        if not 0 <= power < math.inf:
+        if power is not None and not 0 <= power < math.inf:
             raise ValueError(f"model.power must be 0 or more, and finite, got {power}")
-        self.k, self.power, self.chosen = k, power, k or 3
+        usual = (None, 1.0) if scene.task.is_noisy else (3, 2.0)
+        self.k, self.power = k or usual[0], usual[1] if power is None else power
+        self.chosen = self.k or 3
         self.scale = math.nan
 
     def fit(self, links: Links) -> None:

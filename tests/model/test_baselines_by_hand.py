@@ -202,8 +202,10 @@ def compare(config, links, sign=-1):
     values = evaluation.predicted(model, links, test).reshape(TEST, -1).numpy()
     if config["name"] == "gaussian_process":  # the search for these has a test of its own
         config = {**config, "length": model.facts()["length_m"], "nugget": model.facts()["nugget"]}
-    elif config.get("k", 0) is None:  # so has the choice of this
-        config = {**config, "k": model.facts()["neighbours"]}
+    elif config["name"] == "knn":  # so has the choice of neighbours of noisy labels
+        usual = {"k": 3, "power": 2.0}
+        noisy = {"k": model.facts().get("neighbours"), "power": 1.0}
+        config = {**config, **(noisy if links.task.is_noisy else usual)}
     elif config["name"] == "path_loss":  # and these
         config = {
             **config,

@@ -136,7 +136,7 @@ def test_a_carrier_that_matters_is_kept_apart_from_others():
 
 def test_distances_count_place_and_log_frequency():
     links = several_carriers(lambda places, logs: places[:, 0] + 5 * logs)
-    model = KNearestNeighbours(links.scene, 5)
+    model = KNearestNeighbours(links.scene, 5, 2.0)
     model.fit(links)
     query, asked, frequency = links.query[links.split.train], torch.tensor([2.0, 3.0, 1.0]), 1.8e9
     prediction = model.predict(asked, frequency=frequency)
