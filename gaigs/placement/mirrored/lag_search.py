@@ -241,39 +241,54 @@ class ReceiverLags:
         gains = self.array.gain(ways) / lengths * (here * there > 0)
         return ways, lengths, gains * reflection(normals, cosines.abs()), cosines
 
-    def periodogram(
+    def likeness(
         self,
         waves: Complex[Tensor, "b n e"],
         lengths: Float[Tensor, "b n"],
         bandwidth: float,
-        plane: Float[Tensor, "4"],
-        pivot: Float[Tensor, "3"],
+        planes: Float[Tensor, "c 4"],
+        pivots: Float[Tensor, "c 3"],
         axes: Float[Tensor, "2 3"],
-        moves: Float[Tensor, " m"],
-        turns: Float[Tensor, " t"],
-    ) -> Float[Tensor, "m t t"]:
-        """Likeness of the reflection at planes about one to the waves of one more path.
-
-        Planes are moved by ``moves`` [m] and turned about the pivot [m] towards two axes by ``turns`` [rad].
-        """
-        ways, own, gains, cosines = (part[:, 0] for part in self.single(plane[None]))
-        likeness = sinc(bandwidth / speed_of_light * (lengths - own[:, None]))
-        left = (waves * likeness[..., None]).sum(1)
-        heard = (self.steering(ways).conj() * left).sum(1) * gains.conj()
+    ) -> tuple[Complex[Tensor, "c b"], Float[Tensor, "c b 3"]]:
+        """Likeness of the reflection at each plane to the waves of one more path; and by how much its phase turns if
+        the plane moves [rad/m], or turns about its pivot [m] towards two axes."""
+        ways, own, gains, cosines = (part.transpose(0, 1) for part in self.single(planes))
+        alike = sinc(bandwidth / speed_of_light * (lengths - own[..., None]))
+        left = torch.einsum("cbn,bne->cbe", alike.to(waves), waves)
+        heard = (self.steering(ways).conj() * left).sum(2) * gains.conj()
         heard = heard * torch.polar(torch.ones_like(own), self.wavenumber * own)
         sizes = heard.abs()
-        loud = sizes[sizes > 0]
-        heard = heard / (sizes + loud.median()) if len(loud) else heard  # so that no link rules
-        there = self.places @ plane[:3] - plane[3]
-        units = functional.normalize(reflect(self.places, plane[:3], plane[3]) - self.pose.position, dim=1)
-        aside = self.places - pivot
-        slopes = [2 * cosines] + [-2 * (aside @ axis) * cosines - 2 * there * (units @ axis) for axis in axes]
-        phases = [
-            self.wavenumber * slope[:, None] * steps for slope, steps in zip(slopes, (moves, turns, turns), strict=True)
-        ]
-        first, second, third = (torch.polar(torch.ones_like(phase), phase) for phase in phases)
-        both = ((heard[:, None] * first)[:, :, None] * second[:, None]).flatten(1)
-        return (both.T @ third).real.view(len(moves), len(turns), len(turns))
+        medians = torch.where(sizes > 0, sizes, math.nan).nanmedian(1, keepdim=True).values.nan_to_num(1.0)
+        heard = heard / (sizes + medians)  # so that no link rules
+        normals, offsets = planes[:, None, :3], planes[:, None, 3]
+        there = (self.places * normals).sum(-1) - offsets
+        units = functional.normalize(reflect(self.places, normals, offsets) - self.pose.position, dim=2)
+        turned = (self.places - pivots[:, None]) @ axes.T * cosines[..., None] + there[..., None] * (units @ axes.T)
+        return heard, 2 * self.wavenumber * torch.cat((cosines[..., None], -turned), 2)
+
+
+def periodogram(
+    heard: Complex[Tensor, " b"],
+    rates: Float[Tensor, "b 3"],
+    moves: Float[Tensor, " m"],
+    turns: Float[Tensor, " t"],
+) -> Float[Tensor, "m 2*t-1 2*t-1"]:
+    """``ReceiverLags.likeness`` in all, at planes that are moved by ``moves`` [m] and turned towards two axes by
+    ``turns`` [rad], from 0 up, and their negatives, in ascending order."""
+    phases = rates[:, :1] * moves
+    moved = heard[:, None] * torch.polar(torch.ones_like(phases), phases)
+    # Turns to both sides have the same products of cosines and sines, but for their signs.
+    sides = rates[:, 1:, None] * turns
+    (cos, other_cos), (sin, other_sin) = sides.cos().unbind(1), sides.sin().unbind(1)
+    size = len(turns), len(moves), len(turns)
+    total = lambda part, one, other: (other.T @ (part[:, :, None] * one[:, None]).flatten(1)).view(size).movedim(0, 2)
+    even, odd = total(moved.real, cos, other_cos), total(moved.real, sin, other_sin)
+    one, two = total(moved.imag, sin, other_cos), total(moved.imag, cos, other_sin)
+    rows = []
+    for sign in (-1, 1):
+        near, far = even - sign * one, sign * odd + two  # even and odd in the second turn
+        rows.append(torch.cat(((near + far).flip(2)[..., :-1], near - far), 2))
+    return torch.cat((rows[0].flip(1)[:, :-1], rows[1]), 1)
 
 
 @dataclass(frozen=True)
@@ -505,21 +520,24 @@ class LagSearch(PlaneSearch):
         self, waves: list[tuple[Tensor, Tensor]], normal: Float[Tensor, "3"], plane: Float[Tensor, "4"]
     ) -> list[Peak]:
         """Planes near a normal in place of one: at most six maxima of the periodogram."""
-        about, reach = self.pivot(plane), min(REACH * self.diagonal, WIDEST * self.wavelength)
+        (about,), reach = self.pivots(plane[None]), min(REACH * self.diagonal, WIDEST * self.wavelength)
         half = min(self.wavelength, reach)  # of a tile [m]
         spread = torch.cat([part.places - about for part in self.receivers]).norm(dim=1).mean().item()
-        turns = 2 * math.ceil(TILE / max(min(TILE / 5, TURN * self.wavelength / spread), TILE / 20)) + 1
-        steps = torch.linspace(-half, half, 19), torch.linspace(-TILE, TILE, turns)
+        count = math.ceil(TILE / max(min(TILE / 5, TURN * self.wavelength / spread), TILE / 20)) + 1
+        moves, turns = torch.linspace(-half, half, 19), torch.linspace(0, TILE, count)
+        every = torch.cat((-turns.flip(0)[:-1], turns))
         axes = torch.stack(tangents(normal))
-        found = []
-        for start in torch.linspace(-reach, reach, 2 * math.ceil(reach / half / 2) + 1):
-            centre = torch.cat((normal, (normal @ about + start)[None]))
-            pivot = self.pivot(centre)
-            pairs = zip(self.receivers, waves, strict=True)
-            tile = sum(part.periodogram(*own, self.bandwidth, centre, pivot, axes, *steps) for part, own in pairs)
+        starts = normal @ about + torch.linspace(-reach, reach, 2 * math.ceil(reach / half / 2) + 1)
+        centres = torch.cat((normal.expand(len(starts), 3), starts[:, None]), 1)
+        pivots, found = self.pivots(centres), []
+        pairs = zip(self.receivers, waves, strict=True)
+        parts = (part.likeness(*own, self.bandwidth, centres, pivots, axes) for part, own in pairs)
+        heard, rates = (torch.cat(part, 1) for part in zip(*parts, strict=True))
+        for pivot, wave, rate in zip(pivots, heard, rates, strict=True):
+            tile = periodogram(wave, rate, moves, turns)
             best = tile.flatten().topk(2)
             for score, *at in zip(best.values.tolist(), *torch.unravel_index(best.indices, tile.shape), strict=True):
-                move, first, second = steps[0][at[0]], steps[1][at[1]], steps[1][at[2]]
+                move, first, second = moves[at[0]], every[at[1]], every[at[2]]
                 turned = functional.normalize(normal + first * axes[0] + second * axes[1], dim=0)
                 found.append(Peak(score, torch.cat((turned, (turned @ pivot + move)[None])), pivot))
         found.sort(key=lambda peak: -peak.score)

@@ -109,7 +109,7 @@ class LevelSearch(LagSearch):
                 trials += [(*self.clearest(planes, passing, located, k), self.bandwidth, k) for k in left]
             gain, plane, self.bandwidth, k = max(trials, key=lambda trial: trial[0])
             if gain >= CLEAR and not least:
-                least = CHANCE * self.by_chance(planes, passing, located, left)
+                least = CHANCE * self.by_chance(planes, passing, located, left, gain / CHANCE)
             if gain < max(CLEAR, least):
                 break
             if is_unknown:
@@ -135,10 +135,18 @@ class LevelSearch(LagSearch):
         return torch.cat(parts)
 
     def by_chance(
-        self, planes: Float[Tensor, "w 4"], passing: Float[Tensor, "b v"], located: Bool[Tensor, " w"], left: list[int]
+        self,
+        planes: Float[Tensor, "w 4"],
+        passing: Float[Tensor, "b v"],
+        located: Bool[Tensor, " w"],
+        left: list[int],
+        enough: float,
     ) -> float:
-        """Largest gain of ``clearest`` where the errors of each receiver's links are shuffled."""
-        real, sequences, gains = self.receivers, self.sequences(planes), [0.0]
+        """Largest gain of ``clearest`` where the errors of each receiver's links are shuffled.
+
+        The first gain above ``enough`` ends the trials.
+        """
+        real, sequences, largest = self.receivers, self.sequences(planes), 0.0
         generator = torch.Generator().manual_seed(0)
         for _ in range(SHUFFLES):
             shuffled = []
@@ -147,10 +155,13 @@ class LevelSearch(LagSearch):
                 errors = receiver.lags / powers.real.clamp_min(1e-12)
                 errors = errors[torch.randperm(len(errors), generator=generator)]
                 shuffled.append(replace(receiver, lags=powers * errors))
-            self.receivers = shuffled
-            gains += [self.clearest(planes, passing, located, k)[0] for k in left]
-            self.receivers = real
-        return max(gains)
+            for k in left:
+                self.receivers = shuffled
+                largest = max(largest, self.clearest(planes, passing, located, k)[0])
+                self.receivers = real
+                if largest > enough:
+                    return largest
+        return largest
 
     def clearest(
         self, planes: Float[Tensor, "w 4"], passing: Float[Tensor, "b v"], located: Bool[Tensor, " w"], k: int

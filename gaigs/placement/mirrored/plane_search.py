@@ -89,10 +89,10 @@ class PlaneSearch:
                 found.append((tried[number], highest[number].item()))
         return found
 
-    def pivot(self, plane: Float[Tensor, "4"]) -> Float[Tensor, "3"]:
-        """Mean point at which a plane reflects [m]: turned about it, a plane changes the lengths least."""
+    def pivots(self, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "w 3"]:
+        """Mean point at which each plane reflects [m]: turned about it, a plane changes the lengths least."""
         ends = [(part.places, part.position.expand_as(part.places)) for part in self.receivers]
-        return torch.cat([reflection_points(*pair, plane[None])[:, 0] for pair in ends]).mean(0)
+        return torch.cat([reflection_points(*pair, planes) for pair in ends]).mean(0)
 
     @torch.enable_grad()
     def descend(
@@ -101,7 +101,7 @@ class PlaneSearch:
         """Adam on planes, which turn about their pivots, and on other parameters of a loss; ``rate`` in [m] a step."""
         if not len(planes):
             return [planes, *others]
-        pivots = torch.stack([self.pivot(plane) for plane in planes])
+        pivots = self.pivots(planes)
         heights = planes[:, 3] - (planes[:, :3] * pivots).sum(1)
         axes = torch.stack([torch.stack(tangents(normal)) for normal in planes[:, :3]])
         shifts, *others = (part.clone().requires_grad_() for part in (0 * planes[:, :3], *others))
