@@ -308,7 +308,8 @@ class ScalarProcess(nn.Module):
                 own, made = unpacked(torch.from_numpy(point))
                 between = covariances(around, own.exp(), made)[:, :-1, :-1]
                 factors = expected_factors(between, heard, (2 * own[around.receivers, 2]).exp(), made.degrees)
-            found = minimize(cost, point, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS})
+            options = {"maxiter": ITERATIONS, "ftol": 1e-7}
+            found = minimize(cost, point, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
             point = found.x
         own, made = unpacked(torch.from_numpy(point))
         return float(found.fun), own, made._replace(scale=float(made.scale))
