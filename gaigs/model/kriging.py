@@ -277,9 +277,11 @@ class Kriging(Wrapper):
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
         residuals: dict[float, Any] = {trend_weight: [] for trend_weight in weights}
         for part in torch.arange(len(index)).split(PART):
-            labels, fallback = links.labels[index[part]], predicted(self.fallback, links, index[part])
+            trio = links.labels[index[part]], values[part], predicted(self.fallback, links, index[part])
+            # Labels that are never turned count number by number, and few numbers are enough.
+            labels, trend, fallback = map(thin_labels, trio) if type(links.task).align is Task.align else trio
             for trend_weight, parts in residuals.items():
-                mean = blend(links.task, values[part], fallback, trend_weight)
+                mean = blend(links.task, trend, fallback, trend_weight)
                 parts.append(thin_labels(links.task.align(labels, mean) - mean))
 
         if self.is_scalar:
