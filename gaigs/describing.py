@@ -18,7 +18,7 @@ from gaigs.data.doubts import doubts, places_doubts
 from gaigs.data.readings import marks_of
 from gaigs.io.files import write_text
 from gaigs.kriging.links import distances, evenly
-from gaigs.registry import check_type
+from gaigs.registry import check_instance
 from gaigs.report import style
 from gaigs.task.rssi import Rssi
 from gaigs.task.scalar import with_unit
@@ -65,7 +65,7 @@ def describe(links: Links) -> Description:
         >>> gaigs.describe(gaigs.links("synthetic", transmitters=40, order=0)).suspicious
         ()
     """
-    check_type("links", links, Links)
+    check_instance("links", links, Links)
     places, index = links.query.transmitters, _read(links)
     sites, values = places.unique(dim=0), levels(links, index)
     axes = zip("xyz", sites.amin(0).tolist(), sites.amax(0).tolist(), strict=True)

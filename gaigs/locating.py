@@ -25,7 +25,7 @@ from gaigs.kriging.links import chance_to_hear, distances, evenly, folds_of
 from gaigs.model import Model
 from gaigs.model.knn import COUNTS
 from gaigs.query import ROUNDING, as_positions, as_tensor
-from gaigs.registry import call, check_type
+from gaigs.registry import call, check_instance, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, model_of
 from gaigs.runs.evaluation import is_trained, unseen
@@ -61,7 +61,7 @@ STAYS = 10
 """Most values of a held-out track at each of its places."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Location:
     """Where transmitters may be, from ``locate``.
 
@@ -90,6 +90,11 @@ class Location:
     region: Bool[Tensor, "n g"]
     sizes: Float[Tensor, " n"]
     calibrated: bool
+
+    def __repr__(self) -> str:
+        count, place = len(self.median), ", ".join(f"{x:.2f}" for x in self.median[0].tolist())
+        which = "transmitter" if count == 1 else f"{count} transmitters, the first"
+        return f"<{which} near ({place}) m, in a region of {self.region[0].sum()} of {len(self.places)} candidates>"
 
     def holds(self, places: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """True for each value whose region holds a place: that has the candidate nearest to it."""
@@ -207,11 +212,11 @@ def fingerprints(
         >>> gaigs.locate(prints, [-50.0, -48.0, float("nan"), -61.0]).mean.shape
         torch.Size([1, 3])
     """
-    check_type("model", model, Model)
+    check_instance("model", model, Model)
     check_type("points", points, int | None)
     scene = model.scene
     if links is not None:
-        check_type("links", links, Links)
+        check_instance("links", links, Links)
         check_fit(links, scene)
     if points is not None and points < 2:
         raise ValueError(f"points must be at least 2 candidates, got {points}")

@@ -2,7 +2,7 @@
 
 import math
 import reprlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,11 +86,17 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
 
 
 def as_receivers(values: object, names: Sequence[str]) -> Int[Tensor, "*points"]:
-    """Indices of receivers, given by name or index; raises a ``ValueError`` for an unknown receiver."""
+    """Indices of receivers, given by names or indices; raises a ``ValueError`` for an unknown receiver."""
     expected = f"one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
-    if isinstance(values, str) and values not in names:
-        raise ValueError(f"receiver must be {expected}, got {values!r}")
-    indices = as_tensor("receiver", names.index(values) if isinstance(values, str) else values, expected)
+    values = (
+        [*values] if isinstance(values, Collection) and not isinstance(values, str | Tensor | np.ndarray) else values
+    )
+    if not isinstance(values, Tensor) and (words := np.array(values)).dtype.kind in "UO":
+        flat = words.ravel().tolist()
+        if unknown := [word for word in flat if word not in names]:
+            raise ValueError(f"receiver must be {expected}, got {unknown[0]!r}")
+        values = np.array([names.index(word) for word in flat], dtype=int).reshape(words.shape)
+    indices = as_tensor("receiver", values, expected)
     if indices.dtype not in (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8):
         given = f"{tuple(indices.shape)} of {indices.dtype}" if indices.ndim else repr(values)
         raise ValueError(f"receiver must be {expected}, got {given}")

@@ -4,7 +4,6 @@ import logging
 import math
 import time
 import warnings
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from numpy import ndarray
 
 from gaigs.geometry import ExtrapolationWarning
 from gaigs.io.files import atomic_write
+from gaigs.query import as_receivers
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ SECONDS, FEWEST = 60.0, 200
 """Approximate limit of the time of a map of no given pitch, unless it has fewer points than these."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RadioMap:
     """Predictions of one real number a link, e.g. RSSI, for transmitters on a horizontal plane.
 
@@ -50,6 +50,15 @@ class RadioMap:
     unit: str = "dBm"
     frequency: float | None = None
     deviations: Float[ndarray, "receivers rows columns"] | None = None
+
+    def __repr__(self) -> str:
+        rows, columns = self.values.shape[1:]
+        name, corners = f"{self.quantity} [{self.unit}]" if self.unit else self.quantity, (self.x, self.y)
+        spans = " and ".join(f"{axis} {p[0]:.2f} to {p[-1]:.2f}" for axis, p in zip("xy", corners, strict=True))
+        return (
+            f"<radio map of {name}: {', '.join(self.receivers[:5])}{', ...' * (len(self.receivers) > 5)}; "
+            f"{rows} x {columns} points, {spans}, z {self.height:.2f} m>"
+        )
 
     def only(self, index: Int[ndarray, " k"]) -> "RadioMap":
         """The maps of some receivers."""
@@ -93,7 +102,7 @@ def radio_map(
     pitch: float | None = None,
     height: float | None = None,
     margin: float = 0.5,
-    receivers: str | Collection[str] | None = None,
+    receivers: object = None,
     frequency: float | None = None,
 ) -> RadioMap:
     """Predictions on a horizontal plane over the box of training transmitters and all receivers, widened.
@@ -105,7 +114,7 @@ def radio_map(
         height: Height of the transmitters [m]; None: half-way between the lowest and the highest of training, and of
             several floors that with most training places.
         margin: Widening of the box on each side [m].
-        receivers: Names, or one name; None: all receivers.
+        receivers: Names or indices, or one of them; None: all receivers.
         frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
 
     Warns:
@@ -131,9 +140,8 @@ def radio_map(
             f"are {tuple(scene.task.shape)} of {scene.task.dtype}; use model.predict"
         )
     known = [receiver.name for receiver in scene.receivers]
-    names = tuple(known if receivers is None else [receivers] if isinstance(receivers, str) else receivers)
-    if not names or not {*names} <= {*known}:
-        raise ValueError(f"receivers must be among {', '.join(known)}, got {', '.join(map(repr, names)) or 'none'}")
+    heard = np.arange(len(known)) if receivers is None else as_receivers(receivers, known).reshape(-1).numpy()
+    names = tuple(known[number] for number in heard)
     lower, upper = scene.lower.double().numpy(), scene.upper.double().numpy()
     pitch, margin = None if pitch is None else float(pitch), float(margin)
     if height is None and len(scene.floors):
@@ -158,7 +166,6 @@ def radio_map(
             f"points, got {pitch} m; is it in m?"
         )
     # All receivers of a point in one batch, so that a transmitter's excitation is computed once.
-    heard = np.array([known.index(name) for name in names])
     frequency = scene.middle_frequency if frequency is None else frequency
 
     level = 0.5 if model.calibration is not None and model.calibration.gives(0.5) else None

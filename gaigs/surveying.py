@@ -156,7 +156,8 @@ def survey(
     if region is not None:
         box = as_positions("region", region).reshape(-1, 3)
         if len(box) != 2:
-            raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points")
+            advice = "\ngive places that can be measured as candidates" if len(box) > 2 else ""
+            raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points{advice}")
         even = even_places(box[0], box[1], POINTS)
     places = even if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
     beside = even[:0] if candidates is None else even

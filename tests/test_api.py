@@ -22,7 +22,7 @@ from gaigs.model.gaigs import GaussianSplatting
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.projection import project
 from gaigs.propagation import bartlett
-from gaigs.registry import configuration_of
+from gaigs.registry import check_instance, configuration_of
 from gaigs.tokenizer.euclidean import EuclideanTokenizer
 
 OTHERS = [Algebra, GaussianSplatting, Model.predict, Model.save, project, bartlett]
@@ -233,6 +233,8 @@ def test_arguments_of_another_type_are_refused(spectra, tmp_path):
     with pytest.raises(ValueError, match="baselines must be names or model configurations with a name, got 3"):
         gaigs.evaluate(gaigs.train("mean", spectra), spectra, baselines=[3])
     model = gaigs.train("mean", spectra)
+    with pytest.raises(TypeError, match=r"model must be a gaigs\.Model, got 'room'"):
+        check_instance("model", "room", gaigs.Model)  # annotations are checked in tests alone
     untested = replace(spectra, split=replace(spectra.split, test=spectra.split.test[:0]))
     with pytest.raises(ValueError, match="links must have some to test on"):
         gaigs.evaluate(model, untested)

@@ -95,8 +95,12 @@ def test_map_covers_transmitters_gateways_and_the_margin_with_multiples_of_the_p
 
 
 def test_height_and_receivers_may_be_chosen():
-    drawn = radio_map(Slope(scene()), pitch=0.5, height=2, receivers={"window": 1}.keys())
-    assert (drawn.height, drawn.receivers) == (2.0, ("window",))
+    for receivers in ({"window": 1}.keys(), "window", 1):
+        drawn = radio_map(Slope(scene()), pitch=0.5, height=2, receivers=receivers)
+        assert (drawn.height, drawn.receivers) == (2.0, ("window",))
+    assert repr(drawn) == (
+        "<radio map of RSSI [dBm]: window; 9 x 14 points, x -0.50 to 6.00 and y -1.00 to 3.00, z 2.00 m>"
+    )
     assert drawn.values[0, 0, 0] == pytest.approx(drawn.x[0] + 10 * drawn.y[0] + 200 - 1000, abs=1e-3)
 
 
@@ -106,8 +110,8 @@ def test_height_and_receivers_may_be_chosen():
         *(({"pitch": pitch}, "pitch must be above 0, .* give at most") for pitch in (0, float("nan"), 1e9, 1e-9)),
         ({"margin": -1.0}, "margin at least 0 .m., got height 1.0 and margin -1.0"),
         ({"height": float("inf")}, "height must be finite .* got height inf"),
-        ({"receivers": []}, "receivers must be among door, window, got none"),
-        ({"receivers": ["roof"]}, "receivers must be among door, window, got 'roof'"),
+        ({"receivers": []}, r"receiver must be one of 0 = door, 1 = window, got \(0,\) of torch.float64"),
+        ({"receivers": ["roof"]}, "receiver must be one of 0 = door, 1 = window, got 'roof'"),
     ],
 )
 def test_bad_options_are_refused(options, message):

@@ -5,7 +5,7 @@ from pathlib import Path
 from gaigs.exporting import maps, predictions, rooms, scenarios
 from gaigs.model import Model
 from gaigs.radio_maps import radio_map
-from gaigs.registry import call, check_type
+from gaigs.registry import call, check_instance, check_type
 from gaigs.runs import links_of, model_of
 
 MAPS = {
@@ -61,7 +61,7 @@ def export(
         >>> gaigs.export(model, "places.csv", [[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]])[0].read_text().splitlines()[0]
         'x,y,z,receiver,frequency,value,deviation,lower,upper'
     """
-    check_type("model", model, Model)
+    check_instance("model", model, Model)
     check_type("file", file, str | Path)
     file = Path(file)
     suffix = check_suffix(file)

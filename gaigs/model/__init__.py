@@ -158,7 +158,7 @@ class Model(nn.Module):
 
         Args:
             transmitters: Positions, world frame [m], anything that becomes a float tensor; or a whole query.
-            receiver: Name or index of the receiver; or an index for each position.
+            receiver: Name or index of the receiver, or of that of each position.
             frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the training links'
                 only carrier.
             batch_size: Links computed at a time.
@@ -201,6 +201,7 @@ class Model(nn.Module):
             parts, shape = self._values(*arguments)
             values = torch.cat([*parts])
             return values.reshape(shape + values.shape[1:])
+        check_type("interval", interval, float)
         if not 0 < interval < 1:
             raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
         if self.calibration is None:

@@ -13,6 +13,7 @@ import inspect
 import linecache
 import math
 import numbers
+import reprlib
 import sys
 import typing
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
@@ -332,6 +333,12 @@ def call(owner: str, function: Callable, options: Mapping, /, **context):
         keys = listed(f"{key}={options[key]}" for key in suspects) if suspects else listed(options)
         cause = " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(f"{owner} cannot be made ({cause})\ncheck its options: {keys}") from error
+
+
+def check_instance(name: str, value: object, kind: type) -> None:
+    """Raises a ``TypeError`` unless a value is an object of a class of gaigs."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be a gaigs.{kind.__name__}, got {reprlib.repr(value)}")
 
 
 def check_type(name: str, value: Any, annotation: Any) -> None:

@@ -20,7 +20,7 @@ from gaigs.io.files import write_text
 from gaigs.kriging.links import evenly
 from gaigs.model import Model
 from gaigs.model.kriging import Kriging
-from gaigs.registry import call, check_type, name_of
+from gaigs.registry import call, check_instance, name_of
 from gaigs.runs import configuration_of, links_of, model_of
 from gaigs.viewing.contents import Contents
 from gaigs.viewing.server import server
@@ -137,7 +137,9 @@ def view(model: Model, links: Links | None = None, other: Model | None = None) -
     """
     for name, one in (("model", model), ("other", other)):
         if one is not None:
-            check_type(name, one, Model)
+            check_instance(name, one, Model)
+    if links is not None:
+        check_instance("links", links, Links)
     shown = [one for one in (model, other) if one is not None]
     names = [name_of(one.trend if isinstance(one, Kriging) else one) for one in shown]
     return View(side_by_side([Contents(one, links, name) for one, name in zip(shown, names, strict=True)]))
