@@ -61,10 +61,11 @@ class Calibration:
 
     Links are in one group per receiver where each has at least ``ENOUGH`` of them; of a model that states no
     deviation also by the distance to the nearest known place of their receiver, if errors rise with it. Pixels of a
-    spectrum are in ``BINS`` groups by their predicted amplitude too. A group of n links has an interval of level p by
-    the quantile p (n + 1) / n of its errors: it then holds a new link's label with probability p, if links are
-    exchangeable. Of labels of several numbers, n is the number of single ones whose share within an interval of level
-    ``USUAL`` would scatter as much, so they are held with a probability of about p.
+    spectrum are in ``BINS`` groups by their predicted amplitude too, or in fewer with pixels of more links each. A
+    group of n links has an interval of level p by the quantile p (n + 1) / n of its errors: it then holds a new link's
+    label with probability p, if links are exchangeable. Of labels of several numbers, n is the number of single ones
+    whose share within an interval of level ``USUAL`` would scatter as much, so they are held with a probability of
+    about p.
 
     Attributes:
         edges: Of the distances (r or 1, g - 1) [m].
@@ -123,11 +124,16 @@ class Calibration:
             if groups == 1 or (counts.min() >= ENOUGH // 2 and (squares.view(-1, groups).diff() > 0).all()):
                 break
             groups -= 1
-        amplitudes = values.new_zeros(0, dtype=torch.float64)
-        if values.shape[1] > 1 and not values.is_complex():
-            some = thin(values.flatten()[None], 10**6)[0].double()
-            amplitudes = some.quantile(torch.arange(1, BINS, dtype=torch.float64) / BINS)
-        bins = torch.bucketize(values.double(), amplitudes) if len(amplitudes) else torch.zeros_like(errors).long()
+        numbers = (values.abs() if values.is_complex() else values).double()
+        some = thin(numbers.flatten()[None], 10**6)[0]
+        most = BINS if numbers.shape[1] > 1 and not values.is_complex() else 1
+        while True:  # a bin with pixels of few links would have their errors alone
+            amplitudes = some.quantile(torch.arange(1, most, dtype=torch.float64) / most)
+            bins = torch.bucketize(numbers, amplitudes)
+            links = torch.stack([(bins == bin_).any(1).sum() for bin_ in range(most)])
+            if most == 1 or links.min() >= fewest(USUAL):
+                break
+            most //= 2
         quantiles = errors.new_zeros(len(counts), len(amplitudes) + 1, STEPS + 1, dtype=torch.float64)
         sizes = quantiles[..., 0].clone()
         levels = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)

@@ -122,7 +122,8 @@ def test_a_direction_asked_alone_has_the_interval_that_it_has_beside_others():
     torch.testing.assert_close(alone[..., 0], both[..., 0])
 
 
-def test_pixels_of_a_bin_that_err_together_count_as_few_numbers():
+@pytest.mark.parametrize("count", [10, 20])
+def test_pixels_of_a_bin_that_err_together_count_as_few_numbers(count):
     """Links with one amplitude each, so that a bin has pixels of few links."""
     kind = example_links("spectrum").task
     held = []
@@ -132,7 +133,7 @@ def test_pixels_of_a_bin_that_err_together_count_as_few_numbers():
         scales = torch.rand(220, 1, 1, generator=generator).reciprocal().sqrt()
         labels = values + 0.1 * scales * torch.randn(220, *kind.shape, generator=generator)
         query, ones = Query(torch.rand(220, 3), torch.zeros(220, dtype=torch.long)), torch.ones(220)
-        few, new = slice(0, 20), slice(20, None)
+        few, new = slice(0, count), slice(count, None)
         calibration = Calibration.of(kind, labels[few], values[few], ones[few], query[few], None, query[:1])
         estimate = calibration.estimate(values[new], ones[new], query[new], 0.9)
         estimate = estimate._replace(lower=2 * values[new] - estimate.upper)
