@@ -95,7 +95,7 @@ def from_arrays(
     config = configuration.composed([], {"split": split, **options}, ("split",))["split"]
     if has_parts and (test_rows is None or config["name"] != "official"):
         raise ValueError("train_rows and test_rows are for split='official'; give test_rows, and no other split")
-    task = registry("task").build(task)
+    task, remarks = registry("task").build(task), []
     places = as_positions("transmitters", transmitters).detach()
     if places.ndim != 2 or not len(places):
         raise ValueError(f"transmitters must be (n, 3) positions [m], got shape {tuple(places.shape)}")
@@ -106,7 +106,12 @@ def from_arrays(
         if index is None and len(stands) == len(places) > 1 and np.ndim(labels) == 1 + len(task.shape):
             distinct, index = number_places(stands.tolist())
             stands = torch.tensor(distinct)
-        antenna = Array(torch.zeros(task.elements if isinstance(task, Csi) else 1, 3))
+        elements = task.elements if isinstance(task, Csi) else 1
+        antenna = Array(torch.zeros(elements, 3))
+        if elements > 1:
+            remarks.append(
+                f"positions of the {elements} elements are unknown: all count as standing at their receiver's"
+            )
         receivers = [Receiver(f"rx{k}", Pose(place, torch.eye(3)), antenna) for k, place in enumerate(stands)]
     names = [receiver.name for receiver in receivers]
     if twice := [name for name in names if names.count(name) > 1]:
@@ -140,17 +145,18 @@ def from_arrays(
     if not heard.any() or broken.any():
         where = f"; link {int(broken.int().argmax())} is not" if broken.any() else ""
         raise ValueError(f"labels must be finite where something was heard, and something must have been heard{where}")
-    remarks = f"{int((~heard).sum())} links were not heard and are left out" if not heard.all() else ""
+    if not heard.all():
+        remarks.append(f"{int((~heard).sum())} links were not heard and are left out")
     check_range(task, labels, "labels")
     if isinstance(task, Csi):
-        _check_elements(task, labels, receivers, index)
+        _check_elements(task, labels.where(heard[:, None, None], 0), receivers, index)
     if isinstance(task, Rssi):
         doubtful = loud_remark(labels[heard].tolist())
         marks = {mark: int((labels == mark).sum()) for mark in marks_of(labels[:, None].numpy())}
         doubtful += "".join(f"; {count} readings of {mark:g} dBm are taken for levels" for mark, count in marks.items())
         if doubtful:
-            log.warning("%s\ngive nan where nothing was heard, and levels in dBm", doubtful.removeprefix("; "))
-        remarks += doubtful
+            remarks.append(doubtful.removeprefix("; "))
+            log.warning("%s\ngive nan where nothing was heard, and levels in dBm", remarks[-1])
     carriers = None
     if frequency is None and hasattr(task, "frequencies"):
         frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
@@ -178,7 +184,7 @@ def from_arrays(
         rows=number_places(places.tolist())[1][own],
         official=(lambda: parts) if has_parts else None,
         uncertainties=torch.zeros(len(receivers)),
-        remarks=remarks.removeprefix("; "),
+        remarks="; ".join(remarks),
     )
     return divide(made, config)
 

@@ -138,7 +138,8 @@ def test_channels_have_the_elements_of_their_arrays():
     channels = np.ones((12, 2, 4, 2)) + 1j
     channels[:, 0, 2:] = 0
     arrays = {"task": task, "transmitters": PLACES, "receivers": receivers}
-    assert len(gaigs.links(**arrays, labels=channels)) == 24
+    channels[5, 0] = np.nan
+    assert len(gaigs.links(**arrays, labels=channels)) == 23
     channels[3, 0, 2] = 1
     with pytest.raises(ValueError, match="that of link 6 is not at element 2, and a1 has 2 elements"):
         gaigs.links(**arrays, labels=channels)
@@ -146,6 +147,7 @@ def test_channels_have_the_elements_of_their_arrays():
         gaigs.links(**arrays | {"receivers": receivers[0]}, labels=channels[:, 1])
     placed = gaigs.links(**arrays | {"receivers": GATEWAYS[0]}, labels=channels[:, 1])
     assert placed.receivers[0].array.elements.tolist() == [[0.0, 0.0, 0.0]] * 4
+    assert "positions of the 4 elements are unknown" in placed.remarks
 
 
 def test_channels_are_complex_and_those_of_nan_are_left_out():
