@@ -2,7 +2,7 @@
 
 import math
 import reprlib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, KeysView, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,17 +85,20 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
     return positions
 
 
-def as_receivers(values: object, names: Sequence[str]) -> Int[Tensor, "*points"]:
+def as_receivers(values: Any, names: Sequence[str]) -> Int[Tensor, "*points"]:
     """Indices of receivers, given by names or indices; raises a ``ValueError`` for an unknown receiver."""
     expected = f"one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
-    values = (
-        [*values] if isinstance(values, Collection) and not isinstance(values, str | Tensor | np.ndarray) else values
-    )
-    if not isinstance(values, Tensor) and (words := np.array(values)).dtype.kind in "UO":
-        flat = words.ravel().tolist()
-        if unknown := [word for word in flat if word not in names]:
+    if isinstance(values, KeysView) or hasattr(values, "to_numpy"):
+        values = [*values]
+    elif isinstance(values, np.ndarray) and values.dtype.kind in "UO":
+        values = values.tolist()
+    words = [values] if isinstance(values, str) else values
+    if isinstance(words, list | tuple) and words and all(isinstance(word, str) for word in words):
+        numbers = {name: number for number, name in enumerate(names)}
+        if unknown := [word for word in words if word not in numbers]:
             raise ValueError(f"receiver must be {expected}, got {unknown[0]!r}")
-        values = np.array([names.index(word) for word in flat], dtype=int).reshape(words.shape)
+        found = [numbers[word] for word in words]
+        values = found[0] if isinstance(values, str) else found
     indices = as_tensor("receiver", values, expected)
     if indices.dtype not in (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8):
         given = f"{tuple(indices.shape)} of {indices.dtype}" if indices.ndim else repr(values)

@@ -19,6 +19,7 @@ from gaigs import configuration
 from gaigs.algebra import Algebra
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
+from gaigs.model.kriging import Kriging
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.projection import project
 from gaigs.propagation import bartlett
@@ -238,6 +239,16 @@ def test_arguments_of_another_type_are_refused(spectra, tmp_path):
     untested = replace(spectra, split=replace(spectra.split, test=spectra.split.test[:0]))
     with pytest.raises(ValueError, match="links must have some to test on"):
         gaigs.evaluate(model, untested)
+
+
+def test_a_kriged_model_is_trained_on_and_stays_as_it_is(spectra):
+    options = {"max_steps": 1, "enable_progress_bar": False}
+    model = gaigs.train("gaigs", spectra, "kriging=true", count=20, **options)
+    before = model.predict([1.0, 2.0, 1.5])
+    again = gaigs.train(model, spectra, "kriging=true", **options)
+    assert torch.equal(model.predict([1.0, 2.0, 1.5]), before)
+    assert isinstance(again, Kriging)
+    assert not torch.equal(again.predict([1.0, 2.0, 1.5]), before)
 
 
 def test_mirrored_gaussians_have_parts_that_suit_them():

@@ -559,15 +559,24 @@ def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch):
     runs.folder.claim(folder, config)
 
 
-def test_a_changed_component_of_a_notebook_is_no_finished_run(monkeypatch):
+@pytest.mark.parametrize(
+    "body",
+    [
+        "def part(links):\n    half = {}",
+        "class Part:\n    half = {}",
+        "class Part(list):\n    def half(self): return {}",
+    ],
+    ids=["function", "attribute", "method"],
+)
+def test_a_changed_component_of_a_notebook_is_no_finished_run(body, monkeypatch):
     """Cells have no file: their text is where Python looks for that of errors."""
-    monkeypatch.setitem(registry("split")._registered, "cell_split", None)
+    monkeypatch.setitem(registry("split")._registered, "cell", None)
     digests = []
-    for number, text in enumerate(("half = 1 / 2", "half = 1 / 3", "half = 1 / 2")):
-        cell = f"@gaigs.register('split', 'cell_split')\ndef cell_split(links):\n    {text}\n# {number}\n"
+    for number, value in enumerate((2, 3, 2)):
+        cell = f"# {number}\n@gaigs.register('split', 'cell')\n{body.format(value)}\nother = {number}\n"
         monkeypatch.setitem(linecache.cache, f"cell {number}", (len(cell), None, cell.splitlines(True), ""))
         exec(compile(cell, f"cell {number}", "exec"), {"__name__": "__main__", "gaigs": gaigs})
-        digests.append(runs.folder.software({"split": {"name": "cell_split"}})["split cell_split"])
+        digests.append(runs.folder.software({"split": {"name": "cell"}})["split cell"])
     assert digests[0] == digests[2] != digests[1]
 
 

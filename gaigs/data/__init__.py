@@ -197,9 +197,10 @@ def divide(links: Links, split: Mapping) -> Links:
         ValueError: An option of the split has a defect, two of its parts share a link, or all spectra are constant.
     """
     parts = registry("split").build(split, links=links)
-    numbers = [*parts.parts().values()]
-    if any(part.dtype != torch.long for part in numbers) or torch.cat(numbers).bincount(minlength=len(links)).max() > 1:
-        raise ValueError(f"split {parts.name!r} must give numbers of links, no masks, and none of them in two parts")
+    given = [*parts.parts().values()]
+    numbers, is_whole = torch.cat(given), all(part.dtype == torch.long for part in given)
+    if not is_whole or not ((numbers >= 0) & (numbers < len(links))).all() or len(numbers.unique()) < len(numbers):
+        raise ValueError(f"split {parts.name!r} must give int64 numbers of links, no masks, and none in two parts")
     if links.held_out is not None:
         tasks: Any = links.task, links.held_out.task
         bands = [task.frequencies / 1e9 for task in tasks]

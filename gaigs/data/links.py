@@ -1,6 +1,7 @@
 """Links of a registered reader, or of arrays in memory."""
 
 import logging
+import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from gaigs import configuration
 from gaigs.antenna import Array, Receiver
-from gaigs.data import Links, divide, load
+from gaigs.data import Links, divide, load, shortened
 from gaigs.data.readings import loud_remark, marks_of
 from gaigs.geometry import Pose
 from gaigs.io.tables import number_places
@@ -183,10 +184,13 @@ def from_arrays(
         task=task,
         rows=number_places(places.tolist())[1][own],
         official=(lambda: parts) if has_parts else None,
-        uncertainties=torch.zeros(len(receivers)),
+        uncertainties=torch.zeros(len(receivers)) if task.is_scalar else None,
         remarks="; ".join(remarks),
     )
-    return divide(made, config)
+    links = divide(made, config)
+    if left := [name for name in names if name not in {receiver.name for receiver in links.receivers}]:
+        log.warning("receivers without a training link are left out: %s\nname the others by name", shortened(left))
+    return links
 
 
 def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
@@ -195,9 +199,11 @@ def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
     if rows.dtype == torch.bool and rows.shape == (count,):
         rows = rows.nonzero()[:, 0]
     is_whole = not (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool)
-    if not (is_whole and rows.ndim == 1 and len(rows) and ((rows >= 0) & (rows < count)).all()):
-        raise ValueError(f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got {values!r}")
-    return rows.long().unique()
+    numbers = rows.long()
+    if not (is_whole and rows.ndim == 1 and len(rows) and ((numbers >= 0) & (numbers < count)).all()):
+        given = reprlib.repr(values)
+        raise ValueError(f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got {given}")
+    return numbers.unique()
 
 
 def _check_elements(task: Csi, labels: Tensor, receivers: Sequence[Receiver], index: Tensor) -> None:

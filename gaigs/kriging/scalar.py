@@ -308,7 +308,7 @@ class ScalarProcess(nn.Module):
                 own, made = unpacked(torch.from_numpy(point))
                 between = covariances(around, own.exp(), made)[:, :-1, :-1]
                 factors = expected_factors(between, heard, (2 * own[around.receivers, 2]).exp(), made.degrees)
-            options = {"maxiter": ITERATIONS, "ftol": 1e-7}
+            options = {"maxiter": ITERATIONS, "ftol": 1e-8}
             found = minimize(cost, point, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
             point = found.x
         own, made = unpacked(torch.from_numpy(point))

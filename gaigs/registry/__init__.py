@@ -57,6 +57,7 @@ class Registry:
     def __init__(self, kind: str):
         self.kind = kind
         self._registered: dict[str, Callable] = {}
+        self._sources: dict[str, str] = {}
 
     def names(self) -> list[str]:
         """All names, sorted."""
@@ -78,6 +79,8 @@ class Registry:
             if holders and not any(holder.owns(component) for holder in holders):
                 raise self._taken(name, holders[0].where, _origin(component))
             self._registered[name] = component
+            if not holders:  # of a notebook or a script
+                self._sources[name] = _source(component)
             return _noting(self.kind, name, component)
 
         return decorate
@@ -201,28 +204,34 @@ def register(kind: str, name: str, /) -> Callable:
 def digests(names: Container[str]) -> dict[str, str]:
     """Digests of the sources of components outside gaigs that have some of these names, by kind and name.
 
-    Of a component of a notebook or a script, the source of its class or function alone counts.
+    Of a component of a notebook or a script, the statement that registers it counts, a class or a function as a rule.
     """
     found = {}
     for kind, components in registries.items():
         holders = {holder.name: holder for holder in find_holders(kind)[0]}
         for name in filter(names.__contains__, components.names()):
             if (holder := holders.get(name)) is None:
-                found[f"{kind} {name}"] = hashlib.sha256(_source(components.get(name)).encode()).hexdigest()
+                found[f"{kind} {name}"] = hashlib.sha256(components._sources[name].encode()).hexdigest()
             elif holder.root is not None or holder.file is None:
                 found[f"{kind} {name}"] = holder.digest
     return found
 
 
-def _source(component: Any) -> str:
-    """The source of a class or function that was defined in a notebook or a script; empty if it is not kept."""
-    parts = [inspect.unwrap(part) for part in (component, *vars(component).values()) if inspect.isfunction(part)]
-    for file in {part.__code__.co_filename: None for part in parts}:
-        text = "".join(linecache.getlines(file))
-        nodes = [node for node in ast.parse(text).body if getattr(node, "name", None) == component.__name__]
-        if nodes:
-            return ast.get_source_segment(text, nodes[-1]) or ""
-    return ""
+def _source(component: Callable) -> str:
+    """The statement that registers a component, which runs now; empty if its text is not kept."""
+    frame: Any = sys._getframe()
+    while frame is not None and frame.f_globals.get("__name__") != component.__module__:
+        frame = frame.f_back
+    if frame is None:
+        return ""
+    text, line = "".join(linecache.getlines(frame.f_code.co_filename, frame.f_globals)), frame.f_lineno
+    try:
+        statements = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.stmt)]
+    except SyntaxError:  # the file has been edited meanwhile
+        return ""
+    first = lambda node: min(part.lineno for part in (node, *getattr(node, "decorator_list", ())))
+    around = [node for node in statements if first(node) <= line <= node.end_lineno]
+    return ast.get_source_segment(text, max(around, key=first)) or "" if around else ""
 
 
 def is_built(config: object) -> bool:

@@ -1,6 +1,7 @@
 """Training of a model on links: fit, gradient descent, kriging."""
 
 import contextlib
+import copy
 import logging
 import signal
 import tempfile
@@ -45,7 +46,8 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
     """Trains a model on links as the command line does, by the preset of the model and the links' task.
 
     Args:
-        model: Name of a registered model; or a model, which is trained in place, a kriged one without its kriging.
+        model: Name of a registered model; or a model, which is trained in place, of a kriged one a copy of
+            its trend.
         links: Links to learn from; validation links choose the best step. Test links are not used.
         overrides: Command-line words, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
         folder: Gets the configuration, the log and the checkpoints; the same call resumes a stopped training there.
@@ -69,7 +71,7 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
     """
     if not isinstance(model, str | Model) or not isinstance(links, Links):
         raise TypeError(f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}")
-    own = None if isinstance(model, str) else model.trend if isinstance(model, Kriging) else model
+    own = None if isinstance(model, str) else copy.deepcopy(model.trend) if isinstance(model, Kriging) else model
     check_fit(links, own and own.scene)
     name = model if own is None else configuration_of(own)["name"]
     if experiments := [word for word in overrides if word.startswith("+experiment=")]:

@@ -49,7 +49,8 @@ class Task(ABC):
         dtype: Of labels and predictions.
         is_noisy: True if labels of one place scatter, so that fine detail cannot be learnt.
         directions: Directions of a label's pixels; None for a label without.
-        lowest, highest: Bounds of the numbers of a real label.
+        lowest: Least possible number of a real label.
+        limits: Bounds of the numbers of labels that are read: others are of another unit, or marks.
     """
 
     name: str
@@ -60,7 +61,7 @@ class Task(ABC):
     is_noisy: bool = False
     directions: Grid | None = None
     lowest: float = -math.inf
-    highest: float = math.inf
+    limits: tuple[float, float] = (-math.inf, math.inf)
 
     @property
     @abstractmethod
@@ -164,15 +165,15 @@ def need_samples(scores: Tensor) -> None:
 
 
 def check_range(task: Task, labels: Tensor, name: str) -> None:
-    """Raises a ``ValueError`` unless real labels (k, *shape) are within the task's bounds, or NaN."""
+    """Raises a ``ValueError`` unless real labels (k, *shape) are within the task's limits, or NaN."""
     if task.dtype.is_complex:
         return
-    flat = labels.reshape(len(labels), -1)
-    wrong = ((flat < task.lowest) | (flat > task.highest + 1e-6)).any(1)
+    flat, (lowest, highest) = labels.reshape(len(labels), -1), task.limits
+    wrong = ((flat < lowest) | (flat > highest + 1e-6)).any(1)
     if wrong.any():
         row = int(wrong.int().argmax())
         low, high = flat[row][~flat[row].isnan()].aminmax()
-        bounds = f"from {task.lowest:g} to {task.highest:g} {task.unit}".rstrip()
+        bounds = f"from {lowest:g} to {highest:g} {task.unit}".rstrip()
         raise ValueError(
             f"{name} of task {task.name!r} must be {bounds}, nan where nothing was heard; "
             f"those of number {row} are from {low:g} to {high:g}"

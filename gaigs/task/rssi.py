@@ -12,4 +12,4 @@ class Rssi(Scalar):
     """
 
     name, quantity, unit, error_unit = "rssi", "RSSI", "dBm", "dB"
-    lowest, highest = -200.0, 30.0
+    limits = -200.0, 30.0

@@ -39,7 +39,7 @@ class Spectrum(Task):
     monitor, higher_is_better = "ssim", True
     pair_score = "SSIM"
     normalisation = ""
-    lowest, highest = 0.0, 1.0
+    lowest, limits = 0.0, (0.0, 1.0)
 
     def __init__(
         self,

@@ -1,5 +1,6 @@
 """The search for planes in spectra: in spectra of a room with known walls, and against sums by hand."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from gaigs.antenna import Array, Receiver
 from gaigs.data import Split
 from gaigs.geometry import Pose
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.placement.mirrored.lag_search import MATERIAL, Found, LagSearch
+from gaigs.placement.mirrored.lag_search import MATERIAL, Found, LagSearch, periodogram
 from gaigs.placement.mirrored.reflections import all_sequences, seen_from
 from gaigs.propagation import fresnel
 from gaigs.query import Query
@@ -159,3 +160,15 @@ def test_spectra_give_back_the_covariances_of_their_elements():
     half = len(counts) // 2
     torch.testing.assert_close(found / found[:, half, None], lags / lags[:, half, None], rtol=0, atol=1e-3)
     assert not pooling.beamformer.lags(torch.zeros(5, *links.task.shape), query)[0].any()
+
+
+def test_a_periodogram_sums_the_waves_at_moved_and_turned_planes():
+    generator = torch.Generator().manual_seed(0)
+    heard = torch.randn(7, dtype=torch.complex64, generator=generator)
+    rates = 30 * torch.randn(7, 3, generator=generator)
+    moves, turns = torch.linspace(-0.1, 0.1, 5), torch.linspace(0, 0.02, 3)
+    tile = periodogram(heard, rates, moves, turns)
+    every = torch.cat((-turns[1:].flip(0), turns))
+    for i, j, k in itertools.product(range(5), range(5), range(5)):
+        phases = rates.double() @ torch.stack((moves[i], every[j], every[k])).double()
+        assert tile[i, j, k].item() == pytest.approx((heard * torch.exp(1j * phases)).real.sum().item(), abs=1e-4)
