@@ -115,7 +115,7 @@ def survey(
         model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet, and a default
             process takes its place.
         region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the error is stated; None: the
-            candidates or, without these, the box of the training transmitters.
+            candidates or, without these, the box of the training transmitters, of several floors these.
         count: Number of places; at most as many as there are candidates.
         candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
         frequency: Carrier [Hz]; None: that of the training links, of several the middle one. Without a model it has no
@@ -145,7 +145,8 @@ def survey(
     check_type("count", count, int)
     if count < 1:
         raise ValueError(f"count must be at least 1 place, got {count}")
-    if region is None and candidates is None:
+    is_whole = region is None and candidates is None
+    if is_whole:
         if model is None:
             raise ValueError(
                 "a survey without a model takes a region or candidates, got neither\n"
@@ -159,6 +160,9 @@ def survey(
             advice = "\ngive places that can be measured as candidates" if len(box) > 2 else ""
             raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points{advice}")
         even = even_places(box[0], box[1], POINTS)
+        if is_whole and len(floors := model.scene.floors):  # places are on floors, not between them
+            levels = [torch.cat((box[:, :2], floor.expand(2, 1)), 1) for floor in floors]
+            even = torch.cat([even_places(lower, upper, POINTS // len(floors)) for lower, upper in levels])
     places = even if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
     beside = even[:0] if candidates is None else even
     points, stated = torch.cat((places, beside)), slice(len(places) if len(beside) else 0, None)

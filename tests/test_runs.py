@@ -535,7 +535,7 @@ class OwnMean(Mean):
 """
 
 
-def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch):
+def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch, caplog):
     (tmp_path / "plugins").mkdir()
     own, other = tmp_path / "plugins/own.py", tmp_path / "plugins/other.py"
     own.write_text(PLUGIN)
@@ -554,7 +554,12 @@ def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch):
         file.write_text(text + "\n")
         with pytest.raises(ValueError, match=r"the source of model own_mean has changed since .*run was begun"):
             runs.folder.claim(folder, config)
+        runs.folder.warn_of_changes(folder, {"name": "own_mean"})
+        assert f"the source of model own_mean has changed since {folder} was trained" in caplog.text
+        caplog.clear()
         file.write_text(text)
+    runs.folder.warn_of_changes(folder, {"name": "own_mean"})
+    assert not caplog.text
     (tmp_path / "plugins/unrelated.py").write_text("")
     runs.folder.claim(folder, config)
 

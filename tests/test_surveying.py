@@ -207,3 +207,12 @@ def test_losses_are_those_of_leaving_all_readings_of_a_place_out():
     for place, loss in zip(known, losses, strict=True):
         rows = [row for row, there in enumerate(own.places.float()) if not torch.allclose(there[:3], place)]
         assert float(loss) == pytest.approx(error(rows) - error(range(len(often))), rel=0.1)
+
+
+def test_no_place_lies_between_two_floors():
+    rng = np.random.default_rng(0)
+    places = np.concatenate((rng.uniform(0, 6, (40, 2)), np.repeat([[1.0], [4.0]], 20, 0)), 1)
+    labels = rng.normal(-60, 8, (40, 2))
+    links = gaigs.links(task="rssi", transmitters=places, receivers=[[0, 0, 2], [6, 6, 5]], labels=labels)
+    heights = gaigs.survey(fitted(links), count=6).places[:, 2]
+    assert {*heights.tolist()} == {1.0, 4.0}

@@ -52,6 +52,8 @@ def links(reader: str | None = None, /, **options: Any) -> Links:
         if missing := ", ".join(key for key in needed if key not in options):
             raise ValueError(f"links takes a reader's name first, or arrays: {', '.join(needed)}; missing: {missing}")
         return from_arrays(**options)
+    if "test_rows" in options or "train_rows" in options:
+        raise ValueError("test_rows and train_rows are for arrays; of a reader choose a split")
     config = configuration.composed([f"data={reader}"], options, ("data", "split"))
     return load(config["data"], config["split"])
 
@@ -63,6 +65,7 @@ def from_arrays(
     labels: Any,
     index: Any = None,
     frequency: Any = None,
+    bandwidth: float | None = None,
     split: str | Mapping | None = None,
     test_rows: Any = None,
     train_rows: Any = None,
@@ -82,6 +85,7 @@ def from_arrays(
         index: Receiver of each link (n,), or of all, from 0; not needed with one receiver, n positions, or labels
             (n, k, ...).
         frequency: Carrier, one or one a link [Hz]; None if unknown, for channels the middle of the subcarriers.
+        bandwidth: Band around each carrier that powers are averaged over, 0 for a carrier alone [Hz]; None if unknown.
         split: Name of a registered split, ``options`` are its own; by default ``official`` with ``test_rows``, else
             ``random``.
         test_rows: Rows of ``transmitters`` to test on, as numbers or a mask (n,).
@@ -176,13 +180,19 @@ def from_arrays(
         training = others if train_rows is None else _rows("train_rows", train_rows, count)
         if (both := training[torch.isin(training, testing)]).numel():
             raise ValueError(f"train_rows and test_rows must have no row in common, got {both[0].item()} in both")
+        if not len(training):
+            raise ValueError(f"test_rows leave no row to train on, got all {count}")
         parts = tuple(torch.isin(own, part).nonzero()[:, 0] for part in (training, testing))
+        stands = number_places(places.tolist())[1]
+        if beside := int(torch.isin(stands[own[parts[1]]], stands[own[parts[0]]]).sum()):
+            remarks.append(f"{beside} test links stand at places of training links")
     made = Links(
         query=Query(places[rows][heard], index[heard].long(), carriers),
         receivers=tuple(receivers),
         labels=labels[heard],
         task=task,
         rows=number_places(places.tolist())[1][own],
+        bandwidth=bandwidth,
         official=(lambda: parts) if has_parts else None,
         uncertainties=torch.zeros(len(receivers)) if task.is_scalar else None,
         remarks="; ".join(remarks),

@@ -3,6 +3,7 @@
 import csv
 import itertools
 import logging
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,11 @@ def write_predictions(
         log.warning("%s has values alone: the model has no intervals of %g here", file, interval)
         found = Estimate(model.predict(query, frequencies=subcarriers), None, None, None)  # type: ignore[arg-type]
     task = asked.task if subcarriers is not None else scene.task
+    if isinstance(task, Csi):  # elements that a receiver's array lacks
+        sizes = torch.tensor([len(receiver.array) for receiver in scene.receivers])
+        absent = (torch.arange(task.elements) >= sizes[query.receivers.cpu()][:, None])[..., None]
+        blank = lambda part: part if part is None or part.ndim < 3 else part.cpu().masked_fill(absent, math.nan)
+        found, labels = Estimate(*map(blank, found)), blank(labels)
     variables = tabulate(query, [receiver.name for receiver in scene.receivers], task, found, labels)
     if file.suffix.lower() == ".csv":
         write_csv(file, variables)
@@ -129,7 +135,7 @@ def axes_of(task: Any) -> dict[str, Variable]:
 
 
 def write_csv(file: Path, variables: Mapping[str, Variable]) -> None:
-    """A row for each number of each link: columns of the link, of the axes, and of the values."""
+    """A row for each number of each link, but NaN: columns of the link, of the axes, and of the values."""
     axes = {name: one.values.tolist() for name, one in variables.items() if one.dimensions == (name,)}
     links = {name: one.values.tolist() for name, one in variables.items() if name in LINK}
     values = {name: one.values for name, one in variables.items() if name not in axes | links}
@@ -140,4 +146,5 @@ def write_csv(file: Path, variables: Mapping[str, Variable]) -> None:
         rows.writerow([*links, *axes, *values])
         for number, link in enumerate(zip(*links.values(), strict=True)):
             start, own = [*map(shown, link)], (map(shown, part[number].ravel().tolist()) for part in values.values())
-            rows.writerows([*start, *place, *row] for place, row in zip(places, zip(*own, strict=True), strict=True))
+            numbers = zip(places, zip(*own, strict=True), strict=True)
+            rows.writerows([*start, *place, *row] for place, row in numbers if row[0] != "nan")

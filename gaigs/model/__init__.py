@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -23,6 +24,9 @@ from gaigs.query import ROUNDING, Batch, Query, as_directions, as_subcarriers
 from gaigs.registry import check_type, registry
 from gaigs.scene import Scene
 from gaigs.task.csi import Csi
+
+NUMBERS, MOST = 2**17, 1024
+"""Numbers of labels that a prediction computes at a time, and most links; 16 links at least."""
 
 
 class Prediction(NamedTuple):
@@ -149,7 +153,7 @@ class Model(nn.Module):
         transmitters: object,
         receiver: object = 0,
         frequency: object = None,
-        batch_size: int = 16,
+        batch_size: int | None = None,
         directions: Directions | None = None,
         frequencies: object = None,
         interval: float | None = None,
@@ -161,7 +165,7 @@ class Model(nn.Module):
             receiver: Name or index of the receiver, or of that of each position.
             frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the training links'
                 only carrier.
-            batch_size: Links computed at a time.
+            batch_size: Links computed at a time; None: as many as have ``NUMBERS`` numbers together.
             directions: Directions to predict; None: the label's own, if it has directions.
             frequencies: Subcarriers of channels to predict (s,) [Hz], also ones that no label had; None: the label's
                 own. A model without ``any_frequency``, such as ``knn``, gives the values of its nearest subcarriers.
@@ -218,7 +222,7 @@ class Model(nn.Module):
         transmitters: object,
         receiver: object = 0,
         frequency: object = None,
-        batch_size: int = 16,
+        batch_size: int | None = None,
         directions: Directions | None = None,
         frequencies: object = None,
     ) -> Iterator[Tensor]:
@@ -244,10 +248,12 @@ class Model(nn.Module):
     ) -> tuple[Iterator, tuple[int, ...]]:
         """Values, or estimates of an interval, for the checked arguments of ``predict``, a batch at a time; and the
         positions' leading axes."""
-        check_type("batch_size", batch_size, int)
+        scene = self.scene
+        check_type("batch_size", batch_size, int | None)
+        if batch_size is None:
+            batch_size = min(MOST, max(16, NUMBERS // math.prod(scene.task.shape)))
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
-        scene = self.scene
         directions = as_directions(directions, scene.task.directions, scene.task.name)
         names = [receiver.name for receiver in scene.receivers]
         query, shape = Query.from_positions(transmitters, receiver, frequency, names, scene.frequencies)
@@ -260,6 +266,13 @@ class Model(nn.Module):
             is_known = (apart <= 1e-9 * asked).all()  # float64 computes them no better
             if not is_known and self.any_frequency:
                 model, chosen = self.at_frequencies(asked), None
+                low, high = scene.task.frequencies.aminmax()
+                beyond = max(low - asked.min(), asked.max() - high).item()
+                if beyond > high - low:
+                    messages = [
+                        f"subcarriers are up to {beyond:.4g} Hz beyond those with labels, which span "
+                        f"{high - low:.4g} Hz: phases may be off"
+                    ]
             elif not is_known:
                 messages = [f"values are those of the nearest subcarriers with labels, up to {apart.max():.7g} Hz away"]
         if not isinstance(transmitters, Query):

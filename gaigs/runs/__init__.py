@@ -18,7 +18,7 @@ from gaigs.radio_maps import radio_map
 from gaigs.registry import registry
 from gaigs.report.runs import read_metrics
 from gaigs.report.table import metrics_table, verdict
-from gaigs.runs.folder import claim, is_configuration, store
+from gaigs.runs.folder import claim, is_configuration, store, warn_of_changes
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +63,7 @@ def run(config: dict, folder: Path) -> dict | None:
 def model_of(folder: str | Path) -> Model:
     """The model of a finished run: that of its checkpoint or, for a look-up, fitted anew to the run's data."""
     folder, config = Path(folder), configuration_of(folder)
+    warn_of_changes(folder, config["model"])
     if (folder / "best.ckpt").is_file():
         trained: Any = checkpoint.load(folder / "best.ckpt")
         if config["kriging"] and not hasattr(trained, "krige"):

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from gaigs.data.matching import are_alike
 from gaigs.io.files import atomic_write, write_text
 from gaigs.registry import digests
 from gaigs.version import __version__
+
+log = logging.getLogger(__name__)
 
 ANOTHER = "choose another folder (hydra.run.dir)"
 
@@ -66,13 +69,25 @@ def _names(part: object) -> Iterator[str]:
         yield from _names(entry)
 
 
+def stored_software(folder: Path) -> dict[str, str]:
+    """What ``software`` was when a run began; empty if that is unknown."""
+    try:
+        return json.loads((folder / "software.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def warn_of_changes(folder: Path, model: dict) -> None:
+    """Warns if sources of a model's plug-ins have changed since its run: stored numbers then mean something else."""
+    there = stored_software(folder)
+    changed = [key for key, digest in digests({*_names(model)}).items() if there.get(key, digest) != digest]
+    if changed:
+        log.warning("the source of %s has changed since %s was trained: predictions differ", ", ".join(changed), folder)
+
+
 def check_software(folder: Path, config: dict) -> None:
     """Checks that a run is resumed by the software that began it; patch versions change no number."""
-    try:
-        there = json.loads((folder / "software.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        there = {}
-    here = software(config)
+    there, here = stored_software(folder), software(config)
     series = lambda version: ".".join(version.split(".")[:2])
     began = str(there.get("gaigs", "0.1 or earlier"))
     if series(began) != series(here["gaigs"]):

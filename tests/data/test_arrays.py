@@ -127,8 +127,13 @@ def test_rows_to_test_on_are_those_of_the_arrays():
         split = gaigs.links(**arrays, test_rows=test_rows).split
         assert split.test.tolist() == [6, 9, 10]
         assert split.train.tolist() == [0, 1, 2, 3, 4, 5, 7, 8, *range(11, 23)]
-    split = gaigs.links(**arrays, test_rows=[3], train_rows=[0, 5]).split
-    assert [split.test.tolist(), split.train.tolist()] == [[6], [0, 1, 9, 10]]
+    links = gaigs.links(**arrays, test_rows=[3], train_rows=[0, 5], bandwidth=2e7)
+    assert [links.split.test.tolist(), links.split.train.tolist()] == [[6], [0, 1, 9, 10]]
+    assert links.scene.bandwidth == 2e7
+    assert "at places" not in links.remarks
+    assert "2 test links stand at places of training links" in gaigs.links(**arrays, test_rows=[5]).remarks
+    with pytest.raises(ValueError, match="test_rows leave no row to train on, got all 12"):
+        gaigs.links(**arrays, test_rows=range(12))
 
 
 def test_channels_have_the_elements_of_their_arrays():

@@ -13,6 +13,7 @@ from scipy.io import netcdf_file
 import gaigs
 from gaigs.geometry import Frame
 from gaigs.report.formats import figure_formats
+from gaigs.task.csi import Csi
 
 CORNER = Frame(32632, 500_000.0, 0.0)
 """Where the central meridian of UTM zone 32 meets the equator: 9 degrees east, 0 degrees north."""
@@ -202,3 +203,16 @@ def test_the_command_exports_a_run(tmp_path, capsys):
             gaigs.run(gaigs.compose(*command, *wrong), tmp_path / "out")
     with pytest.raises(ValueError, match="needs the folder of a finished run"):
         gaigs.run(gaigs.compose("command=export"), tmp_path / "out")
+
+
+def test_channels_have_no_rows_of_elements_that_an_array_lacks(tmp_path):
+    pose = gaigs.Pose.from_xyzw([0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])
+    receivers = [gaigs.Receiver(f"a{k}", pose, gaigs.Array.planar(1, k, pitch=0.06)) for k in (1, 2)]
+    channels = np.ones((20, 2, 2, 3)) + 1j
+    channels[:, 0, 1] = 0
+    places = np.random.default_rng(0).uniform(1, 4, (20, 3))
+    task = Csi(2, [2.40e9, 2.41e9, 2.42e9])
+    links = gaigs.links(task=task, transmitters=places, receivers=receivers, labels=channels)
+    gaigs.export(gaigs.train("mean", links), tmp_path / "channels.csv", links)
+    found = {(row["receiver"], row["element"]) for row in rows(tmp_path / "channels.csv")}
+    assert found == {("a1", "0"), ("a2", "0"), ("a2", "1")}

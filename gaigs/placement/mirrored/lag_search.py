@@ -393,7 +393,8 @@ class LagSearch(PlaneSearch):
         """The planes, each moved twice by up to ``REACH`` and 18 degrees, and others, at most as many as ``most``.
 
         ``bandwidth`` is that over which powers are averaged [Hz]. If it is unknown, it becomes that with which moving
-        the strongest plane leaves least.
+        the strongest plane leaves least, or a carrier if moving all planes leaves less with it: one plane among others
+        in the wrong places hardly interferes.
         """
         if not len(planes) or not self.receivers:
             return planes
@@ -405,8 +406,12 @@ class LagSearch(PlaneSearch):
         for self.bandwidth in choices:
             left = self.moved(start, strongest).errors.mean().item() if len(choices) > 1 else 0.0
             trials.append((left, self.bandwidth))
-        _, self.bandwidth = min(trials)
-        found = self.around(self.with_more(self.around(start), most))
+        moved = []
+        for self.bandwidth in dict.fromkeys((min(trials)[1], choices[0])):
+            found = self.around(start)
+            moved.append((found.errors.mean().item(), self.bandwidth, found))
+        _, self.bandwidth, found = min(moved, key=lambda trial: trial[0])
+        found = self.around(self.with_more(found, most))
         return seen_from(found.planes.double(), -self.middle)
 
     def bandwidths(self, known: float | None) -> list[float]:

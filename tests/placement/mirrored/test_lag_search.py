@@ -54,6 +54,18 @@ def test_planes_off_by_decimetres_and_degrees_are_found(search):
     assert off[0, 3] < 0.3, "the faintest may be two wavelengths off: its error hardly counts"
 
 
+def test_an_unknown_band_is_a_carrier_where_waves_of_all_planes_interfere(search):
+    """Six walls, which all start in wrong places: hardly any move of one alone shows that paths interfere."""
+    walls = torch.cat((WALLS, torch.tensor([(-1.0, 0, 0, 0.2), (0, -1.0, 0, -4.6), (0, 0, -1.0, -2.9)])))
+    own = search.receivers[0]
+    lags = own.sums(*own.paths(seen_from(walls.double(), search.middle).float(), all_sequences(6, 2)), 0.0)
+    search.receivers = [replace(own, lags=lags)]
+    off = torch.tensor([0.3, -0.3, 0.25, 0.35, -0.4, 0.3])
+    found = search.run(walls + off[:, None] * torch.tensor([0.0, 0, 0, 1]), None, 6)
+    assert search.bandwidth == min(search.bandwidths(None))
+    assert (found - walls)[:, 3].abs().max() < 0.1
+
+
 def test_a_missing_plane_is_found_though_half_of_the_links_lack_it(search):
     own = search.receivers[0]
     without = own.sums(*own.paths(seen_from(WALLS[:2], search.middle), all_sequences(2, 2)), 0.0)
