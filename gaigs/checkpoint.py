@@ -113,6 +113,7 @@ def load(path: str | Path) -> nn.Module:
         model.load_state_dict(weights)
         _check_finite("weights", {name: value for name, value in weights.items() if name not in unset})
         model.calibrate(content[KEY].get("calibration"))
+        model.known_places = content[KEY].get("known_places")
     except Exception as error:  # any error of a constructor with damaged options
         if lacks_memory(error):
             raise
@@ -132,9 +133,9 @@ def trained_weights(content: dict) -> dict:
 
 
 def described(model: nn.Module) -> dict:
-    """A model's configuration and, if it has one, its calibration."""
-    calibration = model.calibration
-    return {"model": configuration_of(model), "calibration": None if calibration is None else calibration.state()}
+    """A model's configuration and, if it has them, its calibration and the keys of the places that it knows."""
+    calibration = None if model.calibration is None else model.calibration.state()
+    return {"model": configuration_of(model), "calibration": calibration, "known_places": model.known_places}
 
 
 def exchange_model(path: Path, model: nn.Module, trained: str) -> None:

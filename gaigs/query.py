@@ -237,6 +237,12 @@ class Query:
         """The links in their order, at most ``size`` at a time; a query without links is one part."""
         return (self[start : start + size] for start in range(0, max(len(self), 1), size))
 
+    @property
+    def place_keys(self) -> Int[Tensor, " b"]:
+        """A number for each transmitter's position, the same for the same one."""
+        x, y, z = (self.transmitters.detach().cpu().float() + 0.0).contiguous().view(torch.int32).long().unbind(1)
+        return (x * 1_000_003 + y) * 1_000_003 + z  # past 64 bits it wraps; + 0.0 makes -0 the same as 0
+
     def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
         """The different links, sorted by position, frequency and receiver; and the index of each link among them.
 

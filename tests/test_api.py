@@ -241,6 +241,18 @@ def test_arguments_of_another_type_are_refused(spectra, tmp_path):
         gaigs.evaluate(model, untested)
 
 
+def test_test_links_that_a_model_has_learnt_from_are_told(spectra, tmp_path, caplog):
+    gaigs.train("gaigs", spectra, max_steps=1, count=20, enable_progress_bar=False).save(tmp_path / "model.ckpt")
+    look_up = gaigs.train("knn", spectra)
+    for model in (gaigs.load(tmp_path / "model.ckpt"), look_up):
+        gaigs.evaluate(model, spectra, baselines=[])
+        assert "learnt" not in caplog.text
+        other = gaigs.links("synthetic", transmitters=20, order=0, **{"split.seed": 5}, split="random")
+        gaigs.evaluate(model, other, baselines=[])
+        assert re.search(r"has learnt from the places of \d of 4 test links\ntake links of the split", caplog.text)
+        caplog.clear()
+
+
 def test_a_kriged_model_is_trained_on_and_stays_as_it_is(spectra):
     options = {"max_steps": 1, "enable_progress_bar": False}
     model = gaigs.train("gaigs", spectra, "kriging=true", count=20, **options)

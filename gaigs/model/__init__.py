@@ -60,6 +60,7 @@ class Model(nn.Module):
         any_frequency: True if channels are a function of frequency, read from ``scene.task.frequencies``.
         configuration: Options that a registered model was made with; ``save`` stores them.
         calibration: What intervals are made of; None if no validation links have measured the model's errors.
+        known_places: Keys of the training and validation places, ``Query.place_keys``; None if these are unknown.
 
     Example:
         >>> class Nearest(gaigs.Model):
@@ -88,6 +89,7 @@ class Model(nn.Module):
     any_frequency: bool = False
     primitives: Gaussians | None = None
     calibration: Calibration | None = None
+    known_places: Tensor | None = None
 
     def __init__(self, scene: Scene):
         super().__init__()
@@ -178,8 +180,9 @@ class Model(nn.Module):
 
         Warns:
             ExtrapolationWarning: A position is farther from the training transmitters' box than the diagonal of this
-                box and the receivers, or a frequency is outside the training links' band, or the values are those of
-                other subcarriers. Not for a query.
+                box and the receivers, or a frequency is outside the training links' band, or subcarriers are farther
+                from the band of the labels than it is wide, or the values are those of other subcarriers. Not for a
+                query.
 
         Raises:
             ValueError: The batch size is less than 1, or a position, receiver, frequency or direction is impossible; or
@@ -193,7 +196,7 @@ class Model(nn.Module):
             >>> model.predict([1.0, 2.0, 1.5], directions=few).shape
             torch.Size([8, 36])
             >>> channels = gaigs.train("friis", gaigs.links("synthetic_csi", transmitters=20, order=0))
-            >>> channels.predict([1.0, 2.0, 1.5], frequencies=[5.0e9, 5.1e9]).shape
+            >>> channels.predict([1.0, 2.0, 1.5], frequencies=[6.8e9, 6.9e9]).shape
             torch.Size([16, 2])
             >>> levels = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=100))
             >>> low, high = levels.predict([1.0, 2.0, 1.5], interval=0.9)[2:4]  # [dBm]

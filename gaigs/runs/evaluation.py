@@ -2,6 +2,7 @@
 
 import copy
 import io
+import logging
 import math
 import platform
 import statistics
@@ -32,6 +33,8 @@ from gaigs.registry import name_of, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.scene import Scene
 from gaigs.task import Task
+
+log = logging.getLogger(__name__)
 
 BATCH = 64
 """Links predicted at a time."""
@@ -195,6 +198,8 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
         ValueError: There are no test links, the links have other receivers or another task, or a baseline has to be
             trained.
 
+    It warns of test links at places that the model has learnt from, where those are not official ones.
+
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=50)
         >>> result = gaigs.evaluate(gaigs.train("knn", links), links, baselines=["mean", "path_loss"])
@@ -210,6 +215,13 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
     check_fit(links, model.scene)
     if not len(links.split.test):
         raise ValueError("links must have some to test on; take another split")
+    if model.known_places is not None:
+        known, test = (links.query[part].place_keys for part in (links.split.known, links.split.test))
+        if seen := int((torch.isin(test, model.known_places) & ~torch.isin(test, known)).sum()):
+            words = (
+                "%s has learnt from the places of %d of %d test links\ntake links of the split and seed of its training"
+            )
+            log.warning(words, name_of(model), seen, len(test))
     task = (links.held_out or links).task
     own = name_of(model.trend if isinstance(model, Kriging) else model)
     models = {own: model} | ({f"{own}_trend": model.trend} if isinstance(model, Kriging) else {})

@@ -137,8 +137,9 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
             log.warning(words, parts["tokenizer"], parts["deformation"])
         parts["tokenizer"] = "none"
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
-    began = time.monotonic()
+    began, places = time.monotonic(), links.query[links.split.known].place_keys.unique()
     model.fit(links)
+    model.known_places = places
     searched, start = time.monotonic() - began, count_gaussians(model)
     if not is_trained(model):
         model.calibration = calibrated(model, links)
@@ -151,6 +152,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     best, trained = folder / "best.ckpt", ""
     if config["ensemble"] > 1:
         model, more = with_others(model, loss, links, config, folder)
+        model.known_places = places
         kriged, seconds, trained = make_kriged(model), seconds + more, "members.0"
         checkpoint.exchange_model(best, model, trained)
     model.calibration = calibrated(model, links)
@@ -160,7 +162,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     began = time.monotonic()
     validation_model = kriged.to(model.device).krige(links)
     kriging_seconds = time.monotonic() - began
-    kriged.calibration = calibrated(validation_model, links)
+    kriged.calibration, kriged.known_places = calibrated(validation_model, links), places
     checkpoint.exchange_model(best, kriged, ".".join(filter(None, ("trend", trained))))
     models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged, validation_model))
     return Fitted(models, unseen, start, seconds, kriging_seconds)
