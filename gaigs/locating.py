@@ -124,7 +124,7 @@ class Held(NamedTuple):
     truth: Float[Tensor, "n 3"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Fingerprints:
     """Values that a model predicts at candidate places, from ``fingerprints``; ``locate`` looks a value up in them.
 
@@ -161,6 +161,10 @@ class Fingerprints:
     temper: float = 1.0
     held: tuple[Held, ...] = ()
     _drops: dict = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        places, receivers, _ = self.values.shape
+        return f"<fingerprints of task {self.task.name!r}: {places} candidates, {receivers} receivers>"
 
     def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
         """Logarithm of the best candidate's density over that at the true place, of held-out fingerprints, ascending.
