@@ -2,7 +2,7 @@
 
 import math
 import reprlib
-from collections.abc import Iterator, KeysView, Sequence
+from collections.abc import Iterator, KeysView, Sequence, ValuesView
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,17 +88,15 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
 def as_receivers(values: Any, names: Sequence[str]) -> Int[Tensor, "*points"]:
     """Indices of receivers, given by names or indices; raises a ``ValueError`` for an unknown receiver."""
     expected = f"one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
-    if isinstance(values, KeysView) or hasattr(values, "to_numpy"):
+    if isinstance(values, KeysView | ValuesView) or hasattr(values, "to_numpy"):
         values = [*values]
     elif isinstance(values, np.ndarray) and values.dtype.kind in "UO":
         values = values.tolist()
-    words = [values] if isinstance(values, str) else values
-    if isinstance(words, list | tuple) and words and all(isinstance(word, str) for word in words):
-        numbers = {name: number for number, name in enumerate(names)}
-        if unknown := [word for word in words if word not in numbers]:
+    if _is_text(values):
+        words, numbers = np.array(values), {name: number for number, name in enumerate(names)}
+        if unknown := [word for word in words.ravel().tolist() if word not in numbers]:
             raise ValueError(f"receiver must be {expected}, got {unknown[0]!r}")
-        found = [numbers[word] for word in words]
-        values = found[0] if isinstance(values, str) else found
+        values = np.array([numbers[word] for word in words.ravel().tolist()]).reshape(words.shape)
     indices = as_tensor("receiver", values, expected)
     if indices.dtype not in (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8):
         given = f"{tuple(indices.shape)} of {indices.dtype}" if indices.ndim else repr(values)
@@ -108,6 +106,13 @@ def as_receivers(values: Any, names: Sequence[str]) -> Int[Tensor, "*points"]:
     if len(wrong):
         raise ValueError(f"receiver must be {expected}, got {wrong[0]}")
     return indices
+
+
+def _is_text(values: object) -> bool:
+    """True for a word, or words in lists in lists."""
+    return isinstance(values, str) or (
+        isinstance(values, list | tuple) and len(values) > 0 and all(map(_is_text, values))
+    )
 
 
 def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, "*points"] | None:

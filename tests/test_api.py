@@ -251,6 +251,10 @@ def test_test_links_that_a_model_has_learnt_from_are_told(spectra, tmp_path, cap
         gaigs.evaluate(model, other, baselines=[])
         assert re.search(r"has learnt from the places of \d of 4 test links\ntake links of the split", caplog.text)
         caplog.clear()
+    model = gaigs.load(tmp_path / "model.ckpt")
+    gaigs.train(model, other, max_steps=1, enable_progress_bar=False)
+    gaigs.evaluate(model, other, baselines=[])
+    assert "has learnt from the places of" in caplog.text, "a second training forgets nothing"
 
 
 def test_a_kriged_model_is_trained_on_and_stays_as_it_is(spectra):

@@ -1,6 +1,7 @@
 """Links of a registered reader, or of arrays in memory."""
 
 import logging
+import math
 import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,7 +18,7 @@ from gaigs.data.readings import loud_remark, marks_of
 from gaigs.geometry import Pose
 from gaigs.io.tables import number_places
 from gaigs.query import Query, as_numbers, as_positions, as_tensor, check_carrier
-from gaigs.registry import registry
+from gaigs.registry import check_type, registry
 from gaigs.task import Task, check_range
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
@@ -95,6 +96,9 @@ def from_arrays(
         TypeError: An option has a wrong type.
         ValueError: Shapes do not fit, a number is not finite or out of range, or there is nothing to split.
     """
+    check_type("bandwidth", bandwidth, float | None)
+    if bandwidth is not None and not 0 <= bandwidth < math.inf:
+        raise ValueError(f"bandwidth must be 0 Hz or more, and finite, got {bandwidth}")
     has_parts = test_rows is not None or train_rows is not None
     split = split or ("official" if has_parts else "random")
     config = configuration.composed([], {"split": split, **options}, ("split",))["split"]

@@ -38,7 +38,7 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
 
     They are repeated or usual values out of bounds, and 0 or a repeated -1 or 1 that is 10 dB above all others. Of
     columns with two values or more, they are usual values from -105 down that are 5 dB below all others, -100 if it is
-    repeated and 10 dB below them, and the lowest
+    repeated and more than 10 dB below them, and the lowest
     and usual ones that have 5 % of the readings, five times those of each value within 5 dB, and stand in two columns
     or the only one.
     """
@@ -57,7 +57,7 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
         count, near = counts[values == value][0], counts[(values != value) & (np.abs(values - value) < 5)]
         is_often = count >= max(3, 0.05 * counts.sum()) and count > 5 * near.max(initial=0)
         is_apart = value in ROUND[1:] and value == lowest and not len(near)
-        is_apart |= value == ROUND[0] == lowest and count > 1 and not (np.abs(values - value) < 10).sum() > 1
+        is_apart |= value == ROUND[0] == lowest and count > 1 and not (np.abs(values - value) <= 10).sum() > 1
         if is_apart or (is_often and (own == value).any(0).sum() >= min(2, own.shape[1])):
             marks.append(value)
     return marks

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from gaigs.data import Links
@@ -58,14 +59,15 @@ def write_predictions(
         log.warning("%s has values alone: the model has no intervals of %g here", file, interval)
         found = Estimate(model.predict(query, frequencies=subcarriers), None, None, None)  # type: ignore[arg-type]
     task = asked.task if subcarriers is not None else scene.task
+    absent = torch.zeros(len(query), *task.shape, dtype=torch.bool)
     if isinstance(task, Csi):  # elements that a receiver's array lacks
         sizes = torch.tensor([len(receiver.array) for receiver in scene.receivers])
-        absent = (torch.arange(task.elements) >= sizes[query.receivers.cpu()][:, None])[..., None]
+        absent |= (torch.arange(task.elements) >= sizes[query.receivers.cpu()][:, None])[..., None]
         blank = lambda part: part if part is None or part.ndim < 3 else part.cpu().masked_fill(absent, math.nan)
         found, labels = Estimate(*map(blank, found)), blank(labels)
     variables = tabulate(query, [receiver.name for receiver in scene.receivers], task, found, labels)
     if file.suffix.lower() == ".csv":
-        write_csv(file, variables)
+        write_csv(file, variables, absent.numpy())
         return [file]
     about = {"title": f"{task.quantity} predicted by gaigs", "interval": interval}
     if scene.frame is not None:
@@ -134,8 +136,8 @@ def axes_of(task: Any) -> dict[str, Variable]:
     }
 
 
-def write_csv(file: Path, variables: Mapping[str, Variable]) -> None:
-    """A row for each number of each link, but NaN: columns of the link, of the axes, and of the values."""
+def write_csv(file: Path, variables: Mapping[str, Variable], absent: Bool[np.ndarray, " n *shape"]) -> None:
+    """A row for each number of each link that is not absent: columns of the link, of the axes, and of the values."""
     axes = {name: one.values.tolist() for name, one in variables.items() if one.dimensions == (name,)}
     links = {name: one.values.tolist() for name, one in variables.items() if name in LINK}
     values = {name: one.values for name, one in variables.items() if name not in axes | links}
@@ -147,4 +149,7 @@ def write_csv(file: Path, variables: Mapping[str, Variable]) -> None:
         for number, link in enumerate(zip(*links.values(), strict=True)):
             start, own = [*map(shown, link)], (map(shown, part[number].ravel().tolist()) for part in values.values())
             numbers = zip(places, zip(*own, strict=True), strict=True)
-            rows.writerows([*start, *place, *row] for place, row in numbers if row[0] != "nan")
+            kept = ~absent[number].ravel()
+            rows.writerows(
+                [*start, *place, *row] for (place, row), is_kept in zip(numbers, kept, strict=True) if is_kept
+            )

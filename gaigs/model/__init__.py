@@ -252,11 +252,6 @@ class Model(nn.Module):
         """Values, or estimates of an interval, for the checked arguments of ``predict``, a batch at a time; and the
         positions' leading axes."""
         scene = self.scene
-        check_type("batch_size", batch_size, int | None)
-        if batch_size is None:
-            batch_size = min(MOST, max(16, NUMBERS // math.prod(scene.task.shape)))
-        if batch_size < 1:
-            raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
         directions = as_directions(directions, scene.task.directions, scene.task.name)
         names = [receiver.name for receiver in scene.receivers]
         query, shape = Query.from_positions(transmitters, receiver, frequency, names, scene.frequencies)
@@ -281,6 +276,11 @@ class Model(nn.Module):
         if not isinstance(transmitters, Query):
             for message in messages + extrapolations(query, scene):
                 warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # names the line that called ``predict``
+        check_type("batch_size", batch_size, int | None)
+        if batch_size is None:
+            batch_size = min(MOST, max(16, NUMBERS // math.prod(model.scene.task.shape)))
+        if batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
         query, directions = query.to(self.device), None if directions is None else directions.to(self.device)
         batches = (Batch(part, directions) for part in query.parts(batch_size))
         if interval is not None:

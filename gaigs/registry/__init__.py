@@ -211,14 +211,15 @@ def digests(names: Container[str]) -> dict[str, str]:
         holders = {holder.name: holder for holder in find_holders(kind)[0]}
         for name in filter(names.__contains__, components.names()):
             if (holder := holders.get(name)) is None:
-                found[f"{kind} {name}"] = hashlib.sha256(components._sources[name].encode()).hexdigest()
+                if source := components._sources.get(name):
+                    found[f"{kind} {name}"] = hashlib.sha256(source.encode()).hexdigest()
             elif holder.root is not None or holder.file is None:
                 found[f"{kind} {name}"] = holder.digest
     return found
 
 
 def _source(component: Callable) -> str:
-    """The statement that registers a component, which runs now; empty if its text is not kept."""
+    """The statement that registers a component, which runs now, and its definition; empty if the text is not kept."""
     frame: Any = sys._getframe()
     while frame is not None and frame.f_globals.get("__name__") != component.__module__:
         frame = frame.f_back
@@ -231,7 +232,9 @@ def _source(component: Callable) -> str:
         return ""
     first = lambda node: min(part.lineno for part in (node, *getattr(node, "decorator_list", ())))
     around = [node for node in statements if first(node) <= line <= node.end_lineno]
-    return ast.get_source_segment(text, max(around, key=first)) or "" if around else ""
+    own = [node for node in statements if getattr(node, "name", None) == component.__name__]
+    chosen = dict.fromkeys([*([max(around, key=first)] if around else []), *own[-1:]])
+    return "\n".join(ast.get_source_segment(text, node) or "" for node in chosen)
 
 
 def is_built(config: object) -> bool:

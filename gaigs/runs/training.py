@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import lightning
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
@@ -139,6 +140,8 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
     began, places = time.monotonic(), links.query[links.split.known].place_keys.unique()
     model.fit(links)
+    if is_trained(model) and model.known_places is not None:  # a training before this one
+        places = torch.cat((places, model.known_places)).unique()
     model.known_places = places
     searched, start = time.monotonic() - began, count_gaussians(model)
     if not is_trained(model):
