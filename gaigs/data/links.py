@@ -176,7 +176,7 @@ def from_arrays(
         carriers = carriers.expand(count)[rows][heard]
         for carrier in carriers.unique().tolist():
             check_carrier("frequency", carrier)
-    own = rows[heard]
+    own, (_, sites) = rows[heard], number_places(places.tolist())
     parts: Any = None
     if has_parts:
         testing = _rows("test_rows", test_rows, count)
@@ -187,15 +187,14 @@ def from_arrays(
         if not len(training):
             raise ValueError(f"test_rows leave no row to train on, got all {count}")
         parts = tuple(torch.isin(own, part).nonzero()[:, 0] for part in (training, testing))
-        stands = number_places(places.tolist())[1]
-        if beside := int(torch.isin(stands[own[parts[1]]], stands[own[parts[0]]]).sum()):
+        if beside := int(torch.isin(sites[own[parts[1]]], sites[own[parts[0]]]).sum()):
             remarks.append(f"{beside} test links stand at places of training links")
     made = Links(
         query=Query(places[rows][heard], index[heard].long(), carriers),
         receivers=tuple(receivers),
         labels=labels[heard],
         task=task,
-        rows=number_places(places.tolist())[1][own],
+        rows=sites[own],
         bandwidth=bandwidth,
         official=(lambda: parts) if has_parts else None,
         uncertainties=torch.zeros(len(receivers)) if task.is_scalar else None,

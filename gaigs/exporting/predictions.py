@@ -59,10 +59,11 @@ def write_predictions(
         log.warning("%s has values alone: the model has no intervals of %g here", file, interval)
         found = Estimate(model.predict(query, frequencies=subcarriers), None, None, None)  # type: ignore[arg-type]
     task = asked.task if subcarriers is not None else scene.task
-    absent = torch.zeros(len(query), *task.shape, dtype=torch.bool)
+    absent = torch.tensor(False).expand(len(query), *task.shape)
     if isinstance(task, Csi):  # elements that a receiver's array lacks
         sizes = torch.tensor([len(receiver.array) for receiver in scene.receivers])
-        absent |= (torch.arange(task.elements) >= sizes[query.receivers.cpu()][:, None])[..., None]
+        lacking = torch.arange(task.elements) >= sizes[query.receivers.cpu()][:, None]
+        absent = lacking[..., None].expand_as(absent)
         blank = lambda part: part if part is None or part.ndim < 3 else part.cpu().masked_fill(absent, math.nan)
         found, labels = Estimate(*map(blank, found)), blank(labels)
     variables = tabulate(query, [receiver.name for receiver in scene.receivers], task, found, labels)
