@@ -5,7 +5,7 @@ import json
 import math
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ from gaigs.kriging.intervals import fewest
 from gaigs.kriging.links import chance_to_hear, distances, evenly, folds_of
 from gaigs.model import Model
 from gaigs.model.knn import COUNTS
-from gaigs.query import ROUNDING, as_positions, as_tensor
+from gaigs.query import ROUNDING, as_positions, as_receivers, as_tensor
 from gaigs.registry import call, check_instance, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, model_of
@@ -131,6 +131,7 @@ class Fingerprints:
     Attributes:
         task: Of the values.
         frequency: Carrier [Hz]; None if unknown.
+        receivers: Their names.
         places: Candidates (g, 3) [m].
         prior: Logarithm of each candidate's probability before anything is received (g,).
         density: Logarithm of the prior density there, but for a constant (g,).
@@ -150,6 +151,7 @@ class Fingerprints:
 
     task: Task
     frequency: float | None
+    receivers: Sequence[str]
     places: Float[Tensor, "g 3"]
     prior: Float[Tensor, " g"]
     density: Float[Tensor, " g"]
@@ -241,7 +243,8 @@ def fingerprints(
         axes, hears = torch.eye(values.shape[2]), torch.full(values.shape[:2], 0.5)
         if len(known) and tells:
             hears = chance_to_hear(places, *heard_places(links, known), towards=0.5)
-        return Fingerprints(scene.task, frequency, places, prior, density, axes, values, deviations, hears)
+        names = [receiver.name for receiver in scene.receivers]
+        return Fingerprints(scene.task, frequency, names, places, prior, density, axes, values, deviations, hears)
 
     known = tested = torch.zeros(0).long()
     if links is not None:
@@ -295,8 +298,9 @@ def locate(
     Args:
         model: A model with intervals; or its ``fingerprints``, which then take a few milliseconds a value.
         value: A label of each receiver (r, *shape), or those of several transmissions (n, r, *shape), scaled as the
-            training labels; with one receiver also (*shape) or (n, *shape). NaN, of channels also zeros, where a
-            receiver has not heard it; of a track, a value may be unheard by all.
+            training labels; with one receiver also (*shape) or (n, *shape); or a mapping of the receivers' names to
+            their labels, (*shape) or (n, *shape). NaN, of channels also zeros, where a receiver has not heard it, as if
+            a mapping lacks it; of a track, a value may be unheard by all.
         links, region: As for ``fingerprints``.
         unknown_power: True if all labels of a transmission share an unknown offset [dB], or factor of amplitudes.
             Channels are always compared without their power and phase.
@@ -539,6 +543,12 @@ def as_fingerprints(value: object, prints: Fingerprints, is_track: bool = False)
     A track may have values that no receiver has heard.
     """
     shape, count = tuple(prints.task.shape), prints.values.shape[1]
+    if isinstance(value, Mapping):
+        which = as_receivers([*value], prints.receivers)
+        parts = as_tensor("value", [*value.values()], "a label, or as many labels, of each receiver")
+        whole = torch.full((count, *parts.shape[1:]), math.nan, dtype=prints.task.dtype)
+        whole[which] = parts.detach().cpu().to(whole)
+        value = whole.transpose(0, 1) if parts.ndim == 2 + len(shape) else whole
     given = as_tensor("value", value, f"labels of {count} receivers").detach().cpu().to(prints.task.dtype)
     values = given.reshape(-1, 1, *shape) if count == 1 and given.ndim - len(shape) in (0, 1) else given
     values = values[None] if values.ndim == 1 + len(shape) else values

@@ -41,7 +41,7 @@ LENGTH, NUGGET = 0.25, 0.6
 """Correlation length over the diagonal of all points and nugget of the process that stands in for a model."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SurveyPlan:
     """The next places to measure, and the mean error that is expected after each.
 
@@ -66,6 +66,9 @@ class SurveyPlan:
     losses: Float[Tensor, " k"]
     superfluous: Bool[Tensor, " k"]
     unit: str = ""
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
 
     def __str__(self) -> str:
         if self.errors is None:

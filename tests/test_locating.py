@@ -33,7 +33,8 @@ def scalars(values, deviations, hearing=None, **options):
     task = gaigs.registries["task"].build("rssi")
     parts = torch.tensor(values)[..., None], torch.tensor(deviations)
     parts = *parts, torch.full_like(parts[1], 0.5) if hearing is None else torch.tensor(hearing)
-    return Fingerprints(task, None, places, *even, torch.eye(1), *parts, **options)
+    names = [f"rx{number}" for number in range(len(values[0]))]
+    return Fingerprints(task, None, names, places, *even, torch.eye(1), *parts, **options)
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,20 @@ def rssi():
     links = gaigs.links("synthetic_rssi", transmitters=120, order=0)
     model = gaigs.train("knn", links)
     return links, model, gaigs.fingerprints(model, links, points=3000)
+
+
+def test_values_by_names_of_receivers_are_those_in_their_order():
+    prints = scalars([[-40.0, -60.0], [-50.0, -52.0], [-60.0, -45.0]], [[2.0, 3.0]] * 3)
+    for named, ordered in (
+        ({"rx1": -55.0, "rx0": -48.0}, [-48.0, -55.0]),
+        ({"rx1": -55.0}, [math.nan, -55.0]),
+        ({"rx1": [-55.0, -50.0], "rx0": [-48.0, math.nan]}, [[-48.0, -55.0], [math.nan, -50.0]]),
+    ):
+        torch.testing.assert_close(
+            gaigs.locate(prints, named).probabilities, gaigs.locate(prints, ordered).probabilities, rtol=0, atol=0
+        )
+    with pytest.raises(ValueError, match="receiver must be one of 0 = rx0, 1 = rx1, got 'rx2'"):
+        gaigs.locate(prints, {"rx2": -55.0})
 
 
 def test_posterior_is_that_of_a_plain_sum_over_the_receivers_that_hear():

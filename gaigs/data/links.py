@@ -1,5 +1,6 @@
 """Links of a registered reader, or of arrays in memory."""
 
+import inspect
 import logging
 import math
 import reprlib
@@ -18,7 +19,7 @@ from gaigs.data.readings import loud_remark, marks_of
 from gaigs.geometry import Pose
 from gaigs.io.tables import number_places
 from gaigs.query import Query, as_numbers, as_positions, as_tensor, check_carrier
-from gaigs.registry import check_type, registry
+from gaigs.registry import check_type, registry, suggest
 from gaigs.task import Task, check_range
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
@@ -101,6 +102,11 @@ def from_arrays(
         raise ValueError(f"bandwidth must be 0 Hz or more, and finite, got {bandwidth}")
     has_parts = test_rows is not None or train_rows is not None
     split = split or ("official" if has_parts else "random")
+    if isinstance(split, str):
+        fields, own = [*inspect.signature(from_arrays).parameters][:-1], registry("split").options(split)
+        if unknown := [key for key in options if key.rpartition(".")[2] not in own]:
+            near, has = suggest(unknown[0], [*fields, *own]), ", ".join(fields)
+            raise ValueError(f"arrays have no option {near}; they have: {has}; split {split!r}: {', '.join(own)}")
     config = configuration.composed([], {"split": split, **options}, ("split",))["split"]
     if has_parts and (test_rows is None or config["name"] != "official"):
         raise ValueError("train_rows and test_rows are for split='official'; give test_rows, and no other split")

@@ -105,7 +105,8 @@ class Registry:
             return component
         names = self.names()
         causes = "".join(f"; cannot read {cause}" for cause in unreadable)
-        raise ValueError(f"unknown {self.kind} {suggest(name, names)}; there are: {listed(names)}{causes}")
+        advice = "; one of your own must be imported first, or be in the folder plugins"
+        raise ValueError(f"unknown {self.kind} {suggest(name, names)}; there are: {listed(names)}{causes}{advice}")
 
     def options(self, name: str) -> dict:
         """The options of a component with their defaults; ``???`` stands for a mandatory one.

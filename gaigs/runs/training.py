@@ -73,6 +73,9 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
     if not isinstance(model, str | Model) or not isinstance(links, Links):
         raise TypeError(f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}")
     own = None if isinstance(model, str) else copy.deepcopy(model.trend) if isinstance(model, Kriging) else model
+    if isinstance(own, Ensemble):
+        members = "members" if own is model else "trend.members"
+        raise ValueError(f"an ensemble cannot be trained further; train one of its models, {members}[0]")
     check_fit(links, own and own.scene)
     name = model if own is None else configuration_of(own)["name"]
     if experiments := [word for word in overrides if word.startswith("+experiment=")]:

@@ -9,7 +9,7 @@ from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
 from gaigs.phases import alignment, array_sign, phase_sign
-from gaigs.registry import register
+from gaigs.registry import check_type, register
 from gaigs.task import Metric, Task, check_values, need_samples
 
 HIGHEST = 140.0
@@ -57,6 +57,7 @@ class Csi(Task):
         frequencies: Float[Tensor, " s"] | Float[np.ndarray, " s"] | Sequence[float],
         phase: str = "known",
     ):
+        check_type("elements", elements, int)
         frequencies = torch.as_tensor(frequencies, dtype=torch.float64)
         if elements < 1:
             raise ValueError(f"a channel needs at least one element, got {elements}")

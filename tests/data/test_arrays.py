@@ -65,7 +65,7 @@ def test_each_link_has_a_receiver_of_its_own():
         ({"test_rows": [0], "split": "random"}, "are for split='official'"),
         ({"train_rows": [0]}, "give test_rows"),
         ({"bandwidth": -1.0}, "bandwidth must be 0 Hz or more, and finite, got -1.0"),
-        ({"tset": 0.5}, r"there is no option 'tset' \(did you mean 'test'\?\) of split 'random'"),
+        ({"tset": 0.5}, r"arrays have no option 'tset' \(did you mean 'test'\?\)"),
         ({"task": "rsi"}, r"unknown task 'rsi' \(did you mean 'rssi'\?\)"),
     ],
 )
