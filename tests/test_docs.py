@@ -41,7 +41,7 @@ BRIEF = [
     "trainer.max_steps=2", "trainer.val_check_interval=2", "trainer.accelerator=cpu", "gaussians.count=20",
     "trainer.enable_progress_bar=false", "split.validation=0.2",
 ]  # fmt: skip
-FEW = {"+experiment=delay_spread": ["data.places=20"], "+experiment=arrival": ["data.places=20"]}
+FEW = {"+experiment=delay_spread": ["data.places=20"], "+experiment=arrival": ["data.places=20"], "data=office": []}
 """Little data, of an experiment that brings its own."""
 
 
@@ -102,6 +102,8 @@ def place(tmp_path_factory):
         file = folder / path
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)
+    rows = np.random.default_rng(0).uniform([0, 0, 1, -99, -99], [10, 6, 2, -40, -40], (20, 5))
+    np.savetxt(folder / "office.csv", rows, delimiter=",", header="x,y,z,door,window")
     return folder
 
 
@@ -303,6 +305,7 @@ def test_the_plug_ins_train_by_their_commands(runs):
         ("gaigs", "spectrum", "tokenizer.waves.weight"),
         ("gaigs", "delay_spread", "trend.levels"),
         ("gaigs", "arrival", "gaussians.means"),
+        ("gaigs", "rssi", "gaussians.means"),
         ("direction_mlp", "spectrum", "receivers.weight"),
         ("gaigs", "spectrum", "placement.share"),
         ("gaigs", "spectrum", "gaussians.means"),
