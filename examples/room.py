@@ -1,4 +1,4 @@
-"""Makes examples/room.ckpt, mirrored Gaussians of the built-in room's spectra: python examples/room.py (10 minutes)."""
+"""Makes examples/room.ckpt, mirrored Gaussians of the built-in room's spectra: python examples/room.py (a minute)."""
 
 from pathlib import Path
 

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
 from gaigs.geometry import Pose
@@ -81,6 +81,12 @@ class Array:
         with torch.inference_mode(False):
             steps, pairs = differences(self.elements.clone().double())
             return steps, pairs, torch.bincount(pairs).double()
+
+    def by_lag(self, covariances: Complex[Tensor, "b e e"]) -> Complex[Tensor, "b l"]:
+        """Mean covariance of the pairs of elements at each of ``lags``."""
+        _, pairs, counts = (part.to(covariances.device) for part in self.lags)
+        summed = covariances.new_zeros(len(covariances), len(counts)).index_add(1, pairs, covariances.flatten(1))
+        return summed / counts.to(covariances.real)
 
     def gain(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Field gain of an element towards unit vectors in the array's frame."""

@@ -17,7 +17,8 @@ from gaigs.data import Links, load, phase_doubts, shortened
 from gaigs.data.doubts import doubts, places_doubts
 from gaigs.data.readings import marks_of
 from gaigs.io.files import write_text
-from gaigs.kriging.links import distances, evenly
+from gaigs.kriging.links import distances
+from gaigs.query import evenly
 from gaigs.registry import check_instance
 from gaigs.report import style
 from gaigs.task.rssi import Rssi
@@ -70,7 +71,7 @@ def describe(links: Links) -> Description:
     sites, values = places.unique(dim=0), levels(links, index)
     axes = zip("xyz", sites.amin(0).tolist(), sites.amax(0).tolist(), strict=True)
     quantity, unit = quantity_of(links)
-    low, middle, high = (values.quantile(share).item() for share in (0.0, 0.5, 1.0))
+    low, middle, high = np.quantile(values.numpy(), (0.0, 0.5, 1.0)).tolist()  # torch takes no more than 2**24
     count = len(links.receivers)
     read = [
         f"{links.task.name}: {len(links)} links of {len(sites)} places at {count} receiver{'s' * (count != 1)}",
@@ -221,7 +222,8 @@ def figure(links: Links) -> Figure:
     """
     index = _read(links)
     values, (quantity, unit) = levels(links, index), quantity_of(links)
-    places, counts = links.query.transmitters.unique(dim=0, return_counts=True)
+    heard = torch.cat((links.query.transmitters, links.query.receivers[:, None].float()), 1).unique(dim=0)
+    places, counts = heard[:, :3].unique(dim=0, return_counts=True)
     colours, label = counts, "receivers that hear the place"
     if counts.min() == counts.max():
         first = links.query.receivers[index] == 0

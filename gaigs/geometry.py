@@ -271,6 +271,11 @@ class Grid:
         """The grid of some of the rows and columns."""
         return Grid(self.elevations[rows], self.azimuths[columns])
 
+    def matches(self, other: "Directions") -> bool:
+        """True for a grid of the same angles."""
+        pairs = (self.elevations, other.elevations), (self.azimuths, other.azimuths)
+        return self.shape == other.shape and all(torch.equal(a, b.to(a)) for a, b in pairs)
+
     def flatten(self) -> Rays:
         """The pixels, row by row."""
         elevations, azimuths = torch.meshgrid(self.elevations, self.azimuths, indexing="ij")

@@ -21,10 +21,10 @@ from gaigs.data.matching import check_fit
 from gaigs.geometry import ExtrapolationWarning, even_places
 from gaigs.io.files import write_text
 from gaigs.kriging.intervals import fewest
-from gaigs.kriging.links import chance_to_hear, distances, evenly, folds_of
+from gaigs.kriging.links import chance_to_hear, distances, folds_of
 from gaigs.model import Model
 from gaigs.model.knn import COUNTS
-from gaigs.query import ROUNDING, as_positions, as_receivers, as_tensor
+from gaigs.query import ROUNDING, as_positions, as_receivers, as_tensor, evenly
 from gaigs.registry import call, check_instance, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, model_of
@@ -544,6 +544,8 @@ def as_fingerprints(value: object, prints: Fingerprints, is_track: bool = False)
     """
     shape, count = tuple(prints.task.shape), prints.values.shape[1]
     if isinstance(value, Mapping):
+        if not value:
+            raise ValueError("value must have the label of one receiver or more, got none")
         which = as_receivers([*value], prints.receivers)
         parts = as_tensor("value", [*value.values()], "a label, or as many labels, of each receiver")
         whole = torch.full((count, *parts.shape[1:]), math.nan, dtype=prints.task.dtype)

@@ -36,6 +36,13 @@ def check_carrier(name: str, frequencies: float | Tensor) -> None:
         raise ValueError(f"{name} must be {expected}, got {wrong:.7g}{unit_hint(wrong)}")
 
 
+def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
+    """At most ``most`` of the links, evenly spread over their order."""
+    if len(index) <= most:
+        return index
+    return index[torch.linspace(0, len(index) - 1, most).round().long()]
+
+
 def as_tensor(name: str, values: object, expected: str) -> Tensor:
     """Numbers of any kind as a tensor of their own type; raises a ``ValueError`` for anything else."""
     if isinstance(values, Tensor):

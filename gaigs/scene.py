@@ -51,11 +51,17 @@ class Scene:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""
         return torch.stack([receiver.pose.position for receiver in self.receivers]).to(like)
 
+    @property
+    def box(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        """Lower and upper corner of the box that holds the training transmitters and all receivers [m]."""
+        ends = torch.cat((torch.stack((self.lower, self.upper)), self.positions(self.lower)))
+        return ends.amin(0), ends.amax(0)
+
     @functools.cached_property
     def extent(self) -> float:
-        """Diagonal of the box that holds the training transmitters and all receivers [m]."""
-        ends = torch.cat((torch.stack((self.lower, self.upper)), self.positions(self.lower)))
-        return (ends.amax(0) - ends.amin(0)).norm().item()
+        """Diagonal of this box [m]."""
+        lower, upper = self.box
+        return (upper - lower).norm().item()
 
     @property
     def height(self) -> float:

@@ -15,9 +15,9 @@ from torch import Tensor
 from gaigs.geometry import even_places
 from gaigs.io.files import write_text
 from gaigs.kriging.kernel import LIMIT, Process, kernel
-from gaigs.kriging.links import chance_to_hear, coordinates, distances, evenly
+from gaigs.kriging.links import chance_to_hear, coordinates, distances
 from gaigs.model import Model, call_optional
-from gaigs.query import Query, as_positions
+from gaigs.query import Query, as_positions, evenly
 from gaigs.registry import call, check_type
 from gaigs.report import style
 from gaigs.runs import model_of
@@ -93,9 +93,8 @@ class SurveyPlan:
             words = [f"{error:.4g}" for error in self.errors[1:].tolist()]
         for place, word in zip(self.places.tolist(), words, strict=True):
             rows.writerow(["measure", *(f"{x:.3f}" for x in place), word])
-        for place, loss in zip(
-            self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist(), strict=True
-        ):
+        known, losses = self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist()
+        for place, loss in zip(known, losses, strict=True):
             rows.writerow(["leave out", *(f"{x:.3f}" for x in place), f"{self.errors[0] + loss:.4g}"])
         write_text(Path(path), table.getvalue())
 

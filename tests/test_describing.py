@@ -10,6 +10,7 @@ import torch
 
 import gaigs
 from gaigs.data.readings import gateway
+from gaigs.describing import figure
 from gaigs.query import Query
 from gaigs.testing import example_links
 
@@ -84,6 +85,14 @@ def test_black_spectra_are_named():
     links = example_links("spectrum")
     links.labels[3] = 0
     assert gaigs.describe(links).suspicious == ("1 of 24 spectra are constant, first that of link 3, 0 to 0",)
+
+
+def test_colours_count_receivers_and_not_readings():
+    links = gaigs.links("synthetic_rssi", transmitters=20, order=0)
+    twice = torch.cat((torch.arange(len(links)), torch.arange(5)))
+    repeated = replace(links, query=links.query[twice], labels=links.labels[twice], rows=None, split=None)
+    dots = figure(repeated).axes[0].collections[0]
+    assert len(dots.get_offsets()) == 20, "every place is heard by all receivers, so colours are levels at the first"
 
 
 def test_the_command_writes_text_and_figure(tmp_path, capsys):

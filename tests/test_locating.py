@@ -56,6 +56,8 @@ def test_values_by_names_of_receivers_are_those_in_their_order():
         )
     with pytest.raises(ValueError, match="receiver must be one of 0 = rx0, 1 = rx1, got 'rx2'"):
         gaigs.locate(prints, {"rx2": -55.0})
+    with pytest.raises(ValueError, match="the label of one receiver or more, got none"):
+        gaigs.locate(prints, {})
 
 
 def test_posterior_is_that_of_a_plain_sum_over_the_receivers_that_hear():

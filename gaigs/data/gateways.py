@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gaigs.query import evenly
+
 READINGS, ROUNDS, ACROSS = 100, 3, 18
 """Most readings of a gateway, evenly spread; rounds, each on a finer grid; candidates along x and along y."""
 
@@ -28,7 +30,7 @@ def estimate_place(places: Float[Tensor, "n 3"], levels: Float[Tensor, " n"]) ->
     Source: Gudmundson, Correlation model for shadow fading in mobile radio systems, 1991; the marginal likelihood is
     that of Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 2.7.
     """
-    some = torch.linspace(0, len(places) - 1, min(len(places), READINGS)).round().long()
+    some = evenly(torch.arange(len(places)), READINGS)
     places, levels = places[some].double(), levels[some].double()
     low, high = places.amin(0), places.amax(0)
     margin = max(5.0, (high - low).max().item() / 2)

@@ -103,10 +103,10 @@ def from_arrays(
     has_parts = test_rows is not None or train_rows is not None
     split = split or ("official" if has_parts else "random")
     if isinstance(split, str):
-        fields, own = [*inspect.signature(from_arrays).parameters][:-1], registry("split").options(split)
-        if unknown := [key for key in options if key.rpartition(".")[2] not in own]:
-            near, has = suggest(unknown[0], [*fields, *own]), ", ".join(fields)
-            raise ValueError(f"arrays have no option {near}; they have: {has}; split {split!r}: {', '.join(own)}")
+        fields, has = [*inspect.signature(from_arrays).parameters][:-1], [*registry("split").options(split)]
+        if unknown := [key for key in options if key.rpartition(".")[2] not in has]:
+            near, known = suggest(unknown[0], [*fields, *has]), ", ".join(fields)
+            raise ValueError(f"arrays have no option {near}; they have: {known}; split {split!r}: {', '.join(has)}")
     config = configuration.composed([], {"split": split, **options}, ("split",))["split"]
     if has_parts and (test_rows is None or config["name"] != "official"):
         raise ValueError("train_rows and test_rows are for split='official'; give test_rows, and no other split")

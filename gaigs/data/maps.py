@@ -1,5 +1,7 @@
 """Coordinates of maps in metres of UTM; other systems take pyproj."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -8,6 +10,15 @@ from numpy import ndarray
 def is_utm(epsg: int) -> bool:
     """True for the codes of UTM on WGS 84."""
     return 1 <= epsg % 100 <= 60 and epsg // 100 in (326, 327)
+
+
+def find_pyproj() -> Any:
+    """The module, for coordinate systems; an ``ImportError`` if it is not installed."""
+    try:
+        import pyproj
+    except ImportError:
+        raise ImportError("coordinate systems need pyproj: pip install 'gaigs[maps]'") from None
+    return pyproj
 
 
 def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 2"], int]:
@@ -26,18 +37,14 @@ def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 
     """
     if is_utm(epsg):
         return points, epsg
-    try:
-        from pyproj import Transformer
-        from pyproj.exceptions import ProjError
-    except ImportError:
-        raise ImportError("coordinates of maps need pyproj: pip install 'gaigs[maps]'") from None
+    pyproj = find_pyproj()
     try:
         x, y = points[0].tolist()
-        lon, lat = Transformer.from_crs(epsg, 4326, always_xy=True).transform(x, y, errcheck=True)
+        lon, lat = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True).transform(x, y, errcheck=True)
         utm = (32700 if lat < 0 else 32600) + int((lon + 180) % 360 // 6) + 1
         east, north = points.T
-        moved = Transformer.from_crs(epsg, utm, always_xy=True).transform(east, north, errcheck=True)
-    except ProjError as error:
+        moved = pyproj.Transformer.from_crs(epsg, utm, always_xy=True).transform(east, north, errcheck=True)
+    except pyproj.exceptions.ProjError as error:
         cause = " ".join(str(error).split())
         raise ValueError(f"data.epsg={epsg} does not suit the coordinates: {cause}") from None
     return np.stack(moved, 1), utm

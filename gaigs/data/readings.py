@@ -36,11 +36,12 @@ def to_dbm(file: Path, rows: Rows, names: Sequence[str], lowest: float, not_hear
 def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     """Values among readings [dBm] that mean "not heard", a gateway a column; NaN for an empty cell.
 
-    They are repeated or usual values out of bounds, and 0 or a repeated -1 or 1 that is 10 dB above all others. Of
-    columns with two values or more, they are usual values from -105 down that are 5 dB below all others, -100 if it is
-    repeated and more than 10 dB below them, and the lowest
-    and usual ones that have 5 % of the readings, five times those of each value within 5 dB, and stand in two columns
-    or the only one.
+    Out of bounds they are repeated or usual values. Within bounds they are
+
+    - 0, or a repeated -1 or 1, 10 dB above all others;
+    - of columns with two values or more, a usual value from -105 down, 5 dB below all others; -100, if it is repeated
+      and more than 10 dB below them; and the lowest or a usual value with 5 % of the readings, five times those of each
+      value within 5 dB, in two columns or the only one.
     """
     values, counts = np.unique(levels[np.isfinite(levels)], return_counts=True)
     outside = (values < QUIETEST) | (values > LOUDEST)

@@ -13,6 +13,7 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_pdf import PdfPages
 from numpy import ndarray
 
+from gaigs.data.maps import find_pyproj
 from gaigs.geometry import Frame
 from gaigs.io.files import atomic_write, write_text
 from gaigs.io.netcdf import Variable, write_netcdf
@@ -156,12 +157,3 @@ def axes_on_map(file: Path, floor: RadioMap, frame: Frame | None) -> tuple[ndarr
         log.warning("%s has no coordinate system: x and y are metres in the data's own frame", file)
         return floor.x, floor.y
     return frame.x + floor.x, frame.y + floor.y
-
-
-def find_pyproj() -> Any:
-    """The module, for coordinate systems; an ``ImportError`` if it is not installed."""
-    try:
-        import pyproj
-    except ImportError as error:
-        raise ImportError("coordinate systems need pyproj: pip install 'gaigs[maps]'") from error
-    return pyproj

@@ -5,7 +5,7 @@ from jaxtyping import Float, Inexact
 from torch import Tensor, nn
 
 from gaigs.kriging.fit import Hyperparameters, local_deviations
-from gaigs.kriging.kernel import cholesky_factor, kernel, resize
+from gaigs.kriging.kernel import cholesky_factor, covariance, kernel, resize
 from gaigs.kriging.links import at_directions
 from gaigs.query import Batch
 from gaigs.scene import Scene
@@ -70,8 +70,7 @@ class Field(nn.Module):
     def size(self, process: Hyperparameters) -> Tensor:
         """Most likely standard deviation of the process, a mean over a label's numbers."""
         if self.signal is None:
-            covariances = kernel(self.places, self.places, process.length)
-            covariances.diagonal().add_(process.nugget)
+            covariances = covariance(self.places, process.length, process.nugget)
             kept = self.widened.flatten(1)
             products = self.weights.mH @ covariances.to(self.weights) @ self.weights
             squares = (products.mT * (kept @ kept.mH).to(products)).sum().real / (len(self.places) * kept.shape[1])

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.kriging.kernel import Process, kernel, kriging_weights
-from gaigs.kriging.links import PART, coordinates, distances, evenly, known_links, scale_bounds, scaled
-from gaigs.query import Query
+from gaigs.kriging.links import PART, coordinates, distances, known_links, scale_bounds, scaled
+from gaigs.query import Query, evenly
 from gaigs.scene import Scene
 
 

@@ -54,11 +54,16 @@ def kernel(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"], length: float
     return (distances(a, b) / -length).exp_()
 
 
-def cholesky_factor(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
-    """Lower Cholesky factor of the covariances of noisy labels; arguments as for ``kriging_weights``."""
+def covariance(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
+    """Covariances of noisy labels over the signal's variance; arguments as for ``kriging_weights``."""
     covariances = kernel(places, places, length)
     covariances.diagonal().add_(nugget)
-    return torch.linalg.cholesky(covariances)
+    return covariances
+
+
+def cholesky_factor(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
+    """Lower Cholesky factor of ``covariance``."""
+    return torch.linalg.cholesky(covariance(places, length, nugget))
 
 
 def kriging_weights(

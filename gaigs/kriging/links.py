@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links, Split
-from gaigs.geometry import Directions, Grid
-from gaigs.query import Batch, Query
+from gaigs.geometry import Grid
+from gaigs.query import Batch, Query, evenly
 from gaigs.scene import Scene
 
 PART = 256
@@ -32,13 +32,6 @@ def check_known(links: Links) -> None:
     """Raises the ``ValueError`` of ``known_links`` for all known links, and for those of a validation."""
     known_links(links)
     known_links(replace(links, split=links.split.validating()))
-
-
-def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
-    """At most ``most`` of the links, evenly spread over their order."""
-    if len(index) <= most:
-        return index
-    return index[torch.linspace(0, len(index) - 1, most).round().long()]
 
 
 def thinned(links: Links, most: int) -> Links:
@@ -118,18 +111,11 @@ def scale_bounds(scene: Scene) -> tuple[float, float]:
 def at_directions(values: Tensor, batch: Batch, scene: Scene) -> Tensor:
     """Labels (b, rows, columns) in the directions of a batch, each from the nearest row and column."""
     own, asked = scene.task.directions, batch.directions
-    if own is None or asked is None or _is_same(asked, own):  # the usual case, found at once
+    if own is None or asked is None or own.matches(asked):  # the usual case, found at once
         return values
     rows = _nearest(asked.elevations, own.elevations, None).to(values.device)
     columns = _nearest(asked.azimuths, own.azimuths, 2 * math.pi).to(values.device)
     return values[:, rows][:, :, columns] if isinstance(asked, Grid) else values[:, rows, columns]
-
-
-def _is_same(asked: Directions, own: Grid) -> bool:
-    if not isinstance(asked, Grid) or asked.shape != own.shape:
-        return False
-    pairs = (asked.elevations, own.elevations), (asked.azimuths, own.azimuths)
-    return all(torch.equal(a.to(b), b) for a, b in pairs)
 
 
 def _nearest(asked: Float[Tensor, " k"], own: Float[Tensor, " n"], period: float | None) -> Int[Tensor, " k"]:

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from gaigs.kriging.fit import EDGES
 from gaigs.kriging.kernel import Process, resize
-from gaigs.kriging.links import distances, evenly, scale_bounds, scaled
+from gaigs.kriging.links import distances, scale_bounds, scaled
+from gaigs.query import evenly
 from gaigs.scene import Scene
 
 NEAREST = 32

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from gaigs.data import Links
-from gaigs.kriging.links import evenly
 from gaigs.model import Model, Prediction, Wrapper, call_optional
-from gaigs.query import Batch
+from gaigs.query import Batch, evenly
 from gaigs.registry import register, registry
 from gaigs.scene import Scene
 

@@ -10,10 +10,10 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations, thin_labels
 from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
-from gaigs.kriging.links import PART, at_directions, coordinates, distances, evenly, folds_of, known_links, thinned
+from gaigs.kriging.links import PART, at_directions, coordinates, distances, folds_of, known_links, thinned
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import Model, Prediction, build_trend
-from gaigs.query import Batch, Query
+from gaigs.query import Batch, Query, evenly
 from gaigs.registry import name_of, register
 from gaigs.scene import Scene
 from gaigs.task.csi import Csi

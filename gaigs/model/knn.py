@@ -8,9 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.kriging.links import at_directions, coordinates, distances, evenly, folds_of, known_links, scale_bounds
+from gaigs.kriging.links import at_directions, coordinates, distances, folds_of, known_links, scale_bounds
 from gaigs.model import Model, Prediction
-from gaigs.query import Batch, Query
+from gaigs.query import Batch, Query, evenly
 from gaigs.registry import register
 from gaigs.scene import Scene
 

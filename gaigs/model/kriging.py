@@ -12,13 +12,7 @@ from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.kriging.field import Field
-from gaigs.kriging.fit import (
-    FEWEST,
-    Hyperparameters,
-    damping,
-    fit_hyperparameters,
-    thin_labels,
-)
+from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters, thin_labels
 from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, coordinates, folds_of, scaled, thinned
 from gaigs.kriging.paths import Equations, PathField, PathProcess

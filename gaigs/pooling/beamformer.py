@@ -71,8 +71,7 @@ class Beamformer:
         # Relative to the power, so that no scale of the fields overflows; silence has no spectrum, and 0 stands for it.
         relative = lags[:, half:] / torch.where(power < FAINTEST, 1, power)[:, None]
         parts = torch.cat((relative.real, relative.imag), 1)
-        pairs = (asked.elevations, own.elevations), (asked.azimuths, own.azimuths)
-        is_whole = asked is own or (asked.shape == own.shape and all(torch.equal(a, b.to(a)) for a, b in pairs))
+        is_whole = asked is own or own.matches(asked)
         spectra, order = [parts.new_zeros(0, math.prod(asked.shape))], [torch.zeros(0).long().to(parts.device)]
         for carrier, links in self.by_carrier(query):
             amplitudes = self._look(parts[links], carrier, query, asked)

@@ -95,8 +95,7 @@ class LagPooling(PathPooling):
         cos(2 pi f (t - t')).
         """
         array, amplitudes, coherences = paths.receiver.array, paths.amplitudes, paths.coherences
-        steps, pairs, counts = (part.to(amplitudes.device) for part in array.lags)
-        steps, counts = steps.to(paths.lengths), counts.to(paths.lengths)
+        steps = array.lags[0].to(paths.lengths)
         if array.is_point:  # a power has no directions
             heard = lambda places: amplitudes.new_ones(1, 1, len(places))
         else:
@@ -117,7 +116,7 @@ class LagPooling(PathPooling):
             likeness = sinc(turns[:, :, None] - turns[:, None])
             alike = likeness @ torch.view_as_real(waves).flatten(2)  # real products take half the time of complex ones
             covariance = torch.view_as_complex(alike.unflatten(2, (-1, 2))).mT @ waves.conj()
-        return found + torch.zeros_like(found).index_add(1, pairs, covariance.flatten(1)) / counts
+        return found + array.by_lag(covariance)
 
 
 LEAST_SPREAD = Grid.sphere(24, 48).pitch / math.sqrt(12)

@@ -24,11 +24,11 @@ from gaigs.data import Links, with_places
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
 from gaigs.kriging.intervals import Calibration, holds, interval_scores, nearest, summarise_intervals, thin
-from gaigs.kriging.links import evenly, folds_of
+from gaigs.kriging.links import folds_of
 from gaigs.model import Model, call_optional
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging, predicted
-from gaigs.query import Batch, Query
+from gaigs.query import Batch, Query, evenly
 from gaigs.registry import name_of, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.scene import Scene

@@ -126,6 +126,8 @@ class Fitted(NamedTuple):
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
     """Builds, fits, trains and kriges a model as configured; None in all but the first of several processes."""
     name = config["model"]["name"]
+    if config["ensemble"] < 1:
+        raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
     if model is None:
         model = registry("model").build(config["model"], scene=links.scene)
     if isinstance(model, Kriging):
@@ -150,8 +152,6 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     if not is_trained(model):
         model.calibration = calibrated(model, links)
         return Fitted({name: model}, {}, start)
-    if config["ensemble"] < 1:
-        raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
     model, seconds = descend(model, loss, links, config, folder, searched)
     if not is_first():
         return None
@@ -225,6 +225,8 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
     for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
         logging.getLogger(name).setLevel(logging.WARNING)
     trainer = make_trainer(options, **context)
+    if config["ensemble"] > 1 and trainer.world_size > 1:
+        raise ValueError("an ensemble trains in one process; set trainer.devices=1 and trainer.num_nodes=1")
     steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
     batches = Batches(links, links.split.train, module.batch_size, config["seed"], steps)
     validation = InOrder(links, links.split.validation, module.batch_size) if len(links.split.validation) else None

@@ -64,8 +64,7 @@ class GATokenizer(nn.Module):
         for option, count in (counts | {"multivectors": multivectors}).items():
             if count < 1:
                 raise ValueError(f"tokenizer option {option} must be at least 1, got {count}")
-        corners = torch.cat((scene.lower[None], scene.upper[None], scene.positions(scene.lower)))
-        lower, upper = corners.amin(0), corners.amax(0)
+        lower, upper = scene.box
         scale = (upper - lower).max() / 2
         if not scale > 0:
             raise ValueError(f"transmitters and receivers must not all be at one point, got {lower.tolist()}")

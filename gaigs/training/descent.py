@@ -72,13 +72,8 @@ class Descent(lightning.LightningModule):
         if unset := model.parameter_groups().keys() - self.learning_rates.keys():
             raise ValueError(f"the model has no learning rate for {', '.join(sorted(unset))}; add it to learning_rates")
         self.model, self.loss, self.identity, self.seed = model, loss, identity, seed
-        self.links, self.batch_size, self.jitter, self.patience, self.density = (
-            links,
-            batch_size,
-            jitter,
-            patience,
-            density,
-        )
+        self.links, self.batch_size, self.jitter = links, batch_size, jitter
+        self.patience, self.density = patience, density
         self.optimizer, self.schedule = optimizer, schedule
         self.task = model.scene.task
         self.thin = call("training.thinning", self.task.thinning, thinning)

@@ -17,9 +17,9 @@ from gaigs import checkpoint
 from gaigs.data import Links
 from gaigs.geometry import even_places
 from gaigs.io.files import write_text
-from gaigs.kriging.links import evenly
 from gaigs.model import Model
 from gaigs.model.kriging import Kriging
+from gaigs.query import evenly
 from gaigs.registry import call, check_instance, name_of
 from gaigs.runs import configuration_of, links_of, model_of
 from gaigs.viewing.contents import Contents

@@ -17,9 +17,8 @@ from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.gaussians import SH_DC
 from gaigs.geometry import ExtrapolationWarning
-from gaigs.kriging.links import evenly
 from gaigs.model import Model, call_optional
-from gaigs.query import Query
+from gaigs.query import Query, evenly
 from gaigs.report.csi import decibels, impulse_response
 from gaigs.task.csi import Csi
 from gaigs.task.scalar import with_unit
@@ -164,8 +163,7 @@ class Contents:
 
     def slice(self, height: float, receiver: int) -> dict:
         """The radio map over the training transmitters and receivers at a height [m]."""
-        ends = torch.cat((torch.stack((self.scene.lower, self.scene.upper)), self.scene.positions(self.scene.lower)))
-        lower, upper = ends.amin(0)[:2].double().numpy(), ends.amax(0)[:2].double().numpy()
+        lower, upper = (corner[:2].double().numpy() for corner in self.scene.box)
         pitch = float((upper - lower).max()) / POINTS
         counts = np.maximum(np.ceil((upper - lower) / pitch).astype(int), 1)
         x, y = (low + pitch * (np.arange(count) + 0.5) for low, count in zip(lower, counts, strict=True))

@@ -83,9 +83,14 @@ def test_kriging_has_the_ensemble_as_its_trend(tmp_path, monkeypatch):
     assert {f"model.{name}" for name in first} == weights.keys()
 
 
-def test_an_ensemble_has_a_member(links):
+def test_an_ensemble_has_a_member_and_one_process_and_is_not_trained_again(links):
     with pytest.raises(ValueError, match="ensemble must be at least 1"):
         gaigs.train("gaigs", links, ensemble=0, **FEW)
+    with pytest.raises(ValueError, match=r"an ensemble trains in one process; set trainer\.devices=1"):
+        gaigs.train("gaigs", links, "trainer.devices=2", "trainer.strategy=ddp", ensemble=2, **FEW)
+    model = Ensemble(links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20})])
+    with pytest.raises(ValueError, match=r"train one of its models, members\[0\]"):
+        gaigs.train(model, links, **FEW)
 
 
 def test_all_members_are_rendered():

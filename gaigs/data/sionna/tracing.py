@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float, Int
+from numpy import ndarray
 from scipy.constants import speed_of_light
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
@@ -183,6 +184,13 @@ def set_up(scene: Any, frequency: float) -> None:
     scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
 
 
+def without_weakest(fields: Complex[ndarray, " p"]) -> Int[ndarray, " k"]:
+    """Numbers of the paths that carry all but ``WEAKEST`` of the power, the strongest first."""
+    order = np.argsort(-np.abs(fields), kind="stable")
+    power = np.abs(fields[order]) ** 2
+    return order[np.cumsum(power[::-1])[::-1] > WEAKEST * power.sum()]
+
+
 def _strongest(
     paths: Any, receiver: np.ndarray, wavelength: float, reflections: int | None
 ) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -200,9 +208,7 @@ def _strongest(
     images = receiver + lengths[..., None] * directions
     found = []
     for k, field in enumerate(fields):
-        order = np.argsort(-np.abs(field), kind="stable")
-        power = np.abs(field[order]) ** 2
-        order = order[np.cumsum(power[::-1])[::-1] > WEAKEST * power.sum()]
+        order = without_weakest(field)
         # The path's gain has no spreading of free space, wavelength / (4 pi length).
         found.append((images[k, order], field[order] * 4 * math.pi * lengths[k, order] / wavelength))
     return found

@@ -25,6 +25,7 @@ from gaigs.placement.mirrored.reflections import (
     tangents,
 )
 from gaigs.propagation import NEAREST, slab
+from gaigs.query import evenly
 from gaigs.task.csi import Csi
 
 log = logging.getLogger(__name__)
@@ -98,8 +99,8 @@ class ReceiverChannels:
         receiver, query = links.receivers[number], links.query
         own = links.split.train[query.receivers[links.split.train] == number]
         task: Csi = links.task
-        which = _evenly(len(receiver.array), elements)
-        when = _evenly(len(task.frequencies), subcarriers)
+        which = evenly(torch.arange(len(receiver.array)), elements)
+        when = evenly(torch.arange(len(task.frequencies)), subcarriers)
         channels = links.labels[own][:, which][:, :, when].to(torch.complex128)
         heard = channels.abs().amax((1, 2)) > 0
         pose = receiver.pose.to(torch.zeros((), dtype=torch.float64))
@@ -400,7 +401,7 @@ class ChannelSearch(PlaneSearch):
             new = [plane for plane in others if not self.alike(planes, plane).any()]
             for candidates in filter(None, (self.along(planes, slabs, axes(planes), LITTLE), new)):
                 found = self.with_best(planes, slabs, candidates)
-                if self.cost(found) < before - LITTLE / 2:  # more than what keeps a plane
+                if self.cost(found) < before - LITTLE / 2:  # more than what keeps a plane, which cost has counted
                     break
             else:
                 break
@@ -585,9 +586,8 @@ class ChannelSearch(PlaneSearch):
                 real, imaginary = torch.lerp(values[before], values[before + 1], part).unbind(-1)
                 turns = (delay * centre).frac_().mul_(2 * math.pi)
                 cos, sin = turns.cos(), turns.sin()
-                power = (real * cos - imaginary * sin).sum(-1).square() + (real * sin + imaginary * cos).sum(
-                    -1
-                ).square()
+                real, imaginary = (real * cos - imaginary * sin).sum(-1), (real * sin + imaginary * cos).sum(-1)
+                power = real.square() + imaginary.square()
                 total[number] += (power * (heights * (receiver.position @ normal - own[:, 3]) > 0)).sum(0)
         return total / sum(len(receiver.places) for receiver in receivers)
 
@@ -842,7 +842,3 @@ def _materials(slabs: Float[Tensor, "*w 3"]) -> tuple[Complex[Tensor, "*w"], Flo
     """Permittivities, and thicknesses [m]."""
     real, imaginary, thickness = slabs.exp().unbind(-1)
     return torch.complex(1 + real, -imaginary), thickness
-
-
-def _evenly(count: int, most: int) -> Int[Tensor, " k"]:
-    return torch.linspace(0, count - 1, min(count, most)).round().long()

@@ -29,7 +29,7 @@ from gaigs.placement.mirrored.reflections import (
     tangents,
 )
 from gaigs.propagation import NEAREST, fresnel
-from gaigs.query import Query
+from gaigs.query import Query, evenly
 
 MATERIAL = complex(4.0, -0.3)
 """Relative permittivity of all planes: between wood and concrete."""
@@ -179,9 +179,8 @@ class ReceiverLags:
         ways, lengths = self.seen(points[-1])
         gains = folded.exists * self.array.gain(ways) / lengths
         if passing is not None:
-            own = torch.cat((passing[:, 1:], torch.ones_like(passing[:, :1])), 1)[:, sequences].prod(
-                2
-            )  # -1 is the last
+            own = torch.cat((passing[:, 1:], torch.ones_like(passing[:, :1])), 1)  # -1 is the last
+            own = own[:, sequences].prod(2)
             own[:, 0] = passing[:, 0]
             gains = gains * own
         reflections = reflection(folded.normals, folded.cosines)
@@ -377,14 +376,11 @@ class LagSearch(PlaneSearch):
         used = query.receivers[train].unique()
         super().__init__(torch.cat((query.transmitters[train], links.scene.positions(query.transmitters)[used])))
         heard = torch.stack((query.receivers[train].double(), frequencies[train].double()), 1).unique(dim=0)
-        pairs = heard[torch.linspace(0, len(heard) - 1, min(len(heard), PAIRS)).round().long()].tolist()
+        pairs = heard[evenly(torch.arange(len(heard)), PAIRS)].tolist()
         for number, carrier in pairs:
-            number = int(number)
-            own, receiver = (
-                train[(query.receivers[train] == number) & (frequencies[train] == carrier)],
-                links.receivers[number],
-            )
-            own = own[torch.linspace(0, len(own) - 1, min(len(own), max(20, most // len(pairs)))).round().long()]
+            receiver = links.receivers[int(number)]
+            own = train[(query.receivers[train] == number) & (frequencies[train] == carrier)]
+            own = evenly(own, max(20, most // len(pairs)))
             pose = replace(receiver.pose, position=receiver.pose.position - self.middle).to(self.points)
             yield own, carrier, pose, receiver
 

@@ -150,10 +150,7 @@ class Mirrored(Placement):
         self.scene, self.channels, self.order = scene, channels, order
         self.walls, self.fixed = walls, fixed
         is_complex = scene.task.dtype.is_complex
-        receivers = scene.positions(scene.lower)
-        lower = torch.cat((scene.lower[None], receivers)).amin(0)
-        upper = torch.cat((scene.upper[None], receivers)).amax(0)
-        self.box = lower, upper
+        self.box = lower, upper = scene.box
         half = (upper - lower) / 2
         self.register_buffer("middle", lower + half, persistent=False)
         self.diagonal = 2 * float(half.norm())

@@ -130,8 +130,7 @@ def cubic_grid(scene: Scene, count: int, pitch: float, margin: float) -> Float[T
         pitch: In wavelengths, where these are known.
         margin: As a share of the box's longest edge.
     """
-    corners = torch.cat((scene.lower[None], scene.upper[None], scene.positions(scene.lower)))
-    lower, upper = corners.amin(0).double(), corners.amax(0).double()
+    lower, upper = (corner.double() for corner in scene.box)
     edges = (upper - lower) + 2 * margin * (upper - lower).max()
     task = scene.task
     frequencies = task.frequencies if task.dtype.is_complex else scene.frequencies

@@ -178,6 +178,5 @@ class RayMarching(Model):
 def farthest(scene: Scene) -> float:
     """From any receiver to the farthest corner of the box that holds the training transmitters and receivers [m]."""
     places = scene.positions(scene.lower)
-    lower = torch.minimum(scene.lower, places.amin(0))
-    upper = torch.maximum(scene.upper, places.amax(0))
+    lower, upper = scene.box
     return torch.maximum(places - lower, upper - places).norm(dim=1).max().item()

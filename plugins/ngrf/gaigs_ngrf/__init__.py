@@ -69,8 +69,7 @@ class NGrf(Model):
             if not 0 < value <= 1e6:
                 raise ValueError(f"model.{option} must be more than 0 and at most 1e6, got {value}")
         receivers = scene.positions(scene.lower)
-        corners = torch.cat((scene.lower[None], scene.upper[None], receivers))
-        lower, upper = corners.amin(0), corners.amax(0)
+        lower, upper = scene.box
         beyond = margin * (upper - lower).max()
         means = lower - beyond + (upper - lower + 2 * beyond) * torch.rand(len(receivers), count, 3)
         means[:, 0] = receivers

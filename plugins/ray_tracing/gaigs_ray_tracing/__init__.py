@@ -4,11 +4,10 @@ import math
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from scipy.constants import epsilon_0
 from torch import Tensor, nn
 
-from gaigs.antenna import Array
 from gaigs.data import Links
 from gaigs.data.sionna.meshes import THICKNESS, wavefront_obj
 from gaigs.data.sionna.tracing import frequency_offsets
@@ -228,7 +227,8 @@ class RayTracing(Model):
             channels = channels * torch.polar(amplitude.exp(), phase)
             return channels.conj() if self.sign > 0 else channels
         if self.beamformer is not None:
-            lags = _lags(respond(paths, antenna, carrier, self.offsets), antenna.array)
+            waves = respond(paths, antenna, carrier, self.offsets)
+            lags = antenna.array.by_lag(waves @ waves.mH / waves.shape[-1])
             return self.beamformer(lags.to(torch.complex64), query, batch.directions)
         if self.scene.bandwidth is None:
             distances = (paths.images - antenna.pose.position.double()).norm(dim=-1)
@@ -260,11 +260,3 @@ class RayTracing(Model):
         if self.frequency is not None and query.frequencies is None and not self.scene.task.dtype.is_complex:
             return torch.full((len(query),), float(self.frequency))
         return carriers(self.scene, query)
-
-
-def _lags(responses: Complex[Tensor, "b e f"], array: Array) -> Complex[Tensor, "b l"]:
-    """Mean covariance of an array's pairs of elements that are equally far apart, over the frequencies."""
-    _, pairs, counts = array.lags
-    covariances = responses @ responses.mH / responses.shape[-1]
-    lags = covariances.new_zeros(len(responses), len(counts))
-    return lags.index_add(1, pairs, covariances.flatten(1)) / counts

@@ -152,7 +152,7 @@ class Tracer:
         valid = paths.valid.numpy()
         there = np.zeros_like(valid)
         for receiver, place in np.ndindex(*valid.shape[:2]):
-            there[receiver, place, _strongest(fields[receiver, place] * valid[receiver, place])] = True
+            there[receiver, place, tracing.without_weakest(fields[receiver, place] * valid[receiver, place])] = True
         receivers, transmitters, _ = there.nonzero()
         pick = lambda tensor: np.moveaxis(tensor.numpy(), 0, 3)[there]
         types, objects, faces, points = map(pick, (paths.interactions, paths.objects, paths.primitives, paths.vertices))
@@ -253,13 +253,6 @@ def _normals(mesh: Mesh) -> Float[ndarray, "f 3"]:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / np.where(lengths > 0, lengths, 1)
-
-
-def _strongest(fields: ndarray) -> Int[ndarray, " k"]:
-    """The paths without the weakest."""
-    order = np.argsort(-np.abs(fields), kind="stable")
-    power = np.abs(fields[order]) ** 2
-    return order[np.cumsum(power[::-1])[::-1] > tracing.WEAKEST * power.sum()]
 
 
 def _vertical(directions: Float[ndarray, "p 3"]) -> Float[ndarray, "p 2 3"]:
