@@ -2,10 +2,11 @@
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
 from gaigs.geometry import Pose
@@ -108,3 +109,9 @@ class Receiver:
     name: str
     pose: Pose
     array: Array = field(default_factory=Array.single)
+
+
+def lacking(receivers: Sequence[Receiver], index: Int[Tensor, " b"], count: int) -> Bool[Tensor, "b e"]:
+    """True for each of ``count`` elements that the array of a link's receiver lacks; ``index`` numbers receivers."""
+    sizes = torch.tensor([len(receiver.array) for receiver in receivers], device=index.device)
+    return torch.arange(count, device=index.device) >= sizes[index.long()][:, None]

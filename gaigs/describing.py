@@ -13,6 +13,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from gaigs.antenna import lacking
 from gaigs.data import Links, load, phase_doubts, shortened
 from gaigs.data.doubts import doubts, places_doubts
 from gaigs.data.readings import marks_of
@@ -121,7 +122,10 @@ def levels(links: Links, index: Tensor) -> Float[Tensor, " k"]:
         flat = links.labels[part].reshape(len(part), -1)
         is_wave = flat.is_complex()
         mean = (flat.abs().double().square() if is_wave else flat.double()).mean(1)
-        found.append(10 * mean.clamp_min(1e-300).log10() if is_wave else mean)
+        if is_wave:  # over the elements that arrays have
+            absent = lacking(links.receivers, links.query.receivers[part], links.task.shape[0])
+            mean = 10 * (mean / (1 - absent.double().mean(1))).clamp_min(1e-300).log10()
+        found.append(mean)
     return torch.cat(found)
 
 

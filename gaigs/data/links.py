@@ -13,7 +13,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from gaigs import configuration
-from gaigs.antenna import Array, Receiver
+from gaigs.antenna import Array, Receiver, lacking
 from gaigs.data import Links, divide, load, shortened
 from gaigs.data.readings import loud_remark, marks_of
 from gaigs.geometry import Pose
@@ -233,7 +233,7 @@ def _check_elements(task: Csi, labels: Tensor, receivers: Sequence[Receiver], in
             f"the task has {task.elements} elements, and the largest array of the receivers {sizes.max()}; "
             "give Csi the number of elements of the largest one"
         )
-    absent = torch.arange(task.elements) >= sizes[index.long()][:, None]
+    absent = lacking(receivers, index, task.elements)
     if (beyond := (labels != 0).any(2) & absent).any():
         link, element = beyond.nonzero()[0].tolist()
         raise ValueError(

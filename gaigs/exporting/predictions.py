@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from gaigs.antenna import lacking
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
@@ -61,9 +62,7 @@ def write_predictions(
     task = asked.task if subcarriers is not None else scene.task
     absent = torch.tensor(False).expand(len(query), *task.shape)
     if isinstance(task, Csi):  # elements that a receiver's array lacks
-        sizes = torch.tensor([len(receiver.array) for receiver in scene.receivers])
-        lacking = torch.arange(task.elements) >= sizes[query.receivers.cpu()][:, None]
-        absent = lacking[..., None].expand_as(absent)
+        absent = lacking(scene.receivers, query.receivers.cpu(), task.elements)[..., None].expand_as(absent)
         blank = lambda part: part if part is None or part.ndim < 3 else part.cpu().masked_fill(absent, math.nan)
         found, labels = Estimate(*map(blank, found)), blank(labels)
     variables = tabulate(query, [receiver.name for receiver in scene.receivers], task, found, labels)

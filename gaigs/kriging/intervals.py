@@ -35,6 +35,7 @@ class Estimate(NamedTuple):
     Attributes:
         value: The prediction of ``predict`` without an interval.
         std: Standard deviation of the label about it, in the label's unit; of channels that of the complex error.
+            NaN, as what follows, at elements that an array lacks.
         lower, upper: Ends of the interval, which holds the label with the asked probability; None for channels.
         radius: Of channels, that of a disc about the value which holds the channel with this probability, in the
             label's unit; else None.
@@ -110,6 +111,7 @@ class Calibration:
         """
         errors = (task.align(labels, values) - values).abs() / _shaped(deviations, values)
         errors, values = (thin(part) for part in (errors, values))
+        exists = ~errors.isnan()
         count = int(torch.cat((query.receivers, known.receivers)).max()) + 1
         heard = query.receivers.bincount(minlength=count)
         rows = query.receivers if heard.min() >= ENOUGH and count > 1 else torch.zeros_like(query.receivers)
@@ -120,7 +122,7 @@ class Calibration:
             edges = torch.stack([apart[rows == row].quantile(levels) for row in range(int(rows.max()) + 1)])
             own = rows * groups + torch.searchsorted(edges[rows], apart[:, None])[:, 0]
             counts = own.bincount(minlength=len(edges) * groups)
-            squares = torch.stack([errors[own == group].square().mean() for group in range(len(counts))])
+            squares = torch.stack([errors[own == group].square().nanmean() for group in range(len(counts))])
             if groups == 1 or (counts.min() >= ENOUGH // 2 and (squares.view(-1, groups).diff() > 0).all()):
                 break
             groups -= 1
@@ -140,9 +142,9 @@ class Calibration:
         for group in range(len(counts)):
             for bin_ in range(len(amplitudes) + 1):
                 # A bin without pixels in a group, as of receivers in different surroundings, has those of all groups.
-                inside = (bins == bin_) & (own == group)[:, None]
-                inside = inside if inside.any() else bins == bin_
-                inside = inside if inside.any() else torch.ones_like(inside)
+                inside = (bins == bin_) & (own == group)[:, None] & exists
+                inside = inside if inside.any() else (bins == bin_) & exists
+                inside = inside if inside.any() else exists
                 found = errors[inside].double().sort().values
                 held = (errors <= quantile(found, levels.new_tensor(USUAL))) & inside
                 quantiles[group, bin_] = quantile(found, levels * (1 + 1 / effective_count(held.sum(1), inside.sum(1))))
@@ -176,7 +178,7 @@ class Calibration:
         half = scale * factors(self.quantiles.to(value.device)[own[:, None], bins, rank])
         std = scale * factors(self.sizes.to(value.device)[own[:, None], bins])
         if value.is_complex():
-            powers, errors = (part.abs().square().flatten(1).sum(1) for part in (value, std))
+            powers, errors = (part.abs().square().flatten(1).nansum(1) for part in (value, std))
             return Estimate(value, std, None, None, half, 10 * (powers / errors).log10())
         return Estimate(value, std, (value - half).clamp_min(self.lowest.item()), value + half)
 
@@ -252,7 +254,11 @@ def interval_scores(
     crps = std * (z * torch.erf(z / math.sqrt(2)) + 2 * density - 1 / math.sqrt(math.pi))
     nll = z.square() / 2 + std.log() + math.log(2 * math.pi) / 2
     parts = {"coverage_50": inside[0], "coverage_90": inside[1], "width_90": width, "crps": crps, "nll": nll}
-    return {name: part.double()[..., None].flatten(1).mean(1) for name, part in parts.items()}
+    means = {}
+    for name, part in parts.items():
+        of_numbers = part.double().reshape(*value.shape, -1).mean(-1).masked_fill(most.std.isnan(), math.nan)
+        means[name] = of_numbers[..., None].flatten(1).nanmean(1)
+    return means
 
 
 def summarise_intervals(scores: dict[str, Float[Tensor, " k"]]) -> dict[str, float]:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gaigs import checkpoint
+from gaigs.antenna import lacking
 from gaigs.data import Links
 from gaigs.gaussians import Gaussians
 from gaigs.geometry import Directions, ExtrapolationWarning
@@ -311,12 +312,20 @@ class Model(nn.Module):
     def spread(self, batch: Batch, value: Tensor) -> Tensor:
         """Standard deviation of the labels as the model knows it, (b,) or of each number; a calibration scales it.
 
-        By default 1, of channels the root mean square of each link's value.
+        By default 1, of channels the root mean square of each link's value. It is NaN at elements that a receiver's
+        array lacks, which have no error.
         """
-        found = call_optional(self, "deviations", batch)
+        found, task = call_optional(self, "deviations", batch), self.scene.task
+        absent = torch.zeros((), dtype=torch.bool, device=value.device)
+        if isinstance(task, Csi):
+            absent = lacking(self.scene.receivers, batch.query.receivers, task.elements)[..., None]
         if found is None and value.is_complex():
-            found = value.abs().square().flatten(1).mean(1).sqrt()
-        return torch.ones(len(value), device=value.device) if found is None else found
+            found = value.abs().square().masked_fill(absent, math.nan).flatten(1).nanmean(1).sqrt()
+        found = torch.ones(len(value), device=value.device) if found is None else found
+        if absent.any():
+            of_numbers = found if found.ndim > 1 else found[:, None, None]
+            found = of_numbers.expand(value.shape).masked_fill(absent, math.nan)
+        return found
 
 
 class OptionalMethods(Protocol):

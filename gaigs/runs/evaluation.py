@@ -320,8 +320,8 @@ def shares(
         if not calibration.gives(level):
             found.append(math.nan)
             continue
-        inside = holds(calibration.estimate(values, deviations, query, level), aligned)
-        found.append(inside.double().mean().item())
+        estimate = calibration.estimate(values, deviations, query, level)
+        found.append(holds(estimate, aligned)[~estimate.std.isnan()].double().mean().item())
     return np.array(found)
 
 

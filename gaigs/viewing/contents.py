@@ -144,6 +144,7 @@ class Contents:
             heard = torch.arange(len(self.scene.receivers))
             points = points.expand(len(heard), 3)
         value, std, snr = self._estimate(points, heard)
+        own = slice(len(self.scene.receivers[receiver].array))  # elements
         if self.kind == "level":
             answer["levels"] = plain(value)
             answer["stds"] = None if std is None else plain(std)
@@ -152,8 +153,8 @@ class Contents:
             answer["std"] = None if std is None else grey(std[0], 2 * step)  # it is smooth
         elif self.kind == "channel":
             answer["curves"] = {"predicted": self._curve(value[0], int(loudest(value[0])))}
-            answer["level"] = plain(level(value)[0])
-            answer["std"] = None if std is None else plain(level(std)[0])
+            answer["level"] = plain(level(value[:, own])[0])
+            answer["std"] = None if std is None else plain(level(std[:, own])[0])
             answer["snr"] = None if snr is None else plain(snr[0].clamp_max(140))
         query, _ = Query.from_positions([place], receiver, self.frequency, self._names, self.scene.frequencies)
         with self.lock:
@@ -171,7 +172,8 @@ class Contents:
         # In parts, so that a drag need not wait for the whole map.
         parts = torch.from_numpy(places.reshape(-1, 3)).split(POINTS)
         found = torch.cat([self._estimate(part, receiver)[0] for part in parts])
-        values = level(found) if found.is_complex() else found
+        own = slice(len(self.scene.receivers[receiver].array))
+        values = level(found[:, own]) if found.is_complex() else found
         return {"x": plain(x), "y": plain(y), "height": plain(height), "values": plain(values)}
 
     def comparison(self, number: int, step: int = 1) -> dict:

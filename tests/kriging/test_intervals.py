@@ -10,13 +10,15 @@ from scipy import stats
 from scipy.integrate import quad
 
 import gaigs
+from gaigs.antenna import Array, Receiver
 from gaigs.data import Split
-from gaigs.geometry import Rays
+from gaigs.geometry import Pose, Rays
 from gaigs.kriging import scalar
 from gaigs.kriging.intervals import Calibration, Estimate, interval_scores, nearest, summarise_intervals
 from gaigs.model.kriging import Kriging
 from gaigs.query import Query
 from gaigs.runs import evaluation
+from gaigs.task.csi import Csi
 from gaigs.testing import example_links
 
 TASKS = pytest.mark.parametrize("task", ["rssi", "spectrum", "csi"])
@@ -338,3 +340,28 @@ def test_kriging_does_not_know_a_single_group_of_validation_links():
     ((model, part, known),) = evaluation.unseen(kriged, links)
     assert torch.equal(part, alone)
     assert len(model.process.values) == len(known) == len(links.split.train)
+
+
+def test_elements_that_an_array_lacks_have_no_intervals_and_count_in_none():
+    frequencies, rng = np.linspace(2.4e9, 2.48e9, 5), np.random.default_rng(0)
+    places = rng.uniform([0.5, 0.5, 0.5], [6, 4, 2], (150, 3))
+    pose = lambda x: Pose(torch.tensor([x, 2.0, 1.5]), torch.eye(3))
+    receivers = [Receiver("four", pose(6.4), Array.planar(2, 2, 0.06)), Receiver("one", pose(0.2), Array.single())]
+    labels = np.zeros((150, 2, 4, 5), complex)
+    for number, receiver in enumerate(receivers):
+        stand = (receiver.pose.position + receiver.array.elements).numpy()
+        for image, gain in ((places, 1.0), (places * [-1, 1, 1], -0.5)):
+            lengths = np.linalg.norm(image[:, None] - stand, axis=-1)[..., None]
+            labels[:, number, : len(stand)] += gain / lengths * np.exp(-2j * np.pi * frequencies / 3e8 * lengths)
+    links = gaigs.links(task=Csi(4, frequencies), transmitters=places, receivers=receivers, labels=labels)
+    model, test = gaigs.train("friis", links), links.split.test
+    found, held = model.predict(links.query[test], interval=0.9), []
+    for number, count in enumerate((4, 1)):
+        own = links.query.receivers[test] == number
+        inside = (links.labels[test] - found.value).abs() <= found.radius
+        held += inside[own][:, :count].flatten(1).double().mean(1).tolist()
+        assert found.radius[own][:, count:].isnan().all()
+        assert found.snr_db[own].isfinite().all()
+        assert inside[own][:, :count].double().mean() > 0.75, "it was 0 at the single antenna"
+    scores = gaigs.evaluate(model, links).scores["friis"]
+    torch.testing.assert_close(scores["interval_coverage_90"].mean().item(), np.mean(held))
