@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gaigs.data.links import links
     from gaigs.describing import Description, describe
     from gaigs.exporting import export
-    from gaigs.geometry import Grid, Pose, Rays
+    from gaigs.geometry import Frame, Grid, Pose, Rays
     from gaigs.kriging.intervals import Estimate
     from gaigs.locating import Fingerprints, Location, fingerprints, locate
     from gaigs.model import Model
@@ -48,9 +48,10 @@ PLACES = {
     "links": "data.links", "train": "runs.training", "evaluate": "runs.evaluation", "load": "checkpoint",
     "compose": "configuration", "rasterize": "rasterizer", "radio_map": "radio_maps", "register": "registry",
     "registries": "registry", "Model": "model", "Links": "data", "Query": "query", "Grid": "geometry",
-    "Rays": "geometry", "Receiver": "antenna", "Array": "antenna", "Pose": "geometry", "Scene": "scene",
-    "Metric": "task", "survey": "surveying", "SurveyPlan": "surveying", "Estimate": "kriging.intervals",
-    "locate": "locating", "Location": "locating", "fingerprints": "locating", "Fingerprints": "locating",
+    "Frame": "geometry", "Rays": "geometry", "Receiver": "antenna", "Array": "antenna", "Pose": "geometry",
+    "Scene": "scene", "Metric": "task", "survey": "surveying", "SurveyPlan": "surveying",
+    "Estimate": "kriging.intervals", "locate": "locating", "Location": "locating", "fingerprints": "locating",
+    "Fingerprints": "locating",
     "describe": "describing", "Description": "describing",
     "export": "exporting",
     "view": "viewing", "View": "viewing",
@@ -58,10 +59,10 @@ PLACES = {
 """The module of each public name, which is imported when the name is first used: torch is slow to import."""
 
 __all__ = [
-    "Array", "Description", "Estimate", "Fingerprints", "Grid", "Links", "Location", "Metric", "Model", "Pose", "Query",
-    "Rays", "Receiver", "Scene", "SurveyPlan", "View", "__version__", "compose", "describe", "evaluate", "export",
-    "fingerprints", "links", "load", "locate", "radio_map", "rasterize", "register", "registries", "run", "survey",
-    "train", "view",
+    "Array", "Description", "Estimate", "Fingerprints", "Frame", "Grid", "Links", "Location", "Metric", "Model", "Pose",
+    "Query", "Rays", "Receiver", "Scene", "SurveyPlan", "View", "__version__", "compose", "describe", "evaluate",
+    "export", "fingerprints", "links", "load", "locate", "radio_map", "rasterize", "register", "registries", "run",
+    "survey", "train", "view",
 ]  # fmt: skip
 
 

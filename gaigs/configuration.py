@@ -326,6 +326,10 @@ def explain(error: Exception) -> str | None:
             place, _, word = key.rpartition(".")
             has = [str(name) for name in cause.parent_node]
             part = f"{place} {cause.parent_node['name']!r}" if "name" in has else place or "the configuration"
+            plain: Any = OmegaConf.to_container(cause.parent_node)
+            inner = [full for full in _options(plain, plain) if full.rpartition(".")[2] == word]
+            if inner:
+                return f"{part} has no key {word!r}; did you mean {' or '.join(inner)}?"
             hint = f"\nin a sweep write ++{key}=... for a key that only the swept {place} has" if is_multirun() else ""
             return f"{part} has no key {suggest(word, has)}; it has: {listed(sorted(has))}{hint}"
         case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:

@@ -138,6 +138,9 @@ def suspicions(links: Links, sites: Float[Tensor, "n 3"]) -> Iterator[str]:
         yield from places_doubts(links)
     else:
         yield from [*doubts(links), *phase_doubts(links)]
+    if len(receivers) > 1 and len(links) < 3 * len(receivers):
+        each = "models are learnt for each, so a fixed one must have one place"
+        yield f"{len(receivers)} receivers have {len(links)} links: {each}"
     near = (distances(sites.double(), stands[given].double()) < 0.01).any(1)
     if len(sites) > 1 and near.any():
         yield f"{int(near.sum())} places are where a receiver stands"

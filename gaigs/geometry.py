@@ -24,7 +24,15 @@ class ExtrapolationWarning(UserWarning):
 
 
 class Frame(NamedTuple):
-    """The place of the world frame on a map: its origin (x, y) in the projected system of an EPSG code [m]."""
+    """The place of the world frame on a map: its origin (x, y) in the projected system of an EPSG code [m].
+
+    Example:
+        >>> places, levels = [[10.0, 20.0, 1.5], [30.0, 5.0, 1.5], [0.0, 9.0, 1.5]], [-50.0, -60.0, -55.0]
+        >>> frame = gaigs.Frame(32632, 450000.0, 5400000.0)  # UTM less this easting and northing
+        >>> links = gaigs.links(task="rssi", transmitters=places, receivers=[0, 0, 9], labels=levels, frame=frame)
+        >>> links.frame.epsg
+        32632
+    """
 
     epsg: int
     x: float

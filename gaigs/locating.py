@@ -57,6 +57,9 @@ KEPT, SPREAD = 1500, 75
 """Candidates of each value of a track that are linked to those before and after, and those over which its own posterior
 spreads: regions of tracks reach far beyond the likeliest candidates."""
 
+FARTHEST = 5.0
+"""Deviations that a reading may be beyond all predictions without a warning."""
+
 STAYS = 10
 """Most values of a held-out track at each of its places."""
 
@@ -330,7 +333,16 @@ def locate(
         prints = model
     else:
         prints = fingerprints(model, links, region)
-    return posterior(prints, as_fingerprints(value, prints, step is not None), unknown_power, step, level)
+    asked = as_fingerprints(value, prints, step is not None)
+    if not prints.task.shape and not unknown_power:
+        lowest, highest = prints.values.aminmax()
+        beyond = torch.maximum(asked - highest, lowest - asked).nan_to_num(0)
+        if beyond.max() > FARTHEST * prints.deviations.max():
+            words = (
+                f"readings are up to {beyond.max():.3g} {prints.task.unit} beyond all predicted ones; check their unit"
+            )
+            warnings.warn(words, ExtrapolationWarning, stacklevel=2)
+    return posterior(prints, asked, unknown_power, step, level)
 
 
 def posterior(
@@ -413,6 +425,8 @@ def run(config: dict, folder: Path) -> None:
     if not found.calibrated:
         count = sum(len(one.truth) for one in prints.held)
         print(f"regions are not calibrated: {count} fingerprints are held out, and {fewest(options['level'])} needed")
+    if (frame := model.scene.frame) is not None:
+        print(f"x and y are metres from ({frame.x:.10g}, {frame.y:.10g}) of EPSG:{frame.epsg}")
     print(f"results: {folder}")
 
 

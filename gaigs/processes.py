@@ -7,7 +7,9 @@ import gc
 import os
 import signal
 import sys
+import sysconfig
 import threading
+import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -112,7 +114,18 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
     if isinstance(error, OSError):
         return file_message(error, folder)
     is_known = isinstance(error, ValueError | TypeError | ImportError | RuntimeError | OmegaConfBaseException)
-    return str(error) if is_known or type(error).__name__ == "MisconfigurationException" else None  # Lightning's
+    is_known |= type(error).__name__ == "MisconfigurationException"  # Lightning's
+    return f"{error}{fault_of_plug_in(error)}" if is_known else None
+
+
+def fault_of_plug_in(error: Exception) -> str:
+    """File and line if code that is neither gaigs nor installed is at fault, and did not raise the error itself."""
+    here, installed = str(Path(__file__).parent), (sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), "<")
+    trace = traceback.extract_tb(error.__traceback__)
+    frames = [one for one in trace if one.filename.startswith(here) or not one.filename.startswith(installed)]
+    if not frames or frames[-1].filename.startswith(here) or (frames[-1].line or "").startswith("raise"):
+        return ""
+    return f"\nat {frames[-1].filename}, line {frames[-1].lineno}; hydra.verbose=true prints the traceback"
 
 
 def is_first() -> bool:

@@ -12,8 +12,9 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from gaigs.geometry import even_places
+from gaigs.geometry import Frame, even_places
 from gaigs.io.files import write_text
+from gaigs.io.tables import read_points
 from gaigs.kriging.kernel import LIMIT, Process, kernel
 from gaigs.kriging.links import chance_to_hear, coordinates, distances
 from gaigs.model import Model, call_optional
@@ -53,6 +54,7 @@ class SurveyPlan:
         losses: Rise of the mean error if one of them had been left out (k,).
         superfluous: Known places that together raise the error by at most 5 % if left out (k,).
         unit: Of the errors.
+        frame: Place of x and y on a map; None if unknown.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -66,6 +68,7 @@ class SurveyPlan:
     losses: Float[Tensor, " k"]
     superfluous: Bool[Tensor, " k"]
     unit: str = ""
+    frame: Frame | None = None
 
     def __repr__(self) -> str:
         return f"<{self}>"
@@ -83,19 +86,21 @@ class SurveyPlan:
     def save(self, path: str | Path) -> None:
         """Writes a CSV table: places to measure, each with the error after it, then measured ones to leave out.
 
-        Without a model errors are empty.
+        With a ``frame`` it has easting and northing too. Without a model errors are empty.
         """
-        table = io.StringIO()
+        table, frame = io.StringIO(), self.frame
         rows = csv.writer(table, lineterminator="\n")
-        rows.writerow(["use", "x", "y", "z", "mean_error"])
+        rows.writerow(["use", "x", "y", "z", *([] if frame is None else ["easting", "northing"]), "mean_error"])
+        on_map = lambda x, y, z: () if frame is None else (frame.x + x, frame.y + y)
+        row = lambda use, place, word: rows.writerow([use, *(f"{x:.3f}" for x in (*place, *on_map(*place))), word])
         words = [""] * len(self.places)
         if self.errors is not None:
             words = [f"{error:.4g}" for error in self.errors[1:].tolist()]
         for place, word in zip(self.places.tolist(), words, strict=True):
-            rows.writerow(["measure", *(f"{x:.3f}" for x in place), word])
+            row("measure", place, word)
         known, losses = self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist()
         for place, loss in zip(known, losses, strict=True):
-            rows.writerow(["leave out", *(f"{x:.3f}" for x in place), f"{self.errors[0] + loss:.4g}"])
+            row("leave out", place, f"{self.errors[0] + loss:.4g}")
         write_text(Path(path), table.getvalue())
 
 
@@ -213,17 +218,22 @@ def survey(
         return SurveyPlan(places[chosen], None, places[:0], places[:0, 0], torch.zeros(0, dtype=torch.bool))
     known, losses, superfluous = without(processes, asked[stated], MEAN * factor)
     unit = getattr(model.scene.task, "error_unit", model.scene.task.unit)
-    return SurveyPlan(places[chosen], torch.tensor(errors), known, losses, superfluous, unit)
+    return SurveyPlan(places[chosen], torch.tensor(errors), known, losses, superfluous, unit, model.scene.frame)
 
 
 def run(config: dict, folder: Path) -> None:
     """Plans a survey, by the model of a finished run if given; writes ``survey.csv`` and ``survey.png``."""
     model = None if config["folder"] is None else model_of(config["folder"])
-    plan = call("survey", survey, config["survey"], model=model)
+    options = dict(config["survey"])
+    if isinstance(options["candidates"], str):
+        options["candidates"] = read_points(Path(options["candidates"]), "xyz", "x,y,z [m] of one candidate a line")
+    plan = call("survey", survey, options, model=model)
     folder.mkdir(parents=True, exist_ok=True)
     plan.save(folder / "survey.csv")
     style.save(figure(plan), folder / "survey.png")
     print(plan)
+    if plan.frame is not None:
+        print(f"easting and northing are those of EPSG:{plan.frame.epsg}")
     print(f"results: {folder}")
 
 

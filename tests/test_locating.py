@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 
 import gaigs
 from gaigs import locating
+from gaigs.geometry import ExtrapolationWarning
 from gaigs.locating import (
     Fingerprints,
     geometric_median,
@@ -58,6 +59,13 @@ def test_values_by_names_of_receivers_are_those_in_their_order():
         gaigs.locate(prints, {"rx2": -55.0})
     with pytest.raises(ValueError, match="the label of one receiver or more, got none"):
         gaigs.locate(prints, {})
+
+
+def test_readings_of_another_unit_are_named():
+    prints = scalars([[-40.0, -60.0], [-50.0, -52.0], [-60.0, -45.0]], [[2.0, 3.0]] * 3)
+    with pytest.warns(ExtrapolationWarning, match="up to 40 dBm beyond all predicted ones; check their unit"):
+        gaigs.locate(prints, [1e-5, -50.0])
+    gaigs.locate(prints, [-30.0, math.nan])
 
 
 def test_posterior_is_that_of_a_plain_sum_over_the_receivers_that_hear():

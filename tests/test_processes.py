@@ -178,6 +178,21 @@ def test_jobs_of_a_launcher_share_the_processors(monkeypatch):
             pass
 
 
+def test_a_fault_of_a_plug_in_has_its_file_and_line(tmp_path):
+    file = tmp_path / "plug_in.py"
+    file.write_text("def fault():\n    return len(3)\n\n\ndef refusal():\n    raise ValueError('width is too small')\n")
+    functions: dict = {}
+    exec(compile(file.read_text(), str(file), "exec"), functions)
+    messages = {}
+    for name in ("fault", "refusal"):
+        with pytest.raises((TypeError, ValueError)) as caught:
+            functions[name]()
+        error = caught.value.with_traceback(caught.tb.tb_next)  # without the test's own frame
+        messages[name] = processes.advice(error, tmp_path, "")
+    assert messages["fault"].splitlines()[1].startswith(f"at {file}, line 2; hydra.verbose=true")
+    assert messages["refusal"] == "width is too small"
+
+
 def test_a_folder_is_held_by_one_run_at_a_time(tmp_path):
     with pytest.raises(ValueError, match="another run is at work"):
         with processes.only_run(tmp_path), processes.only_run(tmp_path):

@@ -1,5 +1,6 @@
 """Survey plans against covariances by numpy, and against places drawn at random."""
 
+import csv
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from scipy.spatial.distance import cdist
 
 import gaigs
-from gaigs.geometry import even_places
+from gaigs.geometry import Frame, even_places
 from gaigs.kriging import scalar
 from gaigs.kriging.kernel import Process
 from gaigs.surveying import MEAN, POINTS, heard, posterior, with_trend, without
@@ -165,6 +166,11 @@ def test_plans_are_written_and_wrong_ones_are_refused(tmp_path):
     assert lines[0] == "use,x,y,z,mean_error"
     assert [line.split(",")[0] for line in lines[1:]] == ["measure"] * 4 + ["leave out"] * int(plan.superfluous.sum())
     assert str(plan).startswith("4 more places bring the expected mean error from ")
+    replace(plan, frame=Frame(32632, 5e5, 5.4e6)).save(tmp_path / "survey.csv")
+    with (tmp_path / "survey.csv").open() as text:
+        first = next(csv.DictReader(text))
+    np.testing.assert_allclose(float(first["easting"]) - 5e5, float(first["x"]), atol=2e-3)
+    np.testing.assert_allclose(float(first["northing"]) - 5.4e6, float(first["y"]), atol=2e-3)
     with pytest.raises(ValueError, match="count must be at least 1"):
         gaigs.survey(model, count=0)
     with pytest.raises(ValueError, match="candidates, got 0"):
@@ -196,6 +202,11 @@ def test_the_command_plans_before_anything_is_measured(tmp_path, capsys):
     assert len(lines) == 4
     assert all(line.startswith("measure,") and line.endswith(",") for line in lines[1:])
     assert "without a trained model their error is unknown" in capsys.readouterr().out
+    (tmp_path / "places.csv").write_text("x,y,z\n0,0,1\n6,4,1\n6,0,1\n")
+    gaigs.run(gaigs.compose("command=survey", f"survey.candidates={tmp_path / 'places.csv'}"), tmp_path)
+    assert sorted(line.split(",")[1:3] for line in (tmp_path / "survey.csv").read_text().splitlines()[1:]) == [
+        ["0.000", "0.000"], ["6.000", "0.000"], ["6.000", "4.000"],
+    ]  # fmt: skip
 
 
 def test_losses_are_those_of_leaving_all_readings_of_a_place_out():

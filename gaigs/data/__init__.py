@@ -245,7 +245,8 @@ def phase_doubts(links: Links) -> list[str]:
     elif is_known and not sign and len(train) >= MANY * len(receivers.unique()):
         found.append(
             "phases of the channels do not follow the direct distance; unless walls block most direct waves, "
-            "check units and order of tx, rx, elements and h, and the frequencies"
+            "check units and order of tx, rx, elements and h, and the frequencies, or set data.phase=per_link if each "
+            "packet has a phase of its own"
         )
     for receiver, (elements, subcarriers, delay) in strange.items():
         unexplained = "have phases that geometry does not explain, the same at all links"
@@ -271,6 +272,12 @@ def only_trained(links: Links) -> Links:
     kept = (number[links.query.receivers] >= 0).nonzero()[:, 0]
     some = lambda values: None if values is None else values[kept]
     parts = {name: torch.isin(kept, part).nonzero()[:, 0] for name, part in links.split.parts().items()}
+    if len(links.split.test) and not len(parts["test"]):
+        each = f"{len(links.receivers)} receivers have {len(links)} links"
+        raise ValueError(
+            f"{each}, and those with test links none to train on: models are learnt for each receiver\n"
+            "give a fixed receiver one place for all its links, and the moving end as transmitters"
+        )
     names = [receiver.name for receiver, new in zip(links.receivers, number, strict=True) if new < 0]
     remark = f"receivers without a training link are left out, with {len(links) - len(kept)} links: {shortened(names)}"
     return replace(

@@ -16,10 +16,10 @@ from gaigs import configuration
 from gaigs.antenna import Array, Receiver, lacking
 from gaigs.data import Links, divide, load, shortened
 from gaigs.data.readings import loud_remark, marks_of
-from gaigs.geometry import Pose
+from gaigs.geometry import Frame, Pose
 from gaigs.io.tables import number_places
 from gaigs.query import Query, as_numbers, as_positions, as_tensor, check_carrier
-from gaigs.registry import check_type, registry, suggest
+from gaigs.registry import check_instance, check_type, registry, suggest
 from gaigs.task import Task, check_range
 from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
@@ -71,6 +71,7 @@ def from_arrays(
     split: str | Mapping | None = None,
     test_rows: Any = None,
     train_rows: Any = None,
+    frame: Frame | None = None,
     **options: Any,
 ) -> Links:
     """Links of arrays in memory, or of values that torch converts, with their split.
@@ -92,12 +93,16 @@ def from_arrays(
             ``random``.
         test_rows: Rows of ``transmitters`` to test on, as numbers or a mask (n,).
         train_rows: Rows to train and validate on; by default all others.
+        frame: Place of the positions' origin on a map, such as ``gaigs.Frame(32632, 450000.0, 5400000.0)`` for
+            UTM less that easting and northing; None if unknown.
 
     Raises:
         TypeError: An option has a wrong type.
         ValueError: Shapes do not fit, a number is not finite or out of range, or there is nothing to split.
     """
     check_type("bandwidth", bandwidth, float | None)
+    if frame is not None:
+        check_instance("frame", frame, Frame)
     if bandwidth is not None and not 0 <= bandwidth < math.inf:
         raise ValueError(f"bandwidth must be 0 Hz or more, and finite, got {bandwidth}")
     has_parts = test_rows is not None or train_rows is not None
@@ -182,7 +187,12 @@ def from_arrays(
         carriers = carriers.expand(count)[rows][heard]
         for carrier in carriers.unique().tolist():
             check_carrier("frequency", carrier)
-    own, (_, sites) = rows[heard], number_places(places.tolist())
+    own, (distinct, sites) = rows[heard], number_places(places.tolist())
+    if len(distinct) == 1 < len(own):
+        raise ValueError(
+            "transmitters all stand at one place; if receivers move, give their places as transmitters, and the fixed "
+            "end as receiver: a channel is the same both ways"
+        )
     parts: Any = None
     if has_parts:
         testing = _rows("test_rows", test_rows, count)
@@ -204,6 +214,7 @@ def from_arrays(
         bandwidth=bandwidth,
         official=(lambda: parts) if has_parts else None,
         uncertainties=torch.zeros(len(receivers)) if task.is_scalar else None,
+        frame=frame,
         remarks="; ".join(remarks),
     )
     links = divide(made, config)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from gaigs.exporting import maps, predictions, rooms, scenarios
+from gaigs.io.tables import read_points
 from gaigs.model import Model
 from gaigs.radio_maps import radio_map
 from gaigs.registry import call, check_instance, check_type
@@ -95,7 +96,10 @@ def run(config: dict, folder: Path) -> None:
     if places is None and takes_places and (suffix not in MAPS or not model.scene.task.is_scalar):
         places = "test"
     name = "predictions" if suffix in PREDICTIONS and places else "radio_map" if suffix in MAPS else "room"
-    places = links_of(config["folder"]) if places == "test" else places
+    if places == "test":
+        places = links_of(config["folder"])
+    elif isinstance(places, str):
+        places = read_points(Path(places), "xyz", "x,y,z [m] of one place a line")
     folder.mkdir(parents=True, exist_ok=True)
     call("export", export, options, model=model, file=folder / f"{name}{suffix}", places=places)
     print(f"results: {folder}")

@@ -27,7 +27,7 @@ from gaigs.task.csi import Csi
 
 log = logging.getLogger(__name__)
 
-LINK = "x", "y", "z", "receiver", "frequency"
+LINK = "x", "y", "z", "easting", "northing", "receiver", "frequency"
 """Columns of a link."""
 
 
@@ -65,14 +65,11 @@ def write_predictions(
         absent = lacking(scene.receivers, query.receivers.cpu(), task.elements)[..., None].expand_as(absent)
         blank = lambda part: part if part is None or part.ndim < 3 else part.cpu().masked_fill(absent, math.nan)
         found, labels = Estimate(*map(blank, found)), blank(labels)
-    variables = tabulate(query, [receiver.name for receiver in scene.receivers], task, found, labels)
+    variables = tabulate(query, scene, task, found, labels)
     if file.suffix.lower() == ".csv":
         write_csv(file, variables, absent.numpy())
         return [file]
-    about = {"title": f"{task.quantity} predicted by gaigs", "interval": interval}
-    if scene.frame is not None:
-        about |= {"frame_epsg": scene.frame.epsg, "frame_x": scene.frame.x, "frame_y": scene.frame.y}
-    write_netcdf(file, variables, about)
+    write_netcdf(file, variables, {"title": f"{task.quantity} predicted by gaigs", "interval": interval})
     return [file]
 
 
@@ -95,11 +92,16 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
     return query
 
 
-def tabulate(query: Query, names: list[str], task: Task, found: Estimate, labels: Tensor | None) -> dict[str, Variable]:
+def tabulate(query: Query, scene: Scene, task: Task, found: Estimate, labels: Tensor | None) -> dict[str, Variable]:
     """Columns of links, axes of labels, and values by links and axes; complex values as real and imaginary part."""
     places, metres = query.transmitters.cpu().double().numpy(), {"units": "m"}
     variables = {axis: Variable(("link",), places[:, k], metres) for k, axis in enumerate("xyz")}
-    variables["receiver"] = Variable(("link",), np.array(names)[query.receivers.cpu().numpy()])
+    if scene.frame is not None:
+        about = metres | {"long_name": f"of EPSG:{scene.frame.epsg}"}
+        variables["easting"] = Variable(("link",), scene.frame.x + places[:, 0], about)
+        variables["northing"] = Variable(("link",), scene.frame.y + places[:, 1], about)
+    names = np.array([receiver.name for receiver in scene.receivers])
+    variables["receiver"] = Variable(("link",), names[query.receivers.cpu().numpy()])
     if query.frequencies is not None:
         carriers = query.frequencies.cpu().double().numpy()
         variables["frequency"] = Variable(("link",), carriers, {"units": "Hz", "standard_name": "radiation_frequency"})
@@ -125,7 +127,7 @@ def axes_of(task: Any) -> dict[str, Variable]:
     """The axes of a label: elements and subcarriers, elevations and azimuths, or numbers of another task's."""
     if task.directions is not None:
         angles = {"elevation": task.directions.elevations, "azimuth": task.directions.azimuths}
-        degrees = {name: np.degrees(values.double().numpy()) for name, values in angles.items()}
+        degrees = {name: np.degrees(values.double().numpy()).round(6) for name, values in angles.items()}
         return {name: Variable((name,), values, {"units": "degree"}) for name, values in degrees.items()}
     if isinstance(task, Csi):
         subcarriers = Variable(("subcarrier",), task.frequencies.double().numpy(), {"units": "Hz"})
@@ -141,7 +143,7 @@ def write_csv(file: Path, variables: Mapping[str, Variable], absent: Bool[np.nda
     axes = {name: one.values.tolist() for name, one in variables.items() if one.dimensions == (name,)}
     links = {name: one.values.tolist() for name, one in variables.items() if name in LINK}
     values = {name: one.values for name, one in variables.items() if name not in axes | links}
-    shown = lambda value: value if isinstance(value, str) else f"{value:.7g}"
+    shown = lambda value: value if isinstance(value, str) else f"{value:.{7 if abs(value) < 1e5 else 10}g}"
     places = [*itertools.product(*([f"{number:.10g}" for number in axis] for axis in axes.values()))]
     with atomic_write(file) as part, part.open("w", encoding="utf-8", newline="") as text:
         rows = csv.writer(text, lineterminator="\n")

@@ -180,7 +180,10 @@ class Calibration:
         if value.is_complex():
             powers, errors = (part.abs().square().flatten(1).nansum(1) for part in (value, std))
             return Estimate(value, std, None, None, half, 10 * (powers / errors).log10())
-        return Estimate(value, std, (value - half).clamp_min(self.lowest.item()), value + half)
+        lower = torch.minimum(
+            (value - half).clamp_min(self.lowest.item()), value
+        )  # a prediction may be below the least
+        return Estimate(value, std, lower, value + half)
 
     def gives(self, level: float) -> bool:
         """True if every group has enough links for intervals of a level."""

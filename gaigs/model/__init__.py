@@ -8,6 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, overload
 
 import torch
@@ -39,7 +40,7 @@ class Prediction(NamedTuple):
     """
 
     value: Tensor
-    penalties: dict[str, Tensor]
+    penalties: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class Model(nn.Module):

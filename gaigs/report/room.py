@@ -66,8 +66,8 @@ def room(links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | 
             label = f"|signal| × opacity, {len(means):,} strongest of {len(gaussians.means):,} Gaussians"
             figure.colorbar(ellipses, ax=axes, label=label, extend="max", **bar)
         if obstacles:
-            # The scale spans at least 1 dB, so that a negligible loss is pale.
-            highest = max(1.0, *(np.quantile(image.get_array().data, 0.99) for image in obstacles))
+            # The scale spans at least 1 dB, so that a negligible loss is pale, and 40 dB, where nothing is left to see.
+            highest = min(40.0, max(1.0, *(np.quantile(image.get_array().data, 0.99) for image in obstacles)))
             for image in obstacles:
                 image.set_clim(0, highest)
             label = "loss by obstacles along the line of sight [dB]"

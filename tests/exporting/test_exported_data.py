@@ -125,6 +125,15 @@ def test_places_are_heard_by_each_receiver(rssi, tmp_path):
         assert float(table[5][name]) == pytest.approx(value.item(), rel=1e-5)
 
 
+def test_places_on_a_map_have_easting_and_northing(on_map, tmp_path):
+    gaigs.export(on_map, tmp_path / "places.csv", [[1.25, 2.0, 1.5]])
+    assert [rows(tmp_path / "places.csv")[0][name] for name in ("x", "easting", "northing")] == [
+        "1.25",
+        "500001.25",
+        "2",
+    ]
+
+
 def test_channels_of_test_links_stand_beside_their_labels(tmp_path, caplog):
     links = gaigs.links("synthetic_csi", transmitters=20, subcarriers=3, order=0)
     model = gaigs.train("friis", links)
