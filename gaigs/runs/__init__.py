@@ -61,7 +61,9 @@ def run(config: dict, folder: Path) -> dict | None:
 
 
 def model_of(folder: str | Path) -> Model:
-    """The model of a finished run: that of its checkpoint or, for a look-up, fitted anew to the run's data."""
+    """The model of a checkpoint, or of a finished run: for a look-up fitted anew to the run's data."""
+    if Path(folder).is_file():
+        return checkpoint.load(folder)
     folder, config = Path(folder), configuration_of(folder)
     warn_of_changes(folder, config["model"])
     if (folder / "best.ckpt").is_file():

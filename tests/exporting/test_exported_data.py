@@ -225,3 +225,13 @@ def test_channels_have_no_rows_of_elements_that_an_array_lacks(tmp_path):
     gaigs.export(gaigs.train("mean", links), tmp_path / "channels.csv", links)
     found = {(row["receiver"], row["element"]) for row in rows(tmp_path / "channels.csv")}
     assert found == {("a1", "0"), ("a2", "0"), ("a2", "1")}
+
+
+def test_the_command_exports_places_of_a_file_from_a_checkpoint(rssi, tmp_path):
+    rssi[0].save(tmp_path / "room.ckpt")
+    (tmp_path / "places.csv").write_text("x,y,z\n1.5,2,1\n")
+    words = ("command=export", f"folder={tmp_path / 'room.ckpt'}", "export.format=csv")
+    gaigs.run(gaigs.compose(*words, f"export.places={tmp_path / 'places.csv'}"), tmp_path / "out")
+    assert {row["x"] for row in rows(tmp_path / "out/predictions.csv")} == {"1.5"}
+    with pytest.raises(FileNotFoundError, match="holds no run"):  # its test links
+        gaigs.run(gaigs.compose(*words), tmp_path / "out")
