@@ -85,7 +85,7 @@ class Array:
 
     def by_lag(self, covariances: Complex[Tensor, "b e e"]) -> Complex[Tensor, "b l"]:
         """Mean covariance of the pairs of elements at each of ``lags``."""
-        _, pairs, counts = (part.to(covariances.device) for part in self.lags)
+        pairs, counts = (part.to(covariances.device) for part in self.lags[1:])
         summed = covariances.new_zeros(len(covariances), len(counts)).index_add(1, pairs, covariances.flatten(1))
         return summed / counts.to(covariances.real)
 

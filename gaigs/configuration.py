@@ -327,8 +327,9 @@ def explain(error: Exception) -> str | None:
             has = [str(name) for name in cause.parent_node]
             part = f"{place} {cause.parent_node['name']!r}" if "name" in has else place or "the configuration"
             plain: Any = OmegaConf.to_container(cause.parent_node)
-            inner = [full for full in _options(plain, plain) if full.rpartition(".")[2] == word]
-            if inner:
+            parts = () if place else plain.keys() - {"hydra", "survey", "locate", "export", "view", "benchmark"}
+            inner = sorted(full for full in _options(plain, parts) if full.rpartition(".")[2] == word)
+            if inner and word != "name":
                 return f"{part} has no key {word!r}; did you mean {' or '.join(inner)}?"
             hint = f"\nin a sweep write ++{key}=... for a key that only the swept {place} has" if is_multirun() else ""
             return f"{part} has no key {suggest(word, has)}; it has: {listed(sorted(has))}{hint}"

@@ -22,6 +22,7 @@ from gaigs.kriging.links import distances
 from gaigs.query import evenly
 from gaigs.registry import check_instance
 from gaigs.report import style
+from gaigs.task.csi import Csi
 from gaigs.task.rssi import Rssi
 from gaigs.task.scalar import with_unit
 from gaigs.task.spectrum import Spectrum
@@ -122,10 +123,10 @@ def levels(links: Links, index: Tensor) -> Float[Tensor, " k"]:
         flat = links.labels[part].reshape(len(part), -1)
         is_wave = flat.is_complex()
         mean = (flat.abs().double().square() if is_wave else flat.double()).mean(1)
-        if is_wave:  # over the elements that arrays have
-            absent = lacking(links.receivers, links.query.receivers[part], links.task.shape[0])
-            mean = 10 * (mean / (1 - absent.double().mean(1))).clamp_min(1e-300).log10()
-        found.append(mean)
+        if isinstance(links.task, Csi):  # over the elements that arrays have
+            absent = lacking(links.receivers, links.query.receivers[part], links.task.elements)
+            mean = mean / (1 - absent.double().mean(1))
+        found.append(10 * mean.clamp_min(1e-300).log10() if is_wave else mean)
     return torch.cat(found)
 
 
@@ -138,7 +139,7 @@ def suspicions(links: Links, sites: Float[Tensor, "n 3"]) -> Iterator[str]:
         yield from places_doubts(links)
     else:
         yield from [*doubts(links), *phase_doubts(links)]
-    if len(receivers) > 1 and len(links) < 3 * len(receivers):
+    if len(receivers) > 10 and len(links) < 1.5 * len(receivers):
         each = "models are learnt for each, so a fixed one must have one place"
         yield f"{len(receivers)} receivers have {len(links)} links: {each}"
     near = (distances(sites.double(), stands[given].double()) < 0.01).any(1)

@@ -58,7 +58,7 @@ KEPT, SPREAD = 1500, 75
 spreads: regions of tracks reach far beyond the likeliest candidates."""
 
 FARTHEST = 5.0
-"""Deviations that a reading may be beyond all predictions without a warning."""
+"""Deviations that a reading may be beyond all predictions without a warning, and half of their range at least."""
 
 STAYS = 10
 """Most values of a held-out track at each of its places."""
@@ -337,10 +337,9 @@ def locate(
     if not prints.task.shape and not unknown_power:
         lowest, highest = prints.values.aminmax()
         beyond = torch.maximum(asked - highest, lowest - asked).nan_to_num(0)
-        if beyond.max() > FARTHEST * prints.deviations.max():
-            words = (
-                f"readings are up to {beyond.max():.3g} {prints.task.unit} beyond all predicted ones; check their unit"
-            )
+        if beyond.max() > max(FARTHEST * prints.deviations.max(), (highest - lowest) / 2):
+            unit = getattr(prints.task, "error_unit", prints.task.unit)
+            words = f"readings are up to {beyond.max():.3g} {unit} beyond all predicted ones; check their unit"
             warnings.warn(words, ExtrapolationWarning, stacklevel=2)
     return posterior(prints, asked, unknown_power, step, level)
 
@@ -566,7 +565,8 @@ def as_fingerprints(value: object, prints: Fingerprints, is_track: bool = False)
         whole[which] = parts.detach().cpu().to(whole)
         value = whole.transpose(0, 1) if parts.ndim == 2 + len(shape) else whole
     given = as_tensor("value", value, f"labels of {count} receivers").detach().cpu().to(prints.task.dtype)
-    values = given.reshape(-1, 1, *shape) if count == 1 and given.ndim - len(shape) in (0, 1) else given
+    is_single = count == 1 and tuple(given.shape[given.ndim - len(shape) :]) == shape and given.ndim <= 1 + len(shape)
+    values = given.reshape(-1, 1, *shape) if is_single else given
     values = values[None] if values.ndim == 1 + len(shape) else values
     if values.ndim != 2 + len(shape) or values.shape[1:] != (count, *shape) or not len(values):
         need = f"{(count, *shape)} or {('n', count, *shape)}, a label of each receiver"

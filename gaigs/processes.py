@@ -120,10 +120,11 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
 
 def fault_of_plug_in(error: Exception) -> str:
     """File and line if code that is neither gaigs nor installed is at fault, and did not raise the error itself."""
-    here, installed = str(Path(__file__).parent), (sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), "<")
+    here, stdlib = str(Path(__file__).parent) + os.sep, sysconfig.get_path("stdlib")
+    is_library = lambda name: name.startswith(("<", stdlib)) or "site-packages" in name or "dist-packages" in name
     trace = traceback.extract_tb(error.__traceback__)
-    frames = [one for one in trace if one.filename.startswith(here) or not one.filename.startswith(installed)]
-    if not frames or frames[-1].filename.startswith(here) or (frames[-1].line or "").startswith("raise"):
+    frames = [one for one in trace if one.filename.startswith(here) or not is_library(one.filename)]
+    if not frames or frames[-1].filename.startswith(here) or "raise " in (frames[-1].line or ""):
         return ""
     return f"\nat {frames[-1].filename}, line {frames[-1].lineno}; hydra.verbose=true prints the traceback"
 

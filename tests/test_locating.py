@@ -63,7 +63,7 @@ def test_values_by_names_of_receivers_are_those_in_their_order():
 
 def test_readings_of_another_unit_are_named():
     prints = scalars([[-40.0, -60.0], [-50.0, -52.0], [-60.0, -45.0]], [[2.0, 3.0]] * 3)
-    with pytest.warns(ExtrapolationWarning, match="up to 40 dBm beyond all predicted ones; check their unit"):
+    with pytest.warns(ExtrapolationWarning, match="up to 40 dB beyond all predicted ones; check their unit"):
         gaigs.locate(prints, [1e-5, -50.0])
     gaigs.locate(prints, [-30.0, math.nan])
 

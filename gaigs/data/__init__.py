@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gaigs.antenna import Receiver
+from gaigs.antenna import Receiver, lacking
 from gaigs.data.doubts import doubts
 from gaigs.data.gateways import estimate_place
 from gaigs.geometry import Frame, Pose
@@ -207,6 +207,8 @@ def divide(links: Links, split: Mapping) -> Links:
         at = [f"at {band.min():.7g} .. {band.max():.7g} GHz" for band in bands]
         parts = replace(parts, name=f"{parts.name}, trained {at[0]}, tested {at[1]}")
     links = replace(links, split=parts)
+    if isinstance(links.task, Csi):
+        check_elements(links)
     if links.uncertainties is not None:
         links = with_places(only_trained(links))
     remarks, phase = [links.remarks], getattr(links.task, "phase", "known")
@@ -217,6 +219,24 @@ def divide(links: Links, split: Mapping) -> Links:
         log.warning(doubt)
         remarks.append(doubt)
     return replace(links, remarks="; ".join(filter(None, remarks)))
+
+
+def check_elements(links: Links) -> None:
+    """A ``ValueError`` unless channels have the elements of their receivers' arrays, and are 0 at all others."""
+    count, sizes = links.task.shape[0], [len(receiver.array) for receiver in links.receivers]
+    if max(sizes) != count:
+        raise ValueError(
+            f"the task has {count} elements, and the largest array of the receivers {max(sizes)}; "
+            "give Csi the number of elements of the largest one"
+        )
+    for part in torch.arange(len(links) if min(sizes) < count else 0).split(1024):
+        own = links.query.receivers[part]
+        if (beyond := (links.labels[part] != 0).any(2) & lacking(links.receivers, own, count)).any():
+            link, element = beyond.nonzero()[0].tolist()
+            raise ValueError(
+                f"labels must be 0 at elements that an array lacks; that of link {int(part[link])} is not at element "
+                f"{element}, and {links.receivers[int(own[link])].name} has {sizes[int(own[link])]} elements"
+            )
 
 
 def phase_doubts(links: Links) -> list[str]:
@@ -272,7 +292,7 @@ def only_trained(links: Links) -> Links:
     kept = (number[links.query.receivers] >= 0).nonzero()[:, 0]
     some = lambda values: None if values is None else values[kept]
     parts = {name: torch.isin(kept, part).nonzero()[:, 0] for name, part in links.split.parts().items()}
-    if len(links.split.test) and not len(parts["test"]):
+    if len(links.split.test) and not len(parts["test"]) and len(links) < 1.5 * len(links.receivers):
         each = f"{len(links.receivers)} receivers have {len(links)} links"
         raise ValueError(
             f"{each}, and those with test links none to train on: models are learnt for each receiver\n"

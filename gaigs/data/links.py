@@ -13,7 +13,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from gaigs import configuration
-from gaigs.antenna import Array, Receiver, lacking
+from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, divide, load, shortened
 from gaigs.data.readings import loud_remark, marks_of
 from gaigs.geometry import Frame, Pose
@@ -107,7 +107,7 @@ def from_arrays(
         raise ValueError(f"bandwidth must be 0 Hz or more, and finite, got {bandwidth}")
     has_parts = test_rows is not None or train_rows is not None
     split = split or ("official" if has_parts else "random")
-    if isinstance(split, str):
+    if split in registry("split").names():
         fields, has = [*inspect.signature(from_arrays).parameters][:-1], [*registry("split").options(split)]
         if unknown := [key for key in options if key.rpartition(".")[2] not in has]:
             near, known = suggest(unknown[0], [*fields, *has]), ", ".join(fields)
@@ -168,8 +168,6 @@ def from_arrays(
     if not heard.all():
         remarks.append(f"{int((~heard).sum())} links were not heard and are left out")
     check_range(task, labels, "labels")
-    if isinstance(task, Csi):
-        _check_elements(task, labels.where(heard[:, None, None], 0), receivers, index)
     if isinstance(task, Rssi):
         doubtful = loud_remark(labels[heard].tolist())
         marks = {mark: int((labels == mark).sum()) for mark in marks_of(labels[:, None].numpy())}
@@ -188,11 +186,6 @@ def from_arrays(
         for carrier in carriers.unique().tolist():
             check_carrier("frequency", carrier)
     own, (distinct, sites) = rows[heard], number_places(places.tolist())
-    if len(distinct) == 1 < len(own):
-        raise ValueError(
-            "transmitters all stand at one place; if receivers move, give their places as transmitters, and the fixed "
-            "end as receiver: a channel is the same both ways"
-        )
     parts: Any = None
     if has_parts:
         testing = _rows("test_rows", test_rows, count)
@@ -217,7 +210,15 @@ def from_arrays(
         frame=frame,
         remarks="; ".join(remarks),
     )
-    links = divide(made, config)
+    try:
+        links = divide(made, config)
+    except ValueError:
+        if len(distinct) > 1 or most == 1:
+            raise
+        raise ValueError(
+            "transmitters all stand at one place; if receivers move, give their places as transmitters, and the fixed "
+            "end as receiver: a channel is the same both ways"
+        ) from None
     if left := [name for name in names if name not in {receiver.name for receiver in links.receivers}]:
         log.warning("receivers without a training link are left out: %s\nname the others by name", shortened(left))
     return links
@@ -234,20 +235,3 @@ def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
         given = reprlib.repr(values)
         raise ValueError(f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got {given}")
     return numbers.unique()
-
-
-def _check_elements(task: Csi, labels: Tensor, receivers: Sequence[Receiver], index: Tensor) -> None:
-    """A ``ValueError`` unless channels have the elements of their receivers' arrays, and are 0 at all others."""
-    sizes = torch.tensor([len(receiver.array) for receiver in receivers])
-    if sizes.max() != task.elements:
-        raise ValueError(
-            f"the task has {task.elements} elements, and the largest array of the receivers {sizes.max()}; "
-            "give Csi the number of elements of the largest one"
-        )
-    absent = lacking(receivers, index, task.elements)
-    if (beyond := (labels != 0).any(2) & absent).any():
-        link, element = beyond.nonzero()[0].tolist()
-        raise ValueError(
-            f"labels must be 0 at elements that an array lacks; that of link {link} is not at element {element}, and "
-            f"{receivers[int(index[link])].name} has {sizes[index[link]]} elements"
-        )

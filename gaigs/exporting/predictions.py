@@ -66,10 +66,15 @@ def write_predictions(
         blank = lambda part: part if part is None or part.ndim < 3 else part.cpu().masked_fill(absent, math.nan)
         found, labels = Estimate(*map(blank, found)), blank(labels)
     variables = tabulate(query, scene, task, found, labels)
+    if scene.frame is not None:
+        log.info("easting and northing are those of EPSG:%d", scene.frame.epsg)
     if file.suffix.lower() == ".csv":
         write_csv(file, variables, absent.numpy())
         return [file]
-    write_netcdf(file, variables, {"title": f"{task.quantity} predicted by gaigs", "interval": interval})
+    about = {"title": f"{task.quantity} predicted by gaigs", "interval": interval}
+    if scene.frame is not None:
+        about |= {"frame_epsg": scene.frame.epsg, "frame_x": scene.frame.x, "frame_y": scene.frame.y}
+    write_netcdf(file, variables, about)
     return [file]
 
 
@@ -143,13 +148,15 @@ def write_csv(file: Path, variables: Mapping[str, Variable], absent: Bool[np.nda
     axes = {name: one.values.tolist() for name, one in variables.items() if one.dimensions == (name,)}
     links = {name: one.values.tolist() for name, one in variables.items() if name in LINK}
     values = {name: one.values for name, one in variables.items() if name not in axes | links}
-    shown = lambda value: value if isinstance(value, str) else f"{value:.{7 if abs(value) < 1e5 else 10}g}"
+    shown = lambda value, digits=7: value if isinstance(value, str) else f"{value:.{digits}g}"
+    digits = [10 if name in ("easting", "northing") else 7 for name in links]
     places = [*itertools.product(*([f"{number:.10g}" for number in axis] for axis in axes.values()))]
     with atomic_write(file) as part, part.open("w", encoding="utf-8", newline="") as text:
         rows = csv.writer(text, lineterminator="\n")
         rows.writerow([*links, *axes, *values])
         for number, link in enumerate(zip(*links.values(), strict=True)):
-            start, own = [*map(shown, link)], (map(shown, part[number].ravel().tolist()) for part in values.values())
+            start = [*map(shown, link, digits)]
+            own = (map(shown, part[number].ravel().tolist()) for part in values.values())
             numbers = zip(places, zip(*own, strict=True), strict=True)
             kept = ~absent[number].ravel()
             rows.writerows(

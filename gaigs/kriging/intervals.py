@@ -110,8 +110,8 @@ class Calibration:
             known: Links that the calibrated model knows.
         """
         errors = (task.align(labels, values) - values).abs() / _shaped(deviations, values)
+        exists = ~thin(_shaped(deviations, values)).isnan()
         errors, values = (thin(part) for part in (errors, values))
-        exists = ~errors.isnan()
         count = int(torch.cat((query.receivers, known.receivers)).max()) + 1
         heard = query.receivers.bincount(minlength=count)
         rows = query.receivers if heard.min() >= ENOUGH and count > 1 else torch.zeros_like(query.receivers)
@@ -178,7 +178,8 @@ class Calibration:
         half = scale * factors(self.quantiles.to(value.device)[own[:, None], bins, rank])
         std = scale * factors(self.sizes.to(value.device)[own[:, None], bins])
         if value.is_complex():
-            powers, errors = (part.abs().square().flatten(1).nansum(1) for part in (value, std))
+            exists = [part.masked_fill(std.isnan(), 0) for part in (value, std)]
+            powers, errors = (part.abs().square().flatten(1).sum(1) for part in exists)
             return Estimate(value, std, None, None, half, 10 * (powers / errors).log10())
         lower = torch.minimum(
             (value - half).clamp_min(self.lowest.item()), value

@@ -8,7 +8,6 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, overload
 
 import torch
@@ -40,7 +39,7 @@ class Prediction(NamedTuple):
     """
 
     value: Tensor
-    penalties: Mapping[str, Tensor] = MappingProxyType({})
+    penalties: Mapping[str, Tensor] = {}
 
 
 class Model(nn.Module):
@@ -323,7 +322,7 @@ class Model(nn.Module):
         if found is None and value.is_complex():
             found = value.abs().square().masked_fill(absent, math.nan).flatten(1).nanmean(1).sqrt()
         found = torch.ones(len(value), device=value.device) if found is None else found
-        if absent.any():
+        if isinstance(task, Csi) and min(len(receiver.array) for receiver in self.scene.receivers) < task.elements:
             of_numbers = found if found.ndim > 1 else found[:, None, None]
             found = of_numbers.expand(value.shape).masked_fill(absent, math.nan)
         return found

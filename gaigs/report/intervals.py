@@ -26,7 +26,8 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
         labels, predictions, deviations = (run[name] for name in ("labels", "prediction", "deviation"))
     labels = task.align(torch.from_numpy(labels), torch.from_numpy(predictions)).numpy()
     flat = lambda numbers: np.abs(numbers).astype(float).reshape(len(labels), -1)
-    errors, stated = (np.sqrt((flat(part) ** 2).mean(1)) for part in (predictions - labels, deviations))
+    exists = ~np.isnan(flat(deviations))  # elements of the array
+    errors, stated = (np.sqrt(np.mean(flat(part) ** 2, 1, where=exists)) for part in (predictions - labels, deviations))
     parts = [part for part in np.array_split(np.argsort(stated), BINS) if len(part)]
     levels = np.linspace(0, 1, len(next(iter(shares.values()))) + 2)[1:-1]
     with rc_context(STYLE):

@@ -63,7 +63,8 @@ def run(config: dict, folder: Path) -> dict | None:
 def model_of(folder: str | Path) -> Model:
     """The model of a checkpoint, or of a finished run: for a look-up fitted anew to the run's data."""
     if Path(folder).is_file():
-        return checkpoint.load(folder)
+        loaded: Any = checkpoint.load(folder)
+        return loaded
     folder, config = Path(folder), configuration_of(folder)
     warn_of_changes(folder, config["model"])
     if (folder / "best.ckpt").is_file():

@@ -17,6 +17,7 @@ from gaigs.kriging import scalar
 from gaigs.kriging.intervals import Calibration, Estimate, interval_scores, nearest, summarise_intervals
 from gaigs.model.kriging import Kriging
 from gaigs.query import Query
+from gaigs.report.intervals import intervals
 from gaigs.runs import evaluation
 from gaigs.task.csi import Csi
 from gaigs.testing import example_links
@@ -342,7 +343,7 @@ def test_kriging_does_not_know_a_single_group_of_validation_links():
     assert len(model.process.values) == len(known) == len(links.split.train)
 
 
-def test_elements_that_an_array_lacks_have_no_intervals_and_count_in_none():
+def test_elements_that_an_array_lacks_have_no_intervals_and_count_in_none(tmp_path):
     frequencies, rng = np.linspace(2.4e9, 2.48e9, 5), np.random.default_rng(0)
     places = rng.uniform([0.5, 0.5, 0.5], [6, 4, 2], (150, 3))
     pose = lambda x: Pose(torch.tensor([x, 2.0, 1.5]), torch.eye(3))
@@ -353,7 +354,10 @@ def test_elements_that_an_array_lacks_have_no_intervals_and_count_in_none():
         for image, gain in ((places, 1.0), (places * [-1, 1, 1], -0.5)):
             lengths = np.linalg.norm(image[:, None] - stand, axis=-1)[..., None]
             labels[:, number, : len(stand)] += gain / lengths * np.exp(-2j * np.pi * frequencies / 3e8 * lengths)
-    links = gaigs.links(task=Csi(4, frequencies), transmitters=places, receivers=receivers, labels=labels)
+    # In the order of the receivers: batches then have links of one array alone.
+    rows, index = np.tile(np.arange(150), 2), np.arange(2).repeat(150)
+    links = {"transmitters": places[rows], "receivers": receivers, "labels": labels[rows, index], "index": index}
+    links = gaigs.links(task=Csi(4, frequencies), **links)
     model, test = gaigs.train("friis", links), links.split.test
     found, held = model.predict(links.query[test], interval=0.9), []
     for number, count in enumerate((4, 1)):
@@ -365,3 +369,6 @@ def test_elements_that_an_array_lacks_have_no_intervals_and_count_in_none():
         assert inside[own][:, :count].double().mean() > 0.75, "it was 0 at the single antenna"
     scores = gaigs.evaluate(model, links).scores["friis"]
     torch.testing.assert_close(scores["interval_coverage_90"].mean().item(), np.mean(held))
+    evaluation.score({"friis": model}, {}, links, tmp_path)
+    right = intervals(tmp_path, links.task, "random").axes[1].lines[0].get_xydata()
+    assert np.isfinite(right).all()
