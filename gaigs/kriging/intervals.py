@@ -181,10 +181,9 @@ class Calibration:
             exists = [part.masked_fill(std.isnan(), 0) for part in (value, std)]
             powers, errors = (part.abs().square().flatten(1).sum(1) for part in exists)
             return Estimate(value, std, None, None, half, 10 * (powers / errors).log10())
-        lower = torch.minimum(
-            (value - half).clamp_min(self.lowest.item()), value
-        )  # a prediction may be below the least
-        return Estimate(value, std, lower, value + half)
+        lower = (value - half).clamp_min(self.lowest.item())
+        # Some models predict less than the least label.
+        return Estimate(value, std, torch.minimum(lower, value), value + half)
 
     def gives(self, level: float) -> bool:
         """True if every group has enough links for intervals of a level."""

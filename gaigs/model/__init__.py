@@ -319,6 +319,8 @@ class Model(nn.Module):
         absent = torch.zeros((), dtype=torch.bool, device=value.device)
         if isinstance(task, Csi):
             absent = lacking(self.scene.receivers, batch.query.receivers, task.elements)[..., None]
+            if found is not None and found.ndim == 1:  # over numbers of which those that are lacking have no part
+                found = found / (1 - absent.to(found).mean((1, 2))).sqrt()
         if found is None and value.is_complex():
             found = value.abs().square().masked_fill(absent, math.nan).flatten(1).nanmean(1).sqrt()
         found = torch.ones(len(value), device=value.device) if found is None else found
@@ -351,7 +353,8 @@ class OptionalMethods(Protocol):
         """The Gaussian process of a receiver's labels, which plans surveys."""
 
     def deviations(self, batch: Batch) -> Tensor:
-        """Standard deviations of the labels (b,), or of each of their numbers (b, *shape), but for a common factor."""
+        """Standard deviations of the labels (b,), root mean squares over all their numbers, or of each number
+        (b, *shape); but for a common factor."""
 
     def refit(self, links: Links) -> None:
         """As ``fit``, for some of the links of an earlier fit, whose choices may stay; it may be faster."""

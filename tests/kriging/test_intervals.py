@@ -367,6 +367,11 @@ def test_elements_that_an_array_lacks_have_no_intervals_and_count_in_none(tmp_pa
         assert found.radius[own][:, count:].isnan().all()
         assert found.snr_db[own].isfinite().all()
         assert inside[own][:, :count].double().mean() > 0.75, "it was 0 at the single antenna"
+    model.deviations = lambda batch: torch.ones(len(batch.query))  # over four elements, of which one array lacks three
+    batch = links.batch(test)
+    spread, own = model.spread(batch, model.evaluate(batch))[:, 0, 0], batch.query.receivers
+    torch.testing.assert_close(spread, torch.tensor([1.0, 2.0])[own])
+    del model.deviations
     scores = gaigs.evaluate(model, links).scores["friis"]
     torch.testing.assert_close(scores["interval_coverage_90"].mean().item(), np.mean(held))
     evaluation.score({"friis": model}, {}, links, tmp_path)
