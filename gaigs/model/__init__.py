@@ -315,18 +315,15 @@ class Model(nn.Module):
         By default 1, of channels the root mean square of each link's value. It is NaN at elements that a receiver's
         array lacks, which have no error.
         """
-        found, task = call_optional(self, "deviations", batch), self.scene.task
-        absent = torch.zeros((), dtype=torch.bool, device=value.device)
-        if isinstance(task, Csi):
-            absent = lacking(self.scene.receivers, batch.query.receivers, task.elements)[..., None]
-            if found is not None and found.ndim == 1:  # over numbers of which those that are lacking have no part
-                found = found / (1 - absent.to(found).mean((1, 2))).sqrt()
+        found, task, receivers = call_optional(self, "deviations", batch), self.scene.task, self.scene.receivers
         if found is None and value.is_complex():
-            found = value.abs().square().masked_fill(absent, math.nan).flatten(1).nanmean(1).sqrt()
+            found = value.abs().square().flatten(1).mean(1).sqrt()
         found = torch.ones(len(value), device=value.device) if found is None else found
-        if isinstance(task, Csi) and min(len(receiver.array) for receiver in self.scene.receivers) < task.elements:
-            of_numbers = found if found.ndim > 1 else found[:, None, None]
-            found = of_numbers.expand(value.shape).masked_fill(absent, math.nan)
+        if isinstance(task, Csi) and min(len(receiver.array) for receiver in receivers) < task.elements:
+            absent = lacking(receivers, batch.query.receivers, task.elements)[..., None]
+            if found.ndim == 1:  # over all numbers, of which those that are absent are 0
+                found = (found / (1 - absent.to(found).mean((1, 2))).sqrt())[:, None, None]
+            found = found.expand(value.shape).masked_fill(absent, math.nan)
         return found
 
 
