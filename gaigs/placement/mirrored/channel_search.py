@@ -383,7 +383,8 @@ class ChannelSearch(PlaneSearch):
     def seed(self, room: Room) -> Room:
         """The upright plane along the axes of a room that explains most alone, if there is any."""
         none, normals, trials = (room[0][:0], room[1][:0]), axes(room[0]), []
-        for plane in self.along(*none, normals[normals[:, 2].abs() < 0.01], 0.0):
+        walls, amid = self.along(*none, normals[normals[:, 2].abs() < 0.01], 0.0)
+        for plane in walls + amid:
             for moved, material in self.proposals(plane[None], 0, self.reach, 0.04, SLABS[::3]):
                 upright = moved * moved.new_tensor([1.0, 1.0, 0.0, 1.0]) / moved[:2].norm()
                 trials.append((upright[None], material[None]))
@@ -399,9 +400,9 @@ class ChannelSearch(PlaneSearch):
         while len(planes) < self.most:
             before = self.cost((planes, slabs))
             new = [plane for plane in others if not self.alike(planes, plane).any()]
-            for candidates in filter(None, (self.along(planes, slabs, axes(planes), LITTLE), new)):
-                found = self.with_best(planes, slabs, candidates)
-                if self.cost(found) < before - LITTLE / 2:  # more than what keeps a plane, which cost has counted
+            walls, amid = self.along(planes, slabs, axes(planes), LITTLE / 2)
+            for candidates, least in ((walls, 0.0), (amid, LITTLE / 2), (new, LITTLE / 2)):  # beside what keeps a plane
+                if candidates and self.cost(found := self.with_best(planes, slabs, candidates)) < before - least:
                     break
             else:
                 break
@@ -409,28 +410,58 @@ class ChannelSearch(PlaneSearch):
             log.info("%s, square to others", self.words(planes[-1]))
         return self.settled(planes, slabs, polishes=True) if len(planes) > count else (planes, slabs)
 
-    def along(self, planes, slabs, normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "4"]]:
-        """Planes with these normals that explain a share of what real strengths leave.
+    def along(self, planes, slabs, normals: Float[Tensor, "k 3"], least: float) -> list[list[Float[Tensor, "4"]]]:
+        """Planes with these normals that explain a share of what known paths leave, the best first.
 
-        At most four, the best first, and as many that have all places on one side, as walls have: planes amid the
-        places score higher by what is left of others.
+        At most four that have all places on one side, as walls have, and as many amid the places: these score higher by
+        what is left of others.
         """
         amid: list[tuple[float, Tensor]] = []
         walls: list[tuple[float, Tensor]] = []
         lines = self.grid(normals, 400, BEYOND)
-        rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
-        shares = [log_share(rest, receiver.flat) for receiver, rest in zip(self.many, rests, strict=True)]
-        least = least * torch.cat(shares).mean().exp().item()  # a share of what is left lowers its log by about as much
-        profiles = [self.profiles(*pair) for pair in zip(self.many, rests, strict=True)]
-        for line, scores in zip(lines, self.scores(self.many, profiles, lines), strict=True):
+        shares = self.beside(planes, slabs, lines.flatten(0, 1)).view(lines.shape[:2])
+        for line, scores in zip(lines, shares, strict=True):
             for plane in planes:
                 scores[self.alike(line, plane)] = 0
             heights = self.points.to(line) @ line[0, :3]
             is_wall = (line[:, 3] < heights.min()) | (line[:, 3] > heights.max())
             for found, own in ((amid, scores * ~is_wall), (walls, scores * is_wall)):
                 found += [(own[at].item(), line[at]) for at in maxima(own, 11)]
-        best = (sorted(found, key=lambda pair: -pair[0])[:4] for found in (amid, walls))
-        return [plane for found in best for score, plane in found if score > least]
+        best = (sorted(found, key=lambda pair: -pair[0])[:4] for found in (walls, amid))
+        return [[plane for share, plane in found if share > least] for found in best]
+
+    def beside(self, planes, slabs, tried: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
+        """Mean share of what known paths leave that one more image explains, 0 for a plane between the ends.
+
+        Only what the image adds to the known paths counts: the image in a wall behind the array resembles the direct
+        path. All strengths are free at each place; of few numbers, the known paths are single reflections, and real.
+        """
+        flat = lambda waves: torch.view_as_real(waves).flatten(-2)
+        parts, turns = self.some(planes)
+        sequences = self.sequences(planes) if self.numbers >= FEW else all_sequences(len(planes), 1)
+        shares, own = tried.new_zeros(len(tried)), torch.arange(64)[:, None]
+        for receiver, rest in zip(parts, self.rests(parts, turns, planes, slabs), strict=True):
+            known = receiver.reflected(planes, slabs, sequences)
+            known = flat(torch.cat((known, 1j * known), 1) if self.numbers >= FEW else known)
+            gram, left = _ridged(known @ known.mT, RIDGE), flat(rest)[..., None]
+            left = left - known.mT @ torch.linalg.solve(gram, known @ left)
+            powers = left.square().sum((1, 2)).clamp_min(torch.finfo(left.dtype).tiny)
+            for rows in torch.arange(len(tried)).split(64):
+                some = tried[rows].float()
+                heights = receiver.places @ some[:, :3].mT - some[:, 3]
+                outside = heights * (some[:, :3] @ receiver.position - some[:, 3]) > 0
+                waves = receiver.waves(receiver.images(some, own[: len(rows)])).to(torch.complex64)
+                waves = torch.cat((flat(waves), flat(1j * waves)), 1)
+                size = waves.square().sum(2)[:, : len(rows)]
+                waves = waves - torch.linalg.solve(gram, known @ waves.mT).mT @ known
+                (re, im), (right_re, right_im) = (
+                    (part.unflatten(1, (2, -1)).unbind(1)) for part in (waves, waves @ left)
+                )
+                a, b, d = (re * re).sum(2) + RIDGE * size, (re * im).sum(2), (im * im).sum(2) + RIDGE * size
+                u, v = right_re[..., 0], right_im[..., 0]
+                share = (d * u * u - 2 * b * u * v + a * v * v) / (a * d - b * b) / powers[:, None]
+                shares[rows] += (share * outside).sum(0)
+        return shares / sum(len(receiver.places) for receiver in parts)
 
     def with_best(self, planes, slabs, candidates: list[Float[Tensor, "4"]]) -> Room:
         """The planes with the best candidate."""
