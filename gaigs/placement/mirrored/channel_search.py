@@ -396,12 +396,13 @@ class ChannelSearch(PlaneSearch):
         Only offsets are searched and strengths are real, so fainter planes stand out from noise, and a floor from the
         direct path. All planes move a little whenever there is one more.
         """
-        count = len(planes)
+        count, many = len(planes), self.numbers >= FEW
         while len(planes) < self.most:
-            before = self.cost((planes, slabs))
+            before = self.cost((planes, slabs))  # counts LITTLE for each plane
             new = [plane for plane in others if not self.alike(planes, plane).any()]
-            walls, amid = self.along(planes, slabs, axes(planes), LITTLE / 2)
-            for candidates, least in ((walls, 0.0), (amid, LITTLE / 2), (new, LITTLE / 2)):  # beside what keeps a plane
+            walls, amid = self.along(planes, slabs, axes(planes), LITTLE / 2 if many else LITTLE)
+            trials = ((walls, 0.0), (amid, LITTLE / 2)) if many else ((walls + amid, LITTLE / 2),)
+            for candidates, least in (*trials, (new, LITTLE / 2)):
                 if candidates and self.cost(found := self.with_best(planes, slabs, candidates)) < before - least:
                     break
             else:
@@ -410,58 +411,59 @@ class ChannelSearch(PlaneSearch):
             log.info("%s, square to others", self.words(planes[-1]))
         return self.settled(planes, slabs, polishes=True) if len(planes) > count else (planes, slabs)
 
-    def along(self, planes, slabs, normals: Float[Tensor, "k 3"], least: float) -> list[list[Float[Tensor, "4"]]]:
-        """Planes with these normals that explain a share of what known paths leave, the best first.
+    def along(
+        self, planes, slabs, normals: Float[Tensor, "k 3"], least: float
+    ) -> tuple[list[Float[Tensor, "4"]], list[Float[Tensor, "4"]]]:
+        """Planes with these normals that explain a share of what is left, the best first.
 
         At most four that have all places on one side, as walls have, and as many amid the places: these score higher by
         what is left of others.
         """
-        amid: list[tuple[float, Tensor]] = []
         walls: list[tuple[float, Tensor]] = []
+        amid: list[tuple[float, Tensor]] = []
         lines = self.grid(normals, 400, BEYOND)
-        shares = self.beside(planes, slabs, lines.flatten(0, 1)).view(lines.shape[:2])
+        if self.numbers >= FEW:
+            shares = self.added(planes, lines.flatten(0, 1)).view(lines.shape[:2])
+        else:  # free strengths of the known paths would explain everything
+            rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
+            left = [log_share(rest, receiver.flat) for receiver, rest in zip(self.many, rests, strict=True)]
+            profiles = [self.profiles(*pair) for pair in zip(self.many, rests, strict=True)]
+            shares = self.scores(self.many, profiles, lines) / torch.cat(left).mean().exp()
         for line, scores in zip(lines, shares, strict=True):
             for plane in planes:
                 scores[self.alike(line, plane)] = 0
             heights = self.points.to(line) @ line[0, :3]
             is_wall = (line[:, 3] < heights.min()) | (line[:, 3] > heights.max())
-            for found, own in ((amid, scores * ~is_wall), (walls, scores * is_wall)):
+            for found, own in ((walls, scores * is_wall), (amid, scores * ~is_wall)):
                 found += [(own[at].item(), line[at]) for at in maxima(own, 11)]
-        best = (sorted(found, key=lambda pair: -pair[0])[:4] for found in (walls, amid))
-        return [[plane for share, plane in found if share > least] for found in best]
+        best = lambda found: [plane for share, plane in sorted(found, key=lambda pair: -pair[0])[:4] if share > least]
+        return best(walls), best(amid)
 
-    def beside(self, planes, slabs, tried: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
-        """Mean share of what known paths leave that one more image explains, 0 for a plane between the ends.
+    def added(self, planes: Float[Tensor, "w 4"], tried: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
+        """Mean share of what free strengths of known paths leave that one more image explains beside them.
 
-        Only what the image adds to the known paths counts: the image in a wall behind the array resembles the direct
-        path. All strengths are free at each place; of few numbers, the known paths are single reflections, and real.
+        The image in a wall behind the array resembles the direct path, so the residual hides it: only the part of its
+        wave that known paths do not explain counts, in power too. 0 for a plane between the ends.
         """
-        flat = lambda waves: torch.view_as_real(waves).flatten(-2)
-        parts, turns = self.some(planes)
-        sequences = self.sequences(planes) if self.numbers >= FEW else all_sequences(len(planes), 1)
-        shares, own = tried.new_zeros(len(tried)), torch.arange(64)[:, None]
-        for receiver, rest in zip(parts, self.rests(parts, turns, planes, slabs), strict=True):
-            known = receiver.reflected(planes, slabs, sequences)
-            known = flat(torch.cat((known, 1j * known), 1) if self.numbers >= FEW else known)
-            gram, left = _ridged(known @ known.mT, RIDGE), flat(rest)[..., None]
-            left = left - known.mT @ torch.linalg.solve(gram, known @ left)
-            powers = left.square().sum((1, 2)).clamp_min(torch.finfo(left.dtype).tiny)
+        total, count = tried.new_zeros(len(tried)), 0
+        for receiver in self.some(planes)[0]:
+            known = receiver.waves(receiver.images(planes.float(), self.sequences(planes)))
+            if known.shape[1] >= known.shape[2]:
+                continue
+            inverse = torch.linalg.solve(_ridged(known.conj() @ known.mT, RIDGE), known.conj())
+            rest = receiver.flat[..., None] - known.mT @ (inverse @ receiver.flat[..., None])
+            power = rest.abs().square().sum((1, 2)).clamp_min(torch.finfo(torch.float32).tiny)
+            count += len(rest)
             for rows in torch.arange(len(tried)).split(64):
-                some = tried[rows].float()
-                heights = receiver.places @ some[:, :3].mT - some[:, 3]
-                outside = heights * (some[:, :3] @ receiver.position - some[:, 3]) > 0
-                waves = receiver.waves(receiver.images(some, own[: len(rows)])).to(torch.complex64)
-                waves = torch.cat((flat(waves), flat(1j * waves)), 1)
-                size = waves.square().sum(2)[:, : len(rows)]
-                waves = waves - torch.linalg.solve(gram, known @ waves.mT).mT @ known
-                (re, im), (right_re, right_im) = (
-                    (part.unflatten(1, (2, -1)).unbind(1)) for part in (waves, waves @ left)
-                )
-                a, b, d = (re * re).sum(2) + RIDGE * size, (re * im).sum(2), (im * im).sum(2) + RIDGE * size
-                u, v = right_re[..., 0], right_im[..., 0]
-                share = (d * u * u - 2 * b * u * v + a * v * v) / (a * d - b * b) / powers[:, None]
-                shares[rows] += (share * outside).sum(0)
-        return shares / sum(len(receiver.places) for receiver in parts)
+                normals, offsets = tried[rows, :3].float(), tried[rows, 3].float()
+                heights = receiver.places @ normals.mT - offsets
+                waves = receiver.waves(receiver.places[:, None] - 2 * heights[..., None] * normals)
+                size = waves.abs().square().sum(2)
+                waves = waves - (inverse @ waves.mT).mT @ known
+                own = waves.abs().square().sum(2) + RIDGE * size
+                share = (waves.conj() @ rest)[..., 0].abs().square() / own / power[:, None]
+                total[rows] += (share * (heights * (normals @ receiver.position - offsets) > 0)).sum(0)
+        return total / max(count, 1)
 
     def with_best(self, planes, slabs, candidates: list[Float[Tensor, "4"]]) -> Room:
         """The planes with the best candidate."""

@@ -288,34 +288,33 @@ def test_walls_are_tried_beside_planes_amid_the_places(monkeypatch):
     own, normal = search(links), torch.tensor([[1.0, 0, 0]]).double()
     wall = float(own.points[:, 0].max()) + 0.3
     peaks = torch.tensor([[-1.5, 1.0], [0.0, 0.9], [1.5, 0.8], [wall, 0.5]]).double()
-    share = lambda _, __, grid: (peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()).sum(-1)
-    monkeypatch.setattr(own, "beside", share)
+    share = lambda _, grid: (peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()).sum(-1)
+    monkeypatch.setattr(own, "added", share)
     walls, amid = own.along(torch.zeros(0, 4).double(), torch.zeros(0, 3).double(), normal, 0.1)
     assert [plane[3].item() for plane in walls] == pytest.approx([wall], abs=0.03)
     assert [plane[3].item() for plane in amid] == pytest.approx([-1.5, 0.0], abs=0.03)
 
 
-@pytest.mark.parametrize("numbers", [10, 100])
-def test_an_image_counts_by_what_it_adds_to_known_paths(numbers, monkeypatch):
-    """Least squares with and without the image; known strengths are free where a channel has many numbers."""
-    monkeypatch.setattr(channel_search, "RIDGE", 1e-7)
-    links, planes = room(walls=np.array([WALL, FLOOR]))
-    own = search(links)
-    own.numbers = numbers
+def test_an_image_counts_by_what_it_adds_to_known_paths():
+    """Least squares with and without the image, of two receivers with different arrays and some of the places each."""
+    links, planes = room(walls=np.array([WALL, FLOOR]), receivers=2, count=61)
+    links.labels[:, :, 5:] *= 1j
+    own = ChannelSearch(links, -1, True, order=2, most=2, start=torch.zeros(0, 4))
     planes = seen_from(planes, own.middle)
-    known, slabs = planes[:1], channel_search.SLABS[:1]
-    tried = torch.cat((planes[1:], planes.new_tensor([[0.6, 0.8, 0.0, -3.0]])))
-    shares = own.beside(known, slabs, tried)
-    (part,), _ = own.some(known)
-    signs = [1, 1j] if numbers == 100 else [1]
-    columns = part.reflected(known, slabs, torch.tensor([[-1], [0]])).numpy()
-    columns = np.concatenate([sign * columns for sign in signs], 1)
-    for plane, share in zip(tried, shares, strict=True):
-        image = part.waves(part.images(plane[None].float(), torch.tensor([[0]]))).numpy()
-        expected = []
-        for known_waves, own_wave, channel in zip(columns, image, part.flat.numpy(), strict=True):
-            parts = lambda waves: np.concatenate((waves.real, waves.imag), -1).astype(float)
-            left = lambda waves: np.linalg.lstsq(parts(waves).T, parts(channel), rcond=None)[1].item()  # noqa: B023
-            both = np.concatenate((known_waves, own_wave, 1j * own_wave))
-            expected.append(1 - left(both) / left(known_waves))
-        assert share.item() == pytest.approx(np.mean(expected), abs=0.01)
+    others = planes.new_tensor([[0.6, 0.8, 0.0, -3.0], [0.0, 1.0, 0.0, 0.0]])
+    tried = torch.cat((planes[1:], others, planes.repeat(32, 1)))
+    shares, expected = own.added(planes[:1], tried), []
+    for part in own.some(planes[:1])[0]:
+        waves = lambda images, part=part: part.waves(images.float()).to(torch.complex128).numpy()
+        places, normals = part.places.double(), tried[:, :3]
+        heights = places @ normals.mT - tried[:, 3]
+        outside = heights * (normals @ part.position.double() - tried[:, 3]) > 0
+        images = places[:, None] - 2 * heights[..., None] * normals
+        known, images = waves(torch.stack((places, images[:, 3]), 1)), waves(images)
+        for row, channel in enumerate(part.flat.to(torch.complex128).numpy()):
+            fitted = lambda columns, channel=channel: columns.T @ np.linalg.lstsq(columns.T, channel, rcond=1e-4)[0]
+            left = lambda columns, channel=channel: np.linalg.norm(channel - fitted(columns)) ** 2  # noqa: B023
+            after = [left(np.concatenate((known[row], wave[None]))) for wave in images[row]]
+            expected.append((1 - np.array(after) / left(known[row])) * outside[row].numpy())
+    np.testing.assert_allclose(shares, np.mean(expected, 0), rtol=0, atol=0.005)
+    assert 0.1 < shares.max()
