@@ -393,8 +393,8 @@ class ChannelSearch(PlaneSearch):
     def grown(self, planes, slabs, others: Float[Tensor, "v 4"] | tuple[()] = ()) -> Room:
         """The planes, and further ones along the axes of the room or, where none is left, near others.
 
-        Only offsets are searched and strengths are real, so fainter planes stand out from noise, and a floor from the
-        direct path. All planes move a little whenever there is one more.
+        Only offsets are searched, so fainter planes stand out from noise, and walls behind the array from the direct
+        path. Walls go first, and stay for less. All planes move a little whenever there is one more.
         """
         count, many = len(planes), self.numbers >= FEW
         while len(planes) < self.most:
