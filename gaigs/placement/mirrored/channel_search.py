@@ -394,14 +394,15 @@ class ChannelSearch(PlaneSearch):
         """The planes, and further ones along the axes of the room or, where none is left, near others.
 
         Only offsets are searched, so fainter planes stand out from noise, and walls behind the array from the direct
-        path. Walls go first, and stay for less. All planes move a little whenever there is one more.
+        path. Walls go first, and stay for less, unless channels have few numbers, which chance explains. All planes
+        move a little whenever there is one more.
         """
-        count, many = len(planes), self.numbers >= FEW
+        count, walls_first = len(planes), self.numbers >= FEW
         while len(planes) < self.most:
             before = self.cost((planes, slabs))  # counts LITTLE for each plane
             new = [plane for plane in others if not self.alike(planes, plane).any()]
-            walls, amid = self.along(planes, slabs, axes(planes), LITTLE / 2 if many else LITTLE)
-            trials = ((walls, 0.0), (amid, LITTLE / 2)) if many else ((walls + amid, LITTLE / 2),)
+            walls, amid = self.along(planes, slabs, axes(planes), LITTLE / 2 if walls_first else LITTLE)
+            trials = ((walls, 0.0), (amid, LITTLE / 2)) if walls_first else ((walls + amid, LITTLE / 2),)
             for candidates, least in (*trials, (new, LITTLE / 2)):
                 if candidates and self.cost(found := self.with_best(planes, slabs, candidates)) < before - least:
                     break
@@ -423,7 +424,7 @@ class ChannelSearch(PlaneSearch):
         amid: list[tuple[float, Tensor]] = []
         lines = self.grid(normals, 400, BEYOND)
         if self.numbers >= FEW:
-            shares = self.added(planes, lines.flatten(0, 1)).view(lines.shape[:2])
+            shares = self.added_shares(planes, lines.flatten(0, 1)).view(lines.shape[:2])
         else:  # free strengths of the known paths would explain everything
             rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
             left = [log_share(rest, receiver.flat) for receiver, rest in zip(self.many, rests, strict=True)]
@@ -439,8 +440,8 @@ class ChannelSearch(PlaneSearch):
         best = lambda found: [plane for share, plane in sorted(found, key=lambda pair: -pair[0])[:4] if share > least]
         return best(walls), best(amid)
 
-    def added(self, planes: Float[Tensor, "w 4"], tried: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
-        """Mean share of what free strengths of known paths leave that one more image explains beside them.
+    def added_shares(self, planes: Float[Tensor, "w 4"], tried: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
+        """Mean share, 0 to 1, of what free strengths of known paths leave that one more image explains beside them.
 
         The image in a wall behind the array resembles the direct path, so the residual hides it: only the part of its
         wave that known paths do not explain counts, in power too. 0 for a plane between the ends.

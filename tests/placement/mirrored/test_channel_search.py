@@ -289,7 +289,7 @@ def test_walls_are_tried_beside_planes_amid_the_places(monkeypatch):
     wall = float(own.points[:, 0].max()) + 0.3
     peaks = torch.tensor([[-1.5, 1.0], [0.0, 0.9], [1.5, 0.8], [wall, 0.5]]).double()
     share = lambda _, grid: (peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()).sum(-1)
-    monkeypatch.setattr(own, "added", share)
+    monkeypatch.setattr(own, "added_shares", share)
     walls, amid = own.along(torch.zeros(0, 4).double(), torch.zeros(0, 3).double(), normal, 0.1)
     assert [plane[3].item() for plane in walls] == pytest.approx([wall], abs=0.03)
     assert [plane[3].item() for plane in amid] == pytest.approx([-1.5, 0.0], abs=0.03)
@@ -303,7 +303,7 @@ def test_an_image_counts_by_what_it_adds_to_known_paths():
     planes = seen_from(planes, own.middle)
     others = planes.new_tensor([[0.6, 0.8, 0.0, -3.0], [0.0, 1.0, 0.0, 0.0]])
     tried = torch.cat((planes[1:], others, planes.repeat(32, 1)))
-    shares, expected = own.added(planes[:1], tried), []
+    shares, expected = own.added_shares(planes[:1], tried), []
     for part in own.some(planes[:1])[0]:
         waves = lambda images, part=part: part.waves(images.float()).to(torch.complex128).numpy()
         places, normals = part.places.double(), tried[:, :3]
