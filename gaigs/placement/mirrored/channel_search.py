@@ -43,9 +43,15 @@ later; a few too many cost time alone."""
 DROP = 0.5
 """Fall of the mean log of the power that is left, by a true plane behind others: false ones reach 0.3."""
 
-LITTLE = 0.1
-"""A plane is false if the mean log of the power that is left rises by less than this without it; of true ones it rises
-by 0.14 and more. Two tilted planes may share what one true plane explains."""
+PRICE = 0.02
+"""Least fall of the mean log of what neighbours do not predict by a true plane: walls have 0.05 and more, false planes
+up to 0.02, furniture 0.01 to 0.06."""
+
+NEIGHBOURS, TESTED = 8, 250
+"""Places whose strengths predict a place, and most places that are predicted."""
+
+SMALL = 0.05
+"""Least share of what is left that a candidate along the room's axes explains."""
 
 BEYOND = 0.3
 """Largest distance of a plane from all transmitters and receivers [diagonals of the room]."""
@@ -187,8 +193,8 @@ class ChannelSearch(PlaneSearch):
     best candidate is refined by variable projection, together with the planes before it: strengths of paths are free at
     each place, so neither phases nor blockage are assumed. Then phases count: a periodogram over offset and two tilts
     proposes planes and slabs whose reflections have like phases at all places, and the residual decides, with strengths
-    that are real and not negative. It sees delays too, so it tells planes half a wavelength apart. Planes that explain
-    hardly anything are dropped, and what they explained is searched anew. Where planes are tilted, or walls known, a
+    that are real and not negative. It sees delays too, so it tells planes half a wavelength apart. Planes with which
+    neighbouring places do not predict each other better are dropped, and what they explained is searched anew. Where planes are tilted, or walls known, a
     second room has walls along the axes of coordinates, see ``aligned``. At last the room grows along its axes, which
     shows planes that hide behind the direct path.
 
@@ -236,11 +242,9 @@ class ChannelSearch(PlaneSearch):
         # Free strengths may find tilted planes in place of upright ones, or none, and move known walls away.
         if not len(best[0]) or (self.numbers < FEW and (len(self.start) or not is_square(best[0]))):
             walls = self.aligned()
-            left = lambda room: self.in_common(self.many, room[0], room[1], self.order)[0]
-            if len(walls[0]) and left(walls) < left(best):
+            if len(walls[0]) and self.cost(walls) < self.cost(best):
                 moved = self.without_false(*self.grown(*self.settled(*walls, polishes=True)))
-                by_chance = CHANCE / sum(len(receiver.places) for receiver in self.many)
-                return moved if left(moved) < (1 - by_chance) * left(walls) else walls
+                return min(walls, moved, key=self.cost)
         if not len(best[0]):
             return best
         if not is_square(best[0]):
@@ -254,8 +258,45 @@ class ChannelSearch(PlaneSearch):
         return self.without_false(*self.grown(*best))
 
     def cost(self, room: Room) -> float:
-        """What is left, and the least that each plane must explain."""
-        return self.left(*self.some(room[0]), *room).item() + LITTLE * len(room[0])
+        """Mean log of the share of power that is left where each place has the strengths of others near it; a price of
+        planes is added.
+
+        Strengths vary little from place to place. A false plane that explains one place by chance fails at the next.
+        """
+        planes, slabs = room
+        sequences, shares = self.sequences(planes), []
+        for receiver, phase, (rows, targets, near) in zip(
+            self.receivers, self.phases(planes, self.receivers), self.neighbours, strict=True
+        ):
+            part = receiver.some(rows, thinned(receiver)).single()
+            turn = (phase if len(phase) == 1 else phase[rows])[:, None].to(part.flat)
+            channels, power = part.flat * turn.conj(), part.flat.abs().square().sum(1)[:, None, None]
+            waves = part.reflected(planes, slabs, sequences)
+            weights = torch.where(power > 0, 1 / power, 0)  # silent at these subcarriers
+            gram = weights * (waves.conj() @ waves.mT).real
+            right = weights * (waves.conj() @ channels[..., None]).real
+            strengths = real_strengths(_ridged(gram[near].sum(1), RIDGE), right[near].sum(1))
+            found, channels = (strengths.mT.to(waves) @ waves[targets])[:, 0], channels[targets]
+            if not self.common:
+                channels = in_phase(channels, found)
+            shares.append(log_share(channels - found, channels))
+        return torch.cat(shares).mean().item() + PRICE * len(planes)
+
+    @cached_property
+    def neighbours(self) -> list[tuple[Int[Tensor, " p"], Int[Tensor, " t"], Int[Tensor, "t k"]]]:
+        """Of each receiver: places that count, which of these are predicted, and the nearest of these to each.
+
+        Nearest places are at least a wavelength away: closer ones share the interference of all paths.
+        """
+        found = []
+        for receiver in self.receivers:
+            targets = evenly(torch.arange(len(receiver.places)), max(8, TESTED // len(self.receivers)))
+            apart = torch.cdist(receiver.places[targets], receiver.places)
+            apart[apart < self.wavelength] = math.inf
+            near = apart.topk(min(NEIGHBOURS, apart.shape[1]), largest=False).indices
+            rows = torch.cat((targets, near.flatten())).unique()
+            found.append((rows, torch.searchsorted(rows, targets), torch.searchsorted(rows, near)))
+        return found
 
     # --- walls along the axes of coordinates ---
 
@@ -352,15 +393,10 @@ class ChannelSearch(PlaneSearch):
             for w, channel, power in zip(waves, channels, powers, strict=True):
                 gram = gram + ((w.conj() @ w.mT).real / power).sum(0, keepdim=True)
                 right = right + ((w.conj() @ channel[..., None]).real / power).sum(0, keepdim=True)
-            gram = _ridged(gram, 1e-6)
-            kept = (torch.linalg.solve(gram, right) >= 0).to(gram)  # slabs have the signs
-            gains = torch.linalg.solve(gram * kept * kept.mT + torch.diag_embed(1 - kept[..., 0]), right * kept)
-            gains = gains.mT.to(waves[0])
+            gains = real_strengths(_ridged(gram, 1e-6), right).mT.to(waves[0])  # slabs have the signs
             known = [(gains @ w)[:, 0] for w in waves]
             if not self.common:  # phases of the places follow what is known of them
-                for number, (one, channel) in enumerate(zip(known, channels, strict=True)):
-                    turn = (one * channel.conj()).sum(1, keepdim=True).sgn()
-                    channels[number] = torch.where(turn == 0, channel, channel * turn)
+                channels = [in_phase(*pair) for pair in zip(channels, known, strict=True)]
             rests = [channel - one for channel, one in zip(channels, known, strict=True)]
         shares = [rest.abs().square().sum(1) / power[:, 0, 0] for rest, power in zip(rests, powers, strict=True)]
         return torch.cat(shares).mean().item(), rests
@@ -394,17 +430,14 @@ class ChannelSearch(PlaneSearch):
         """The planes, and further ones along the axes of the room or, where none is left, near others.
 
         Only offsets are searched, so fainter planes stand out from noise, and walls behind the array from the direct
-        path. Walls go first, and stay for less, unless channels have few numbers, which chance explains. All planes
-        move a little whenever there is one more.
+        path. Walls go first. All planes move a little whenever there is one more.
         """
-        count, walls_first = len(planes), self.numbers >= FEW
+        count = len(planes)
         while len(planes) < self.most:
-            before = self.cost((planes, slabs))  # counts LITTLE for each plane
+            before = self.cost((planes, slabs))
             new = [plane for plane in others if not self.alike(planes, plane).any()]
-            walls, amid = self.along(planes, slabs, axes(planes), LITTLE / 2 if walls_first else LITTLE)
-            trials = ((walls, 0.0), (amid, LITTLE / 2)) if walls_first else ((walls + amid, LITTLE / 2),)
-            for candidates, least in (*trials, (new, LITTLE / 2)):
-                if candidates and self.cost(found := self.with_best(planes, slabs, candidates)) < before - least:
+            for candidates in (*self.along(planes, slabs, axes(planes), SMALL), new):
+                if candidates and self.cost(found := self.with_best(planes, slabs, candidates)) < before:
                     break
             else:
                 break
@@ -423,13 +456,7 @@ class ChannelSearch(PlaneSearch):
         walls: list[tuple[float, Tensor]] = []
         amid: list[tuple[float, Tensor]] = []
         lines = self.grid(normals, 400, BEYOND)
-        if self.numbers >= FEW:
-            shares = self.added_shares(planes, lines.flatten(0, 1)).view(lines.shape[:2])
-        else:  # free strengths of the known paths would explain everything
-            rests = self.rests(self.many, self.phases(planes, self.many), planes, slabs)
-            left = [log_share(rest, receiver.flat) for receiver, rest in zip(self.many, rests, strict=True)]
-            profiles = [self.profiles(*pair) for pair in zip(self.many, rests, strict=True)]
-            shares = self.scores(self.many, profiles, lines) / torch.cat(left).mean().exp()
+        shares = self.added_shares(planes, slabs, lines.flatten(0, 1)).view(lines.shape[:2])
         for line, scores in zip(lines, shares, strict=True):
             for plane in planes:
                 scores[self.alike(line, plane)] = 0
@@ -440,19 +467,22 @@ class ChannelSearch(PlaneSearch):
         best = lambda found: [plane for share, plane in sorted(found, key=lambda pair: -pair[0])[:4] if share > least]
         return best(walls), best(amid)
 
-    def added_shares(self, planes: Float[Tensor, "w 4"], tried: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
-        """Mean share, 0 to 1, of what free strengths of known paths leave that one more image explains beside them.
+    def added_shares(self, planes, slabs, tried: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
+        """Mean share, 0 to 1, of what known paths leave that one more image explains beside them.
 
         The image in a wall behind the array resembles the direct path, so the residual hides it: only the part of its
-        wave that known paths do not explain counts, in power too. 0 for a plane between the ends.
+        wave that known paths do not explain counts, in power too. Strengths of known paths are free, or real where free
+        ones would explain channels of few numbers. 0 for a plane between the ends.
         """
-        total, count = tried.new_zeros(len(tried)), 0
-        for receiver in self.some(planes)[0]:
-            known = receiver.waves(receiver.images(planes.float(), self.sequences(planes)))
-            if known.shape[1] >= known.shape[2]:
+        total, count, is_free = tried.new_zeros(len(tried)), 0, self.numbers >= FEW
+        taken = lambda x: x if is_free else x.real.to(x)
+        for receiver, turn in zip(*self.some(planes), strict=True):
+            known = receiver.reflected(planes, slabs, self.sequences(planes))
+            if known.shape[1] >= (1 if is_free else 2) * known.shape[2]:
                 continue
-            inverse = torch.linalg.solve(_ridged(known.conj() @ known.mT, RIDGE), known.conj())
-            rest = receiver.flat[..., None] - known.mT @ (inverse @ receiver.flat[..., None])
+            inverse = torch.linalg.solve(_ridged(taken(known.conj() @ known.mT), RIDGE), known.conj())
+            channels = (receiver.flat * turn[:, None].conj().to(receiver.flat))[..., None]
+            rest = channels - known.mT @ taken(inverse @ channels)
             power = rest.abs().square().sum((1, 2)).clamp_min(torch.finfo(torch.float32).tiny)
             count += len(rest)
             for rows in torch.arange(len(tried)).split(64):
@@ -460,20 +490,26 @@ class ChannelSearch(PlaneSearch):
                 heights = receiver.places @ normals.mT - offsets
                 waves = receiver.waves(receiver.places[:, None] - 2 * heights[..., None] * normals)
                 size = waves.abs().square().sum(2)
-                waves = waves - (inverse @ waves.mT).mT @ known
-                own = waves.abs().square().sum(2) + RIDGE * size
-                share = (waves.conj() @ rest)[..., 0].abs().square() / own / power[:, None]
+                strengths = (inverse @ waves.mT).mT
+                # The image's own phase is unknown: its wave and the one a quarter of a turn behind.
+                ahead, aside = waves - taken(strengths) @ known, 1j * waves - taken(1j * strengths) @ known
+                aa, bb = (part.abs().square().sum(2) + RIDGE * size for part in (ahead, aside))
+                ab = (ahead.conj() * aside).real.sum(2)
+                a, b = ((part.conj() @ rest)[..., 0].real for part in (ahead, aside))
+                share = (bb * a.square() - 2 * ab * a * b + aa * b.square()) / (aa * bb - ab.square()) / power[:, None]
                 total[rows] += (share * (heights * (normals @ receiver.position - offsets) > 0)).sum(0)
         return total / max(count, 1)
 
     def with_best(self, planes, slabs, candidates: list[Float[Tensor, "4"]]) -> Room:
-        """The planes with the best candidate."""
+        """The planes with the best candidate, which may not move to another plane; or the planes alone."""
         trials = []
         for plane in candidates:
             tried = torch.cat((planes, plane[None]))
             for moved, material in self.proposals(tried, len(planes), self.reach, 1e-4, SLABS[::3]):
-                trials.append((torch.cat((planes, moved[None])), torch.cat((slabs, material[None]))))
-        return self.polish(*self.least(trials)[0], 12, 5e-4, len(planes))
+                if not self.alike(planes, moved).any():
+                    trials.append((torch.cat((planes, moved[None])), torch.cat((slabs, material[None]))))
+        best = self.least(trials)
+        return self.polish(*best[0], 12, 5e-4, len(planes)) if best else (planes, slabs)
 
     def settled(self, planes, slabs, polishes: bool = False) -> Room:
         """Each plane once more at its best offset and tilt, as the others are known now."""
@@ -504,11 +540,10 @@ class ChannelSearch(PlaneSearch):
         """Planes of which each explains something that the others do not, and their slabs."""
         while len(planes) > len(self.start):
             without = [torch.arange(len(planes)) != k for k in range(len(self.start), len(planes))]
-            left = [self.left(*self.some(planes[kept]), planes[kept], slabs[kept]).item() for kept in without]
-            if min(left) - self.left(*self.some(planes), planes, slabs).item() > LITTLE:
+            best = min(((planes[kept], slabs[kept]) for kept in without), key=self.cost)
+            if self.cost(best) > self.cost((planes, slabs)):
                 break
-            kept = without[left.index(min(left))]
-            planes, slabs = self.polish(planes[kept], slabs[kept], 60, 3e-4)
+            planes, slabs = self.polish(*best, 60, 3e-4)
         return planes, slabs
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
@@ -695,8 +730,7 @@ class ChannelSearch(PlaneSearch):
         parts, turns = [], []
         for receiver, phase in zip(self.receivers, self.phases(planes, self.receivers), strict=True):
             every = slice(None, None, max(1, len(receiver.places) * len(self.receivers) // 100))
-            step = min(5, max(1, receiver.flat.shape[1] // 64))
-            parts.append(receiver.some(every, slice(None, None, step)).single())
+            parts.append(receiver.some(every, thinned(receiver)).single())
             turns.append(phase if len(phase) == 1 else phase[every])
         return parts, turns
 
@@ -786,9 +820,7 @@ class ChannelSearch(PlaneSearch):
             waves, signed = torch.cat((waves, 1j * waves[:, free]), 1), torch.cat((free, free[free]))
             rest = real_residual(waves, channels, signed)
             if not self.common:  # once more with the phase of each place that explains most
-                turn = ((channels - rest) * channels.conj()).sum(1, keepdim=True).sgn()
-                channels = torch.where(turn == 0, channels, channels * turn)  # 0 where nothing is explained
-                rest = real_residual(waves, channels, signed)
+                rest = real_residual(waves, in_phase(channels, channels - rest), signed)
             found.append(rest)
         return found
 
@@ -820,6 +852,17 @@ def one_of_each_place(receiver: ReceiverChannels) -> ReceiverChannels:
     return receiver.some(torch.tensor(sorted(first.values()), dtype=torch.long))
 
 
+def thinned(receiver: ReceiverChannels) -> slice:
+    """A fifth of the subcarriers, or as many as leave 64 numbers of a channel."""
+    return slice(None, None, min(5, max(1, receiver.flat.shape[1] // 64)))
+
+
+def in_phase(channels: Complex[Tensor, "b k"], known: Complex[Tensor, "b k"]) -> Complex[Tensor, "b k"]:
+    """Channels with the phase of what is known of each; their own where that is nothing."""
+    turn = (known * channels.conj()).sum(1, keepdim=True).sgn()
+    return torch.where(turn == 0, channels, channels * turn)
+
+
 def project(
     waves: Complex[Tensor, "b n k"], channels: Complex[Tensor, "b k"], ridge: float = RIDGE
 ) -> tuple[Complex[Tensor, "b k"], Complex[Tensor, "b n"]]:
@@ -834,10 +877,16 @@ def real_residual(
 ) -> Complex[Tensor, "b k"]:
     """Residual after the best real strengths; those that would be negative and are not ``signed`` are left out."""
     gram = _ridged((waves.conj() @ waves.mT).real, RIDGE)
-    right = (waves.conj() @ channels[..., None]).real
-    kept = ((torch.linalg.solve(gram, right) >= 0) | signed[:, None]).to(gram)
-    strengths = torch.linalg.solve(gram * kept * kept.mT + torch.diag_embed(1 - kept[..., 0]), right * kept)
+    strengths = real_strengths(gram, (waves.conj() @ channels[..., None]).real, signed)
     return channels - (strengths.mT.to(waves) @ waves)[:, 0]
+
+
+def real_strengths(
+    gram: Float[Tensor, "b n n"], right: Float[Tensor, "b n 1"], signed: Bool[Tensor, " n"] | bool = False
+) -> Float[Tensor, "b n 1"]:
+    """Solutions of linear systems; those that would be negative and are not ``signed`` are 0, and the others follow."""
+    kept = ((torch.linalg.solve(gram, right) >= 0) | torch.as_tensor(signed)[..., None]).to(gram)
+    return torch.linalg.solve(gram * kept * kept.mT + torch.diag_embed(1 - kept[..., 0]), right * kept)
 
 
 def log_share(part: Complex[Tensor, "b k"], whole: Complex[Tensor, "b k"]) -> Float[Tensor, " b"]:

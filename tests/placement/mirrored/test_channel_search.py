@@ -288,33 +288,75 @@ def test_walls_are_tried_beside_planes_amid_the_places(monkeypatch):
     own, normal = search(links), torch.tensor([[1.0, 0, 0]]).double()
     wall = float(own.points[:, 0].max()) + 0.3
     peaks = torch.tensor([[-1.5, 1.0], [0.0, 0.9], [1.5, 0.8], [wall, 0.5]]).double()
-    share = lambda _, grid: (peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()).sum(-1)
+    share = lambda _, __, grid: (peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()).sum(-1)
     monkeypatch.setattr(own, "added_shares", share)
     walls, amid = own.along(torch.zeros(0, 4).double(), torch.zeros(0, 3).double(), normal, 0.1)
     assert [plane[3].item() for plane in walls] == pytest.approx([wall], abs=0.03)
     assert [plane[3].item() for plane in amid] == pytest.approx([-1.5, 0.0], abs=0.03)
 
 
-def test_an_image_counts_by_what_it_adds_to_known_paths():
-    """Least squares with and without the image, of two receivers with different arrays and some of the places each."""
+@pytest.mark.parametrize("few", [0, 1000])
+def test_an_image_counts_by_what_it_adds_to_known_paths(few, monkeypatch):
+    """Least squares with and without the image, of two receivers with different arrays and some of the places each.
+
+    Known paths have complex strengths, or real ones with the phase of the direct path.
+    """
+    monkeypatch.setattr(channel_search, "FEW", few)
     links, planes = room(walls=np.array([WALL, FLOOR]), receivers=2, count=61)
     links.labels[:, :, 5:] *= 1j
     own = ChannelSearch(links, -1, True, order=2, most=2, start=torch.zeros(0, 4))
     planes = seen_from(planes, own.middle)
     others = planes.new_tensor([[0.6, 0.8, 0.0, -3.0], [0.0, 1.0, 0.0, 0.0]])
     tried = torch.cat((planes[1:], others, planes.repeat(32, 1)))
-    shares, expected = own.added_shares(planes[:1], tried), []
-    for part in own.some(planes[:1])[0]:
+    known_room = channel_search.half_spaces(planes[:1])
+    shares, expected = own.added_shares(*known_room, tried), []
+    stacked = lambda x: x if few == 0 else np.concatenate((x.real, x.imag), -1)
+    for part, turn in zip(*own.some(planes[:1]), strict=True):
         waves = lambda images, part=part: part.waves(images.float()).to(torch.complex128).numpy()
         places, normals = part.places.double(), tried[:, :3]
         heights = places @ normals.mT - tried[:, 3]
         outside = heights * (normals @ part.position.double() - tried[:, 3]) > 0
         images = places[:, None] - 2 * heights[..., None] * normals
-        known, images = waves(torch.stack((places, images[:, 3]), 1)), waves(images)
-        for row, channel in enumerate(part.flat.to(torch.complex128).numpy()):
+        known, images = part.reflected(*known_room, own.sequences(planes[:1])).to(torch.complex128), waves(images)
+        known = stacked(known.numpy())
+        both = (images,) if few == 0 else (images, 1j * images)
+        images = np.stack([stacked(wave) for wave in both], 2)
+        for row, channel in enumerate(stacked((part.flat * turn.conj()).to(torch.complex128).numpy())):
             fitted = lambda columns, channel=channel: columns.T @ np.linalg.lstsq(columns.T, channel, rcond=1e-4)[0]
             left = lambda columns, channel=channel: np.linalg.norm(channel - fitted(columns)) ** 2  # noqa: B023
-            after = [left(np.concatenate((known[row], wave[None]))) for wave in images[row]]
+            after = [left(np.concatenate((known[row], wave))) for wave in images[row]]
             expected.append((1 - np.array(after) / left(known[row])) * outside[row].numpy())
     np.testing.assert_allclose(shares, np.mean(expected, 0), rtol=0, atol=0.005)
     assert 0.1 < shares.max()
+
+
+@pytest.mark.parametrize("phases", [False, True])
+def test_cost_is_what_neighbours_do_not_predict(phases, monkeypatch):
+    """Non-negative least squares over the eight nearest places that are a wavelength away, by numpy; and a price."""
+    monkeypatch.setattr(channel_search, "RIDGE", 1e-7)
+    links, planes = room(walls=np.array([WALL]), receivers=2, count=61)
+    if phases:
+        links = replace(links, labels=turned(links.labels))
+    links.query.transmitters[4] = links.query.transmitters[2] + 0.01
+    own = ChannelSearch(links, -1, not phases, order=1, most=2, start=torch.zeros(0, 4))
+    known_room = channel_search.half_spaces(seen_from(planes, own.middle))
+    found, shares = own.phases(known_room[0], own.receivers), []
+    for receiver, turn in zip(own.receivers, found, strict=True):
+        waves = receiver.reflected(*known_room, own.sequences(known_room[0])).numpy()
+        channels = (receiver.flat * turn[:, None].conj()).numpy()
+        places = receiver.places.numpy()
+        for k, own_channel in enumerate(channels):
+            apart = np.linalg.norm(places - places[k], axis=1)
+            near = np.argsort(np.where(apart < own.wavelength, np.inf, apart))[:8]
+            size = np.linalg.norm(channels[near], axis=1)[:, None]
+            columns, right = (
+                (waves[near] / size[..., None]).swapaxes(0, 1).reshape(2, -1),
+                (channels[near] / size).ravel(),
+            )
+            strengths, _ = nnls(np.concatenate((columns.real, columns.imag), 1).T, np.r_[right.real, right.imag])
+            predicted = strengths @ waves[k]
+            if phases:
+                own_channel = own_channel * np.exp(1j * np.angle(np.vdot(own_channel, predicted)))
+            left = np.linalg.norm(own_channel - predicted) ** 2 / np.linalg.norm(own_channel) ** 2
+            shares.append(np.log(left + channel_search.FLOOR))
+    assert own.cost(known_room) == pytest.approx(np.mean(shares) + channel_search.PRICE, abs=1e-3)
