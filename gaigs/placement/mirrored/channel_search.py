@@ -194,9 +194,9 @@ class ChannelSearch(PlaneSearch):
     each place, so neither phases nor blockage are assumed. Then phases count: a periodogram over offset and two tilts
     proposes planes and slabs whose reflections have like phases at all places, and the residual decides, with strengths
     that are real and not negative. It sees delays too, so it tells planes half a wavelength apart. Planes with which
-    neighbouring places do not predict each other better are dropped, and what they explained is searched anew. Where planes are tilted, or walls known, a
-    second room has walls along the axes of coordinates, see ``aligned``. At last the room grows along its axes, which
-    shows planes that hide behind the direct path.
+    neighbouring places do not predict each other better are dropped, and what they explained is searched anew. Where
+    planes are tilted, or walls known, a second room has walls along the axes of coordinates, see ``aligned``. At last
+    the room grows along its axes, which shows planes that hide behind the direct path.
 
     Args:
         links: Their training links count; of the task ``csi``.
