@@ -265,12 +265,11 @@ class ChannelSearch(PlaneSearch):
         """
         planes, slabs = room
         sequences, shares = self.sequences(planes), []
-        for receiver, phase, (rows, targets, near) in zip(
-            self.receivers, self.phases(planes, self.receivers), self.neighbours, strict=True
-        ):
-            part = receiver.some(rows, thinned(receiver)).single()
-            turn = (phase if len(phase) == 1 else phase[rows])[:, None].to(part.flat)
-            channels, power = part.flat * turn.conj(), part.flat.abs().square().sum(1)[:, None, None]
+        phases = self.phases(planes, [part for part, *_ in self.neighbours])
+        for phase, (part, targets, near) in zip(phases, self.neighbours, strict=True):
+            part = part.some(slice(None), thinned(part)).single()
+            channels = part.flat * phase[:, None].conj().to(part.flat)
+            power = part.flat.abs().square().sum(1)[:, None, None]
             waves = part.reflected(planes, slabs, sequences)
             weights = torch.where(power > 0, 1 / power, 0)  # silent at these subcarriers
             gram = weights * (waves.conj() @ waves.mT).real
@@ -283,8 +282,8 @@ class ChannelSearch(PlaneSearch):
         return torch.cat(shares).mean().item() + PRICE * len(planes)
 
     @cached_property
-    def neighbours(self) -> list[tuple[Int[Tensor, " p"], Int[Tensor, " t"], Int[Tensor, "t k"]]]:
-        """Of each receiver: places that count, which of these are predicted, and the nearest of these to each.
+    def neighbours(self) -> list[tuple[ReceiverChannels, Int[Tensor, " t"], Int[Tensor, "t k"]]]:
+        """Of each receiver: the channels that count, which of these are predicted, and the nearest of these to each.
 
         Nearest places are at least a wavelength away: closer ones share the interference of all paths.
         """
@@ -295,7 +294,7 @@ class ChannelSearch(PlaneSearch):
             apart[apart < self.wavelength] = math.inf
             near = apart.topk(min(NEIGHBOURS, apart.shape[1]), largest=False).indices
             rows = torch.cat((targets, near.flatten())).unique()
-            found.append((rows, torch.searchsorted(rows, targets), torch.searchsorted(rows, near)))
+            found.append((receiver.some(rows), torch.searchsorted(rows, targets), torch.searchsorted(rows, near)))
         return found
 
     # --- walls along the axes of coordinates ---
