@@ -917,7 +917,8 @@ def maxima(scores: Float[Tensor, " k"], width: int) -> Int[Tensor, " n"]:
 
 def _ridged(gram: Tensor, ridge: float) -> Tensor:
     power = gram.diagonal(dim1=1, dim2=2).real.mean(1)
-    return gram + ridge * power[:, None, None] * torch.eye(gram.shape[-1], dtype=power.dtype)
+    power = torch.where(power > 0, power, 1)[:, None, None]  # nothing is heard: strengths are 0
+    return gram + ridge * power * torch.eye(gram.shape[-1], dtype=gram.real.dtype)
 
 
 def _materials(slabs: Float[Tensor, "*w 3"]) -> tuple[Complex[Tensor, "*w"], Float[Tensor, "*w"]]:

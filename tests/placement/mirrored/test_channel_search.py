@@ -360,3 +360,12 @@ def test_cost_is_what_neighbours_do_not_predict(phases, monkeypatch):
             left = np.linalg.norm(own_channel - predicted) ** 2 / np.linalg.norm(own_channel) ** 2
             shares.append(np.log(left + channel_search.FLOOR))
     assert own.cost(known_room) == pytest.approx(np.mean(shares) + channel_search.PRICE, abs=1e-3)
+
+
+def test_neighbours_may_be_silent_at_the_subcarriers_that_count():
+    links, planes = room(walls=np.array([WALL]))
+    links.labels[:, :, ::2] = 0
+    own = search(links)
+    rooms = [channel_search.half_spaces(seen_from(some, own.middle)) for some in (planes, planes[:0])]
+    own.receivers = [own.receivers[0].some(slice(None), slice(0, None, 2))]
+    assert all(math.isfinite(own.cost(some)) for some in rooms)
