@@ -266,7 +266,7 @@ class ChannelSearch(PlaneSearch):
         planes, slabs = room
         sequences, shares = self.sequences(planes), []
         phases = self.phases(planes, [part for part, *_ in self.neighbours])
-        for phase, (part, targets, near) in zip(phases, self.neighbours, strict=True):
+        for phase, (part, targets, near, counts) in zip(phases, self.neighbours, strict=True):
             part = part.some(slice(None), thinned(part)).single()
             channels = part.flat * phase[:, None].conj().to(part.flat)
             power = part.flat.abs().square().sum(1)[:, None, None]
@@ -274,27 +274,30 @@ class ChannelSearch(PlaneSearch):
             weights = torch.where(power > 0, 1 / power, 0)  # silent at these subcarriers
             gram = weights * (waves.conj() @ waves.mT).real
             right = weights * (waves.conj() @ channels[..., None]).real
-            strengths = real_strengths(_ridged(gram[near].sum(1), RIDGE), right[near].sum(1))
+            gram, right = ((counts[..., None, None] * some[near]).sum(1) for some in (gram, right))
+            strengths = real_strengths(_ridged(gram, RIDGE), right)
             found, channels = (strengths.mT.to(waves) @ waves[targets])[:, 0], channels[targets]
+            found = found * (power[targets, 0] > 0)  # a silent target says nothing
             if not self.common:
                 channels = in_phase(channels, found)
             shares.append(log_share(channels - found, channels))
         return torch.cat(shares).mean().item() + PRICE * len(planes)
 
     @cached_property
-    def neighbours(self) -> list[tuple[ReceiverChannels, Int[Tensor, " t"], Int[Tensor, "t k"]]]:
-        """Of each receiver: the channels that count, which of these are predicted, and the nearest of these to each.
+    def neighbours(self) -> list[tuple[ReceiverChannels, Int[Tensor, " t"], Int[Tensor, "t k"], Bool[Tensor, "t k"]]]:
+        """Of each receiver: channels, which of these are predicted, the nearest to each, and which of them count.
 
-        Nearest places are at least a wavelength away: closer ones share the interference of all paths.
+        Those at least a wavelength away do: closer ones share the interference of all paths.
         """
         found = []
-        for receiver in self.receivers:
+        for receiver in map(one_of_each_place, self.receivers):
             targets = evenly(torch.arange(len(receiver.places)), max(8, TESTED // len(self.receivers)))
             apart = torch.cdist(receiver.places[targets], receiver.places)
             apart[apart < self.wavelength] = math.inf
-            near = apart.topk(min(NEIGHBOURS, apart.shape[1]), largest=False).indices
+            apart, near = apart.topk(min(NEIGHBOURS, apart.shape[1]), largest=False)
             rows = torch.cat((targets, near.flatten())).unique()
-            found.append((receiver.some(rows), torch.searchsorted(rows, targets), torch.searchsorted(rows, near)))
+            targets, near = (torch.searchsorted(rows, some) for some in (targets, near))
+            found.append((receiver.some(rows), targets, near, apart.isfinite()))
         return found
 
     # --- walls along the axes of coordinates ---
