@@ -258,10 +258,11 @@ class ChannelSearch(PlaneSearch):
         return self.without_false(*self.grown(*best))
 
     def cost(self, room: Room) -> float:
-        """Mean log of the share of power that is left where each place has the strengths of others near it; a price of
-        planes is added.
+        """Mean log of the share of power that is left where each place has the strengths of others near it; planes cost.
 
         Strengths vary little from place to place. A false plane that explains one place by chance fails at the next.
+
+        Source: Stone, Cross-validatory choice and assessment of statistical predictions, 1974.
         """
         planes, slabs = room
         sequences, shares = self.sequences(planes), []
