@@ -258,7 +258,7 @@ class ChannelSearch(PlaneSearch):
         return self.without_false(*self.grown(*best))
 
     def cost(self, room: Room) -> float:
-        """Mean log of the share of power that is left where each place has the strengths of others near it; planes cost.
+        """Mean log of the share of power that strengths of the nearest places leave, and a price of the planes.
 
         Strengths vary little from place to place. A false plane that explains one place by chance fails at the next.
 
