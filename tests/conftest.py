@@ -10,6 +10,7 @@ import signal
 import sys
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
@@ -85,6 +86,14 @@ def files_read_once():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ConfigRepository, "load_config", once)
         yield
+
+
+@pytest.fixture
+def unchecked():
+    """For runs from end to end: a third of their time is checks of annotations, which tests of the parts have."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

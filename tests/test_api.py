@@ -26,6 +26,8 @@ from gaigs.propagation import bartlett
 from gaigs.registry import check_instance, configuration_of
 from gaigs.tokenizer.euclidean import EuclideanTokenizer
 
+pytestmark = pytest.mark.usefixtures("unchecked")
+
 OTHERS = [Algebra, GaussianSplatting, Model.predict, Model.save, project, bartlett]
 """Documented for notebooks beside the names of the package."""
 

@@ -25,7 +25,7 @@ from gaigs.processes import Stopped
 from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
 
-pytestmark = pytest.mark.usefixtures("files_read_once")
+pytestmark = pytest.mark.usefixtures("files_read_once", "unchecked")
 
 SMALL = (
     "tokenizer=euclidean",

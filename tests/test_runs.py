@@ -32,7 +32,7 @@ from gaigs.runs import evaluation
 from gaigs.testing import example_links
 from gaigs.training.descent import Descent
 
-pytestmark = pytest.mark.usefixtures("files_read_once")
+pytestmark = pytest.mark.usefixtures("files_read_once", "unchecked")
 
 SMALL = (
     "data.transmitters=30",

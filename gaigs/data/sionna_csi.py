@@ -24,12 +24,14 @@ def traced_room_csi(
     receiver: Sequence[float] | None = None,
     facing: Sequence[float] | None = None,
     heights: Sequence[float] | None = None,
+    diffraction: bool = True,
 ) -> Links:
     """Channels of transmitters at random places in a room, at each element of its 4 x 4 array.
 
-    Rooms, scenes, places, array and errors are those of ``sionna``, channels and other options those of
+    Rooms, scenes, places, array, diffraction and errors are those of ``sionna``, channels and other options those of
     ``synthetic_csi``.
     """
-    simulated = find_room(room, scene, "receiver", None if receiver is None else [receiver], facing, heights)
+    receivers = None if receiver is None else [receiver]
+    simulated = find_room(room, scene, "receiver", receivers, facing, heights, diffraction)
     links = simulate_channels(simulated, transmitters, frequency, bandwidth, subcarriers, seed, phase)
     return hold_out_band(links, band_train, band_test)

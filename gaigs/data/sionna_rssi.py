@@ -18,13 +18,15 @@ def traced_room_rssi(
     scene: str | None = None,
     receivers: Sequence[Sequence[float]] | None = None,
     heights: Sequence[float] | None = None,
+    diffraction: bool = True,
 ) -> Links:
     """Signal strength of transmitters of 0 dBm at random places in a room, at four gateways.
 
-    Rooms, scenes, places and errors are those of ``sionna``, readings and other options those of ``synthetic_rssi``.
+    Rooms, scenes, places, diffraction and errors are those of ``sionna``, readings and other options those of
+    ``synthetic_rssi``.
 
     Args:
         receivers: Positions of the gateways in the scene [m].
     """
-    simulated = find_room(room, scene, "receivers", receivers, None, heights)
+    simulated = find_room(room, scene, "receivers", receivers, None, heights, diffraction)
     return simulate_readings(simulated, transmitters, noise, sensitivity, seed)

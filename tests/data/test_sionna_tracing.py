@@ -88,6 +88,8 @@ def test_a_wave_bends_around_a_corner(tracer):
     half = np.array([0.5, -1.0, 0.0])  # from the receiver to the edge
     np.testing.assert_allclose(images, [receiver.numpy() + 2 * half], atol=1e-3)
     assert 0.01 < abs(gains[0]) < 0.5  # at the shadow's boundary it is half the field
+    with pytest.raises(ValueError, match="a path must lead"):
+        tracing.trace([block], receiver, place, FREQUENCY, tracing.DEPTH)
 
 
 @pytest.mark.parametrize("frequency", [1e8, 5e10, math.nan])
@@ -168,6 +170,7 @@ def test_paths_are_traced_once(traced, tmp_path):
         lambda patch: ("slanted", RECEIVER + 0.1, PLACE, FREQUENCY),
         lambda patch: ("slanted", RECEIVER, PLACE + 0.1, FREQUENCY),
         lambda patch: ("slanted", RECEIVER, PLACE, 5e9),
+        lambda patch: ("slanted", RECEIVER, PLACE, FREQUENCY, False),
         lambda patch: patch.setattr(tracing, "DEPTH", 2),
         lambda patch: patch.setattr(tracing, "find_packages", lambda: {"sionna-rt": "2.3.0"}),
     ],

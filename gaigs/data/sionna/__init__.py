@@ -37,6 +37,7 @@ def traced_room(
     receiver: Sequence[float] | None = None,
     facing: Sequence[float] | None = None,
     heights: Sequence[float] | None = None,
+    diffraction: bool = True,
 ) -> Links:
     """Spectra of transmitters at random places in a room; the official split tests on the last fifth of them.
 
@@ -48,6 +49,7 @@ def traced_room(
         receiver: Position of the array in the scene [m].
         facing: Point in the scene that the array faces [m]; None for the middle of all surfaces.
         heights: Lowest and highest z of transmitters in the scene [m]; None for 0.3 to 2 m above the lowest surface.
+        diffraction: False if edges bend no waves, as many tracers have it by default.
 
     Raises:
         FileNotFoundError: There is no such scene.
@@ -55,7 +57,8 @@ def traced_room(
         RuntimeError: There is no libLLVM that it can use.
         ValueError: An option is out of range, or the scene cannot be loaded.
     """
-    simulated = find_room(room, scene, "receiver", None if receiver is None else [receiver], facing, heights)
+    receivers = None if receiver is None else [receiver]
+    simulated = find_room(room, scene, "receiver", receivers, facing, heights, diffraction)
     return simulate_spectra(simulated, spectrum, transmitters, frequency, bandwidth, seed)
 
 
@@ -66,6 +69,7 @@ def find_room(
     receivers: Sequence[Sequence[float]] | None = None,
     facing: Sequence[float] | None = None,
     heights: Sequence[float] | None = None,
+    diffraction: bool = True,
 ) -> SimulatedRoom:
     """The traced room of a name or scene file, and receivers in the scene by the option of a name.
 
@@ -73,7 +77,7 @@ def find_room(
         ValueError: The name is unknown, or the scene or an option of it has a defect.
     """
     if scene is not None:
-        return find_scene(scene, option, receivers, facing, heights)
+        return find_scene(scene, option, receivers, facing, heights, diffraction)
     if given := [key for key, value in ((option, receivers), ("facing", facing), ("heights", heights)) if value]:
         raise ValueError(f"data.{given[0]} is an option of data.scene; rooms have their own")
     if name not in ROOMS:
@@ -86,7 +90,7 @@ def find_room(
         edges=edges(room.meshes()),
         place=lambda count, seed: place(room, count, seed),
         frequency_offsets=lambda bandwidth: frequency_offsets(room.meshes(), bandwidth),
-        respond=partial(respond_in_parts, room),
+        respond=partial(respond_in_parts, room, diffraction),
     )
 
 
@@ -96,6 +100,7 @@ def find_scene(
     receivers: Sequence[Sequence[float]] | None,
     target: Sequence[float] | None,
     heights: Sequence[float] | None,
+    diffraction: bool,
 ) -> SimulatedRoom:
     """The room of a scene file; options are those of ``find_room``."""
     positions = check_points(f"data.{option}", receivers)
@@ -111,15 +116,20 @@ def find_scene(
         edges=room.edges(),
         place=room.place,
         frequency_offsets=lambda bandwidth: sample_paths(bandwidth, float(np.linalg.norm(space.upper - space.lower))),
-        respond=partial(respond_in_parts, room),
+        respond=partial(respond_in_parts, room, diffraction),
     )
 
 
 def respond_in_parts(
-    room: MeshRoom | SceneFile, places: Tensor, receiver: Receiver, frequency: float, offsets: Tensor
+    room: MeshRoom | SceneFile,
+    diffraction: bool,
+    places: Tensor,
+    receiver: Receiver,
+    frequency: float,
+    offsets: Tensor,
 ) -> Sequence[Tensor]:
     """``respond`` for the traced paths, ``PART`` places at a time."""
-    paths = find_paths(room, receiver.pose.position, places, frequency)
+    paths = find_paths(room, receiver.pose.position, places, frequency, diffraction)
     return respond(paths, receiver, frequency, offsets).split(PART)
 
 

@@ -27,7 +27,11 @@ VERSION = 1
 
 
 def find_paths(
-    room: MeshRoom | SceneFile, receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
+    room: MeshRoom | SceneFile,
+    receiver: Float[Tensor, "3"],
+    transmitters: Float[Tensor, "b 3"],
+    frequency: float,
+    diffraction: bool = True,
 ) -> Paths:
     """The paths in a room, traced by ``tracing.trace`` the first time and read by ``keep`` afterwards."""
     surfaces: dict[str, object] = (
@@ -45,12 +49,15 @@ def find_paths(
         "frequency": float(frequency),
         "settings": [tracing.DEPTH, tracing.RAYS, tracing.CANDIDATES, tracing.CHUNK, tracing.WEAKEST],
     }
+    if not diffraction:
+        key["diffraction"] = False
+    reflections = None if diffraction else tracing.DEPTH
 
     def trace() -> dict[str, np.ndarray]:
         if isinstance(room, SceneFile):
-            paths = tracing.trace_scene(room.load(frequency), receiver, transmitters)
+            paths = tracing.trace_scene(room.load(frequency), receiver, transmitters, reflections=reflections)
         else:
-            paths = tracing.trace(room.meshes(), receiver, transmitters, frequency)
+            paths = tracing.trace(room.meshes(), receiver, transmitters, frequency, reflections)
         return {"images": paths.images.numpy().astype(np.float32), "gains": paths.gains.numpy().astype(np.complex64)}
 
     arrays = keep(key, trace, f"tracing the paths of {len(transmitters)} transmitters")

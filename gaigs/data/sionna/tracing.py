@@ -73,7 +73,11 @@ def llvm_version(file: str) -> int:
 
 
 def trace(
-    meshes: Sequence[Mesh], receiver: Float[Tensor, "3"], transmitters: Float[Tensor, "b 3"], frequency: float
+    meshes: Sequence[Mesh],
+    receiver: Float[Tensor, "3"],
+    transmitters: Float[Tensor, "b 3"],
+    frequency: float,
+    reflections: int | None = None,
 ) -> Paths:
     """The paths at a carrier [Hz] from transmitters to a receiver point [m], strongest first; gains are padded with 0.
 
@@ -81,6 +85,7 @@ def trace(
     field runs along the meridians about the vertical. A path that is reflected and passes through surfaces equals a
     straight one from an image of the transmitter, at the path's length in the direction of arrival. Length and
     direction of a diffracted path are exact at the receiver point, and its wave is more curved than that of its image.
+    With a largest number of reflections there are no diffractions, as in ``trace_scene``.
 
     Raises:
         ImportError: Sionna RT is not installed.
@@ -89,7 +94,7 @@ def trace(
 
     Source: Sionna RT technical report, arXiv:2504.21719; materials as in ITU-R P.2040-3, table 3.
     """
-    paths = trace_scene(make_scene(meshes, frequency), receiver, transmitters)
+    paths = trace_scene(make_scene(meshes, frequency), receiver, transmitters, reflections=reflections)
     if deaf := [k for k, gains in enumerate(paths.gains) if not gains.any()]:
         raise ValueError(f"a path must lead to each transmitter, got none to {transmitters[deaf[0]].tolist()}; move it")
     return paths

@@ -95,6 +95,7 @@ CASES = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("case", CASES)
 def test_planes_are_found(case):
     """To 5 mm and 0.01 rad, a tenth of a wavelength."""
@@ -129,6 +130,7 @@ def test_no_plane_is_found_in_noise(count):
     assert len(planes) == 0
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_false_plane_is_dropped(monkeypatch):
     links, walls = room(walls=PLANES[1:])
     misled, found = search(links), []
@@ -170,6 +172,7 @@ def few(links):
 WALL, PARALLEL, FLOOR = [1.0, 0, 0, -0.4], [1.0, 0, 0, 6.3], [0, 0, 1.0, -0.2]
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_walls_along_axes_show_where_channels_have_few_numbers():
     """One element and 8 subcarriers: free strengths at each place explain these channels by many planes."""
     walls = np.array([[1.0, 0, 0, -0.1], [0, 1.0, 0, 0.1]])
@@ -192,6 +195,7 @@ def test_links_that_are_partly_silent_or_repeated_show_no_wall():
     torch.testing.assert_close(planes, walls, rtol=0, atol=5e-3)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_drawn_walls_that_phases_do_not_show_stay():
     links, walls = room(count=120, walls=np.array([WALL]))
     links = few(links)
