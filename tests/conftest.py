@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, Phase, settings
 
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of these would compile all modules
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell runs the tests in the background
 settings.register_profile(
     "gaigs",

@@ -196,21 +196,28 @@ def without_weakest(fields: Complex[ndarray, " p"]) -> Int[ndarray, " k"]:
     return order[np.cumsum(power[::-1])[::-1] > WEAKEST * power.sum()]
 
 
+def fields_and_images(
+    paths: Any, receiver: Float[ndarray, "3"]
+) -> tuple[Complex[ndarray, "b p"], Float[ndarray, "b p 3"]]:
+    """Fields of the solver's paths from one receiver, and their images [m]; of fewer paths the rest is 0."""
+    fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, 0, 0]
+    lengths, zenith, azimuth = (array.numpy()[:, 0].astype(float) for array in (paths.tau, paths.theta_t, paths.phi_t))
+    horizontal = np.sin(zenith)
+    directions = np.stack((horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.cos(zenith)), -1)
+    return fields, receiver + speed_of_light * lengths[..., None] * directions
+
+
 def _strongest(
     paths: Any, receiver: np.ndarray, wavelength: float, reflections: int | None
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Images (p, 3) [m] and gains (p,) of each transmitter's paths, without the weakest."""
-    fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, 0, 0]
+    fields, images = fields_and_images(paths, receiver)
     if reflections is not None:
         from sionna.rt.constants import InteractionType
 
         counts = (paths.interactions.numpy()[:, :, 0] == InteractionType.SPECULAR).sum(0)
         fields = np.where(counts <= reflections, fields, 0)
-    lengths, zenith, azimuth = (array.numpy()[:, 0].astype(float) for array in (paths.tau, paths.theta_t, paths.phi_t))
-    lengths *= speed_of_light
-    horizontal = np.sin(zenith)
-    directions = np.stack((horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.cos(zenith)), -1)
-    images = receiver + lengths[..., None] * directions
+    lengths = np.linalg.norm(images - receiver, axis=-1)
     found = []
     for k, field in enumerate(fields):
         order = without_weakest(field)
