@@ -1,0 +1,85 @@
+"""Scores of channels of which some kinds of paths are known exactly: what a model of walls can reach in a traced room.
+
+    python benchmarks/channel_paths.py l_shape slanted furnished         rooms of the ray tracer; needs gaigs[sionna]
+
+Test places of ``sionna_csi``, traced anew. Prints a table in Markdown: each kind's mean share of a place's power [%],
+median and mean SNR [dB] of channels of this kind of paths and all kinds above. docs/results.md has the numbers.
+"""
+
+import sys
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Complex, Int
+from numpy import ndarray
+from torch import Tensor
+
+from gaigs.data import load
+from gaigs.data.sionna import ROOMS, tracing
+from gaigs.data.synthetic.image_source import Paths, respond
+from gaigs.report.table import markdown
+
+KINDS = "walls, two reflections or fewer", "walls, three", "furniture", "edges"
+
+
+def kinds_of(types: Int[ndarray, "d b p"], at_wall: Bool[ndarray, "d b p"]) -> Int[ndarray, "b p"]:
+    """Numbers in ``KINDS`` of paths by the types of their interactions, and which of these are at walls."""
+    from sionna.rt.constants import InteractionType
+
+    reflected = types == InteractionType.SPECULAR
+    kinds = np.where((reflected & ~at_wall).any(0), 2, reflected.sum(0) > 2)
+    return np.where((types == InteractionType.DIFFRACTION).any(0), 3, kinds)
+
+
+def parts_of(room: str) -> list[Complex[Tensor, "b e s"]]:
+    """Channels of the paths of each kind."""
+    links = load({"name": "sionna_csi", "room": room}, {"name": "official", "validation": 0.1, "seed": 0}, "csi")
+    receiver, frequencies = links.receivers[0], links.task.frequencies
+    carrier, place = float(frequencies.mean()), receiver.pose.position
+    meshes = ROOMS[room].meshes()
+    scene = tracing.make_scene(meshes, carrier)
+    rt = tracing.find_sionna()
+    walls = [mesh.name.endswith(" walls") or mesh.name in ("floor", "ceiling") for mesh in meshes]
+    is_wall = {scene.get(f"mesh {number}").object_id: wall for number, wall in enumerate(walls)}
+    scene.add(rt.Transmitter("receiver", place.tolist()))
+    parts = [[] for _ in KINDS]
+    for chunk in links.query.transmitters[links.split.test].split(tracing.CHUNK):
+        names = [f"transmitter {k}" for k in range(len(chunk))]
+        for name, position in zip(names, chunk.tolist(), strict=True):
+            scene.add(rt.Receiver(name, position))
+        paths = rt.PathSolver()(
+            scene,
+            max_depth=tracing.DEPTH,
+            samples_per_src=tracing.RAYS,
+            max_num_paths_per_src=tracing.CANDIDATES,
+            diffraction=True,
+        )
+        scene.remove(names)
+        fields, images = tracing.fields_and_images(paths, place.double().numpy())
+        types, surfaces = (array.numpy()[:, :, 0] for array in (paths.interactions, paths.objects))
+        at_wall = np.vectorize(lambda number: is_wall.get(number, True))(surfaces)
+        kinds = kinds_of(types, at_wall)
+        gains = fields * np.linalg.norm(images - place.double().numpy(), axis=-1)  # all labels have one more factor
+        for kind, part in enumerate(parts):
+            own = Paths(torch.from_numpy(images), torch.from_numpy(np.where(kinds == kind, gains, 0)))
+            part.append(respond(own, receiver, carrier, frequencies - carrier))
+    return [torch.cat(part) for part in parts]
+
+
+def main(rooms: list[str]) -> None:
+    lines = [("room", "paths", "power [%]", "median SNR", "mean SNR")]
+    for room in rooms:
+        parts = parts_of(room)
+        whole = sum(parts)
+        ratio = lambda some, whole=whole: some.abs().square().sum((1, 2)) / whole.abs().square().sum((1, 2))
+        known = torch.zeros_like(whole)
+        for kind, part in zip(KINDS, parts, strict=True):
+            known = known + part
+            snr = -10 * ratio(whole - known).log10()
+            scores = (f"{snr.median():.1f}", f"{snr.mean():.1f}") if kind != KINDS[-1] else ("all", "all")
+            lines.append((room, kind, f"{100 * ratio(part).mean():.1f}", *scores))
+    print(markdown(lines))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:] or ["l_shape", "slanted", "furnished"])
