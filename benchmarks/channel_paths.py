@@ -2,8 +2,8 @@
 
     python benchmarks/channel_paths.py l_shape slanted furnished         rooms of the ray tracer; needs gaigs[sionna]
 
-Test places of ``sionna_csi``, traced anew. Prints a table in Markdown: each kind's mean share of a place's power [%],
-median and mean SNR [dB] of channels of this kind of paths and all kinds above. docs/results.md has the numbers.
+Test places of ``sionna_csi``, traced anew. Prints a table in Markdown: each kind's share of a place's power, and SNR
+of channels of this kind of paths and all kinds above. docs/results.md has the numbers.
 """
 
 import sys
@@ -67,7 +67,7 @@ def parts_of(room: str) -> list[Complex[Tensor, "b e s"]]:
 
 
 def main(rooms: list[str]) -> None:
-    lines = [("room", "paths", "power [%]", "median SNR", "mean SNR")]
+    lines = [("room", "paths", "median power [%]", "mean power", "median SNR [dB]", "mean SNR")]
     for room in rooms:
         parts = parts_of(room)
         whole = sum(parts)
@@ -75,9 +75,10 @@ def main(rooms: list[str]) -> None:
         known = torch.zeros_like(whole)
         for kind, part in zip(KINDS, parts, strict=True):
             known = known + part
-            snr = -10 * ratio(whole - known).log10()
-            scores = (f"{snr.median():.1f}", f"{snr.mean():.1f}") if kind != KINDS[-1] else ("all", "all")
-            lines.append((room, kind, f"{100 * ratio(part).mean():.1f}", *scores))
+            shares, snr = 100 * ratio(part), -10 * ratio(whole - known).log10()
+            scores = [snr.quantile(0.5), snr.mean()] if kind != KINDS[-1] else []  # nothing is left over
+            cells = [f"{value:.1f}" for value in (shares.quantile(0.5), shares.mean(), *scores)]
+            lines.append((room, kind, *cells, *[""] * (4 - len(cells))))
     print(markdown(lines))
 
 

@@ -92,9 +92,10 @@ def files_read_once():
 @pytest.fixture
 def unchecked():
     """For runs from end to end: a third of their time is checks of annotations, which tests of the parts have."""
+    before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 @pytest.fixture(scope="session")

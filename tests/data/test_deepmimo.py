@@ -3,7 +3,6 @@
 import cmath
 import json
 import math
-import runpy
 import sys
 
 import numpy as np
@@ -14,6 +13,7 @@ from scipy.constants import speed_of_light
 
 from gaigs.antenna import Array, Receiver
 from gaigs.data import deepmimo, deepmimo_rssi, synthetic
+from gaigs.data.__main__ import main
 from gaigs.testing import check_data
 
 CARRIER = 3.5e9
@@ -147,7 +147,7 @@ def test_the_built_in_room_is_written_and_read(tmp_path, monkeypatch):
     monkeypatch.setattr(
         sys, "argv", ["gaigs.data", str(tmp_path / "room"), "synthetic_csi", "--deepmimo", "transmitters=20"]
     )
-    runpy.run_module("gaigs.data", run_name="__main__")
+    main()
     links = deepmimo.read(tmp_path / "room", elements=[1, 1], subcarriers=1)
     receiver = Receiver("point", links.receivers[0].pose, Array.single())
     places = links.query.transmitters

@@ -1,6 +1,5 @@
 """Simulated rooms, built-in and traced: options out of range, seeds, and the command that writes them."""
 
-import runpy
 import sys
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 import torch
 
 from gaigs.data import load, synthetic
+from gaigs.data.__main__ import main
 from gaigs.data.sionna import ROOMS
 from gaigs.data.sionna.meshes import wavefront_obj
 
@@ -59,7 +59,7 @@ def test_the_built_in_room_repeats_with_its_seed_alone(labels):
 
 def command(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["data", *map(str, arguments)])
-    runpy.run_module("gaigs.data", run_name="__main__")
+    main()
 
 
 def check_same(found, expected):
