@@ -255,6 +255,7 @@ class ChannelSearch(PlaneSearch):
         if len(best[0]) < len(planes):  # what the false ones explained is searched anew
             again = self.resolve(self.refine(self.find(self.refine(best[0], 100, 1e-2)), 300, 5e-3))
             best = min(best, self.without_false(*again), key=self.cost)
+            best = min(best, self.resolve(best[0]), key=self.cost)  # false planes had moved the others
         return self.without_false(*self.grown(*best))
 
     def cost(self, room: Room) -> float:

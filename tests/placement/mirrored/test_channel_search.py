@@ -147,6 +147,24 @@ def test_false_plane_is_dropped(monkeypatch):
     torch.testing.assert_close(found[1], true, rtol=0, atol=0.05)
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_a_plane_that_a_false_one_moved_returns(monkeypatch):
+    """By half a wavelength, to another lobe of its phases."""
+    links, walls = room(walls=PLANES[1:])
+    own = search(links)
+    true, resolve = seen_from(walls, own.middle), own.resolve
+    found = torch.cat((true, torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double()))
+
+    def resolved(planes):
+        planes, slabs = resolve(planes)
+        return planes + torch.tensor([0, 0, 0, own.wavelength / 2 * (len(planes) > 1)]), slabs
+
+    monkeypatch.setattr(own, "find", lambda known: found)
+    monkeypatch.setattr(own, "refine", lambda planes, *options: planes)
+    monkeypatch.setattr(own, "resolve", resolved)
+    torch.testing.assert_close(own.run()[0], walls, rtol=0, atol=5e-3)
+
+
 def test_the_only_plane_may_be_false():
     own = search(room(walls=PLANES[:0])[0])
     planes, slabs = own.without_false(torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double(), torch.zeros(1, 3).double())
