@@ -38,23 +38,10 @@ def parts_of(room: str) -> list[Complex[Tensor, "b e s"]]:
     carrier, place = float(frequencies.mean()), receiver.pose.position
     meshes = ROOMS[room].meshes()
     scene = tracing.make_scene(meshes, carrier)
-    rt = tracing.find_sionna()
     walls = [mesh.name.endswith(" walls") or mesh.name in ("floor", "ceiling") for mesh in meshes]
     is_wall = {scene.get(f"mesh {number}").object_id: wall for number, wall in enumerate(walls)}
-    scene.add(rt.Transmitter("receiver", place.tolist()))
     parts = [[] for _ in KINDS]
-    for chunk in links.query.transmitters[links.split.test].split(tracing.CHUNK):
-        names = [f"transmitter {k}" for k in range(len(chunk))]
-        for name, position in zip(names, chunk.tolist(), strict=True):
-            scene.add(rt.Receiver(name, position))
-        paths = rt.PathSolver()(
-            scene,
-            max_depth=tracing.DEPTH,
-            samples_per_src=tracing.RAYS,
-            max_num_paths_per_src=tracing.CANDIDATES,
-            diffraction=True,
-        )
-        scene.remove(names)
+    for paths in tracing.solve(scene, place, links.query.transmitters[links.split.test]):
         fields, images = tracing.fields_and_images(paths, place.double().numpy())
         types, surfaces = (array.numpy()[:, :, 0] for array in (paths.interactions, paths.objects))
         at_wall = np.vectorize(lambda number: is_wall.get(number, True))(surfaces)

@@ -49,7 +49,7 @@ def traced_room(
         receiver: Position of the array in the scene [m].
         facing: Point in the scene that the array faces [m]; None for the middle of all surfaces.
         heights: Lowest and highest z of transmitters in the scene [m]; None for 0.3 to 2 m above the lowest surface.
-        diffraction: False if edges bend no waves, as many tracers have it by default.
+        diffraction: False if edges bend no waves, the default of Sionna RT itself.
 
     Raises:
         FileNotFoundError: There is no such scene.

@@ -4,7 +4,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from glob import glob
 from importlib import metadata
 from pathlib import Path
@@ -111,27 +111,38 @@ def trace_scene(
 
     With a largest number of reflections there are no diffractions: each triangle of a curved surface has edges.
     """
+    found = []
+    for paths in solve(scene, receiver, transmitters, depth, diffraction=reflections is None):
+        found += _strongest(paths, receiver.double().numpy(), float(scene.wavelength[0]), reflections)
+    images = pad_sequence([torch.from_numpy(places) for places, _ in found], batch_first=True, padding_value=1e3)
+    return Paths(images, pad_sequence([torch.from_numpy(gains) for _, gains in found], batch_first=True))
+
+
+def solve(
+    scene: Any,
+    receiver: Float[Tensor, "3"],
+    transmitters: Float[Tensor, "b 3"],
+    depth: int = DEPTH,
+    diffraction: bool = True,
+) -> Iterator[Any]:
+    """The paths of ``sionna.rt`` to each ``CHUNK`` of the transmitters, which stand in the scene only meanwhile."""
     from sionna import rt
 
     scene.add(rt.Transmitter("receiver", receiver.tolist()))
     solver = rt.PathSolver()
-    found = []
     for chunk in transmitters.split(CHUNK):
         names = [f"transmitter {k}" for k in range(len(chunk))]
         for name, position in zip(names, chunk.tolist(), strict=True):
             scene.add(rt.Receiver(name, position))
-        paths = solver(
+        yield solver(
             scene,
             max_depth=depth,
             samples_per_src=RAYS,
             max_num_paths_per_src=CANDIDATES,
-            diffraction=reflections is None,
+            diffraction=diffraction,
         )
-        found += _strongest(paths, receiver.double().numpy(), float(scene.wavelength[0]), reflections)
         scene.remove(names)
     scene.remove("receiver")
-    images = pad_sequence([torch.from_numpy(places) for places, _ in found], batch_first=True, padding_value=1e3)
-    return Paths(images, pad_sequence([torch.from_numpy(gains) for _, gains in found], batch_first=True))
 
 
 def find_sionna() -> Any:
