@@ -109,9 +109,9 @@ class Calibration:
                 states deviations, which need no groups of distances.
             known: Links that the calibrated model knows.
         """
-        errors = (task.align(labels, values) - values).abs() / _shaped(deviations, values)
-        exists = ~thin(_shaped(deviations, values)).isnan()
-        errors, values = (thin(part) for part in (errors, values))
+        labels, values, deviations = thinned(task, labels, values, deviations)
+        scale = _shaped(deviations, values)
+        errors, exists = (labels - values).abs() / scale, ~scale.isnan()
         count = int(torch.cat((query.receivers, known.receivers)).max()) + 1
         heard = query.receivers.bincount(minlength=count)
         rows = query.receivers if heard.min() >= ENOUGH and count > 1 else torch.zeros_like(query.receivers)
@@ -234,9 +234,9 @@ def holds(estimate: Estimate, labels: Inexact[Tensor, " k *shape"]) -> Bool[Tens
 
 
 def interval_scores(
-    task: Task, labels: Inexact[Tensor, " k *shape"], half: Estimate, most: Estimate
+    labels: Inexact[Tensor, " k *shape"], half: Estimate, most: Estimate
 ) -> dict[str, Float[Tensor, " k"]]:
-    """Scores of each link's intervals of 50 % and 90 %: shares of its numbers inside, width, CRPS and -log p.
+    """Scores of each link's intervals of 50 % and 90 %: shares of its aligned numbers inside, width, CRPS and -log p.
 
     The last two are those of a normal distribution with the estimate's ``std``; of channels those of real and imaginary
     parts. CRPS has the label's unit.
@@ -244,7 +244,6 @@ def interval_scores(
     Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation, 2007.
     """
     value, std = most.value, most.std
-    labels = task.align(labels, value)
     errors = labels - value
     inside = holds(half, labels), holds(most, labels)
     width = 2 * most.radius if most.radius is not None else most.upper - most.lower
@@ -280,9 +279,16 @@ def summarise_intervals(scores: dict[str, Float[Tensor, " k"]]) -> dict[str, flo
 
 def _shaped(deviations: Tensor, values: Tensor) -> Tensor:
     """Deviations of links, or of all their numbers, in the shape of the values; above 0."""
-    real = values.abs()
-    shaped = deviations.reshape(*deviations.shape, *[1] * (values.ndim - deviations.ndim)).to(real)
-    return shaped.clamp_min(torch.finfo(real.dtype).tiny).expand(values.shape)
+    shaped = deviations.reshape(*deviations.shape, *[1] * (values.ndim - deviations.ndim)).to(values.real)
+    return shaped.clamp_min(torch.finfo(shaped.dtype).tiny).expand(values.shape)
+
+
+def thinned(
+    task: Task, labels: Inexact[Tensor, " n *shape"], values: Inexact[Tensor, " n *shape"], deviations: Tensor
+) -> tuple[Inexact[Tensor, "n m"], Inexact[Tensor, "n m"], Tensor]:
+    """At most ``NUMBERS`` numbers of each label, aligned, of its prediction, and of the deviations if each has one."""
+    deviations = thin(deviations) if deviations.ndim > 1 else deviations
+    return thin(task.align(labels, values)), thin(values), deviations
 
 
 def thin(numbers: Tensor, most: int = NUMBERS) -> Tensor:

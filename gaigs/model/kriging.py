@@ -398,7 +398,7 @@ def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -
     """
     if weight in (0, 1):
         return (one if weight else other).clone()
-    return weight * task.align(one, other) + (1 - weight) * other
+    return torch.add(weight * task.align(one, other), other, alpha=1 - weight)
 
 
 def is_surely_better(one: Float[Tensor, " k"], other: Float[Tensor, " k"], *, errors: float = 2.0) -> bool:

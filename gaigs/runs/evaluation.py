@@ -23,7 +23,7 @@ from gaigs.configuration import composed, files_of
 from gaigs.data import Links, with_places
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
-from gaigs.kriging.intervals import Calibration, holds, interval_scores, nearest, summarise_intervals, thin
+from gaigs.kriging.intervals import Calibration, holds, interval_scores, nearest, summarise_intervals, thinned
 from gaigs.kriging.links import folds_of
 from gaigs.model import Model, call_optional
 from gaigs.model.gaussian_process import GaussianProcess
@@ -282,18 +282,19 @@ def score(
         calibration = model.calibration if key in models or not has_intervals else calibrated(model, links)
         if has_intervals and frequencies is None and calibration is not None and calibration.gives(0.9):
             deviations = spreads(model, links, index, values)
-            parts, stated = [], []
-            for some in torch.arange(len(index)).split(BATCH):  # estimates take ten times the memory of labels
-                own = values[some], deviations[some], query[some]
-                half, most = (calibration.estimate(*own, level) for level in (0.5, 0.9))
-                parts.append(interval_scores(task, labels[some], half, most))
-                stated.append(task.packed(most.std))
+            batches = torch.arange(len(index)).split(BATCH)  # estimates take ten times the memory of labels
+            if key == next(iter(models), None):
+                stated = (calibration.estimate(values[some], deviations[some], query[some], 0.9) for some in batches)
+                content["deviation"] = np.concatenate([task.packed(estimate.std) for estimate in stated])
+            aligned, own, stds = thinned(task, labels, values, deviations)
+            parts = []
+            for some in batches:
+                half, most = (calibration.estimate(own[some], stds[some], query[some], level) for level in (0.5, 0.9))
+                parts.append(interval_scores(aligned[some], half, most))
             found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
             found["calibration_links"] = torch.full((len(index),), float(calibration.counts.sum()))
             scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
-            if key == next(iter(models), None):
-                content["deviation"] = np.concatenate(stated)
-            content[f"shares_{key}"] = shares(calibration, task, labels, values, deviations, query)
+            content[f"shares_{key}"] = shares(calibration, aligned, own, stds, query)
     if links.held_out is not None:
         known: Any = links.task
         closest = (known.frequencies - frequencies[:, None]).abs().argmin(1)
@@ -304,24 +305,17 @@ def score(
     return scores
 
 
-def shares(
-    calibration: Calibration, task: Task, labels: Tensor, values: Tensor, deviations: Tensor, query: Query
-) -> np.ndarray:
-    """Shares of the labels of at most 300 links within intervals of the levels 0.05 to 0.95 (19,).
-
-    Of each label at most ``NUMBERS`` numbers count, as for the calibration.
-    """
+def shares(calibration: Calibration, labels: Tensor, values: Tensor, deviations: Tensor, query: Query) -> np.ndarray:
+    """Shares of the aligned labels of at most 300 links within intervals of the levels 0.05 to 0.95 (19,)."""
     some = evenly(torch.arange(len(labels)), 300)
-    aligned, values, deviations = task.align(labels[some], values[some]), values[some], deviations[some]
-    aligned, values = thin(aligned), thin(values)
-    deviations, query = thin(deviations) if deviations.ndim > 1 else deviations, query[some]
+    labels, values, deviations, query = labels[some], values[some], deviations[some], query[some]
     found = []
     for level in np.arange(1, 20) / 20:
         if not calibration.gives(level):
             found.append(math.nan)
             continue
         estimate = calibration.estimate(values, deviations, query, level)
-        found.append(holds(estimate, aligned)[~estimate.std.isnan()].double().mean().item())
+        found.append(holds(estimate, labels)[~estimate.std.isnan()].double().mean().item())
     return np.array(found)
 
 

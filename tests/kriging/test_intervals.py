@@ -48,7 +48,7 @@ def shares(task, count, level, repeats=40, **options):
         ones = torch.ones(len(query))
         calibration = Calibration.of(kind, labels[held], values[held], ones[held], query[held], None, query[:1])
         estimate = calibration.estimate(values[new], ones[new], query[new], level)
-        found.append(interval_scores(kind, labels[new], estimate, estimate)["coverage_90"].mean().item())
+        found.append(interval_scores(labels[new], estimate, estimate)["coverage_90"].mean().item())
     return np.mean(found), np.std(found) / math.sqrt(repeats)
 
 
@@ -140,7 +140,7 @@ def test_pixels_of_a_bin_that_err_together_count_as_few_numbers(count):
         calibration = Calibration.of(kind, labels[few], values[few], ones[few], query[few], None, query[:1])
         estimate = calibration.estimate(values[new], ones[new], query[new], 0.9)
         estimate = estimate._replace(lower=2 * values[new] - estimate.upper)
-        held.append(interval_scores(kind, labels[new], estimate, estimate)["coverage_90"].mean().item())
+        held.append(interval_scores(labels[new], estimate, estimate)["coverage_90"].mean().item())
     assert abs(np.mean(held) - 0.9) < 0.02
 
 
@@ -159,10 +159,9 @@ def test_discs_and_the_expected_snr_of_channels():
 
 
 def test_scores_are_those_of_the_normal_distribution():
-    task = example_links("rssi").task
     labels, value, std = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 3.0]), torch.tensor([0.7, 2.0])
     estimate = Estimate(value, std, value - 1, value + 1)
-    found = interval_scores(task, labels, estimate, estimate._replace(lower=value - 6, upper=value + 6))
+    found = interval_scores(labels, estimate, estimate._replace(lower=value - 6, upper=value + 6))
     assert found["coverage_50"].tolist() == [1, 0]
     assert found["coverage_90"].tolist() == [1, 1]
     assert found["width_90"].tolist() == [12, 12]
