@@ -263,17 +263,24 @@ def interval_scores(
     return means
 
 
-def summarise_intervals(scores: dict[str, Float[Tensor, " k"]]) -> dict[str, float]:
+def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
     """Means over links, and the standard errors of both coverages, ``coverage_50_error`` and ``coverage_90_error``.
 
-    The errors are those of the test's links and of the ``calibration_links`` together.
+    The errors are those of the test's links and of the ``calibration_links`` together. Links of one place, a number in
+    ``places``, err together: places are independent, links are not.
+
+    Source: Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015.
     """
-    numbers = {}
+    numbers, which = {}, scores["places"].unique(return_inverse=True)[1] if scores else None
     for name, score in scores.items():
+        if name == "places":
+            continue
         numbers[name] = score.mean().item()
         if name.startswith("coverage"):
+            sums = torch.zeros(int(which.max()) + 1).to(score).index_add(0, which, score - score.mean())
             links = 1 / len(score) + 1 / scores["calibration_links"].mean().item()
-            numbers[f"{name}_error"] = score.std().item() * math.sqrt(links) if len(score) > 1 else math.nan
+            spread = sums.square().sum().item() / len(score) * len(sums) / max(len(sums) - 1, 1)
+            numbers[f"{name}_error"] = math.sqrt(spread * links) if len(sums) > 1 else math.nan
     return numbers
 
 

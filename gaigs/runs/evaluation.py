@@ -293,6 +293,7 @@ def score(
                 parts.append(interval_scores(aligned[some], half, most))
             found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
             found["calibration_links"] = torch.full((len(index),), float(calibration.counts.sum()))
+            found["places"] = query.place_keys
             scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
             content[f"shares_{key}"] = shares(calibration, aligned, own, stds, query)
     if links.held_out is not None:

@@ -171,8 +171,22 @@ def test_scores_are_those_of_the_normal_distribution():
         expected, _ = quad(steps, -30, 30, points=[labels[i].item(), value[i].item()], limit=200)
         assert found["crps"][i].item() == pytest.approx(expected, rel=1e-5)
         assert found["nll"][i].item() == pytest.approx(-normal.logpdf(labels[i].item()), rel=1e-6)
-    numbers = summarise_intervals({**found, "calibration_links": torch.tensor([2.0, 2.0])})
+    numbers = summarise_intervals({**found, "calibration_links": torch.tensor([2.0, 2.0]), "places": torch.arange(2)})
     assert (numbers["coverage_50"], numbers["coverage_50_error"]) == (0.5, pytest.approx(0.5**0.5))
+
+
+def test_readings_of_one_place_count_as_one_where_they_err_together():
+    generator = torch.Generator().manual_seed(0)
+    places = torch.arange(400).repeat_interleave(4)
+
+    def error(inside):
+        scores = {"coverage_90": inside.double(), "calibration_links": torch.full((1600,), 1e9), "places": places}
+        return summarise_intervals(scores)["coverage_90_error"]
+
+    alone = torch.rand(1600, generator=generator) < 0.9
+    together = (torch.rand(400, generator=generator) < 0.9).repeat_interleave(4)
+    assert error(alone) == pytest.approx(0.3 / 40, rel=0.15)
+    assert error(together) == pytest.approx(0.3 / 20, rel=0.15)
 
 
 def test_distances_are_those_to_the_same_receivers_places():
