@@ -78,10 +78,14 @@ class Beamformer:
             shown = amplitudes
             if not is_whole:
                 shown = torch.cat((amplitudes, self._look(parts[links], carrier, query, self.coarse)), 1)
-            low, high = shown.amin(1, keepdim=True), shown.amax(1, keepdim=True)
-            spread = torch.where(high > low, high - low, 1)
-            # Pixels are many, and each pass over them in memory costs as much as the beamformer itself.
-            scaled = (amplitudes - low) / spread if torch.is_grad_enabled() else amplitudes.sub_(low).div_(spread)
+            # Pixels are many, and each pass over them in memory costs as much as the beamformer itself. The gradients of
+            # amin and amax take four; min and max, whose gradients take none, are slower themselves.
+            if torch.is_grad_enabled():
+                low, high = shown.min(1, keepdim=True).values, shown.max(1, keepdim=True).values
+                scaled = (amplitudes - low) / torch.where(high > low, high - low, 1)
+            else:
+                low, high = shown.amin(1, keepdim=True), shown.amax(1, keepdim=True)
+                scaled = amplitudes.sub_(low).div_(torch.where(high > low, high - low, 1))
             spectra.append(scaled)
             order.append(links)
         whole = spectra[1] if len(spectra) == 2 else torch.cat(spectra)[torch.cat(order).argsort()]
