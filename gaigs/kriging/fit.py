@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float, Inexact, Int
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -47,9 +47,9 @@ class HeldOut(NamedTuple):
     products: Float[Tensor, "b j+1 j+1"]  # of the residuals of each held-out link and those around it
 
 
-def thin_labels(labels: Tensor) -> Tensor:
-    """At most 1,024 numbers of each label (k, m), to which hyperparameters are fitted: arrays resolve fewer."""
-    numbers = labels.reshape(len(labels), -1)
+def thin_labels(labels: Inexact[Tensor, " k *shape"]) -> Inexact[Tensor, "k m"]:
+    """At most 1,024 numbers of each label, for hyperparameters and intervals: arrays resolve fewer."""
+    numbers = labels[..., None].flatten(1)
     return numbers[:, evenly(torch.arange(numbers.shape[1]), 1024)]
 
 

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Inexact, Int
 from torch import Tensor
 
 from gaigs.geometry import FAR
+from gaigs.kriging.fit import thin_labels
 from gaigs.kriging.links import distances
-from gaigs.query import Query
+from gaigs.query import Query, evenly
 from gaigs.task import Task
 
 ENOUGH = 100
@@ -18,9 +19,6 @@ ENOUGH = 100
 
 BINS = 8
 """Groups of a spectrum's pixels by their predicted amplitude: where it is high, errors are larger."""
-
-NUMBERS = 1024
-"""Most numbers of a label that intervals are calibrated and scored with; arrays resolve fewer."""
 
 USUAL = 0.9
 """Level at which shares of links scatter, for the intervals of all levels."""
@@ -127,7 +125,7 @@ class Calibration:
                 break
             groups -= 1
         numbers = (values.abs() if values.is_complex() else values).double()
-        some = thin(numbers.flatten()[None], 10**6)[0]
+        some = numbers.flatten()[evenly(torch.arange(numbers.numel()), 10**6)]
         most = BINS if numbers.shape[1] > 1 and not values.is_complex() else 1
         while True:  # a bin with pixels of few links would have their errors alone
             amplitudes = some.quantile(torch.arange(1, most, dtype=torch.float64) / most)
@@ -266,8 +264,9 @@ def interval_scores(
 def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
     """Means over links, and the standard errors of both coverages, ``coverage_50_error`` and ``coverage_90_error``.
 
-    The errors are those of the test's links and of the ``calibration_links`` together. Links of one place, a number in
-    ``places``, err together: places are independent, links are not.
+    The errors are those of the test's links and of the ``calibration_links`` together, both placed alike. ``places``
+    has the number of each link's place: errors of one place depend on each other, those of different ones count as
+    independent. NaN with one place.
 
     Source: Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015.
     """
@@ -293,12 +292,8 @@ def _shaped(deviations: Tensor, values: Tensor) -> Tensor:
 def thinned(
     task: Task, labels: Inexact[Tensor, " n *shape"], values: Inexact[Tensor, " n *shape"], deviations: Tensor
 ) -> tuple[Inexact[Tensor, "n m"], Inexact[Tensor, "n m"], Tensor]:
-    """At most ``NUMBERS`` numbers of each label, aligned, of its prediction, and of the deviations if each has one."""
-    deviations = thin(deviations) if deviations.ndim > 1 else deviations
-    return thin(task.align(labels, values)), thin(values), deviations
-
-
-def thin(numbers: Tensor, most: int = NUMBERS) -> Tensor:
-    """At most ``most`` numbers of each label (n, m), evenly spread."""
-    flat = numbers[..., None].flatten(1)
-    return flat[:, :: math.ceil(flat.shape[1] / most)].contiguous()
+    """Aligned labels, predictions and, unless there is one for each link, deviations by ``thin_labels``."""
+    deviations = thin_labels(deviations) if deviations.ndim > 1 else deviations
+    pairs = zip(labels.split(64), values.split(64), strict=True)  # an alignment takes several times the memory
+    aligned = [thin_labels(task.align(*pair)) for pair in pairs]
+    return torch.cat(aligned), thin_labels(values), deviations

@@ -78,9 +78,9 @@ class Beamformer:
             shown = amplitudes
             if not is_whole:
                 shown = torch.cat((amplitudes, self._look(parts[links], carrier, query, self.coarse)), 1)
-            # Pixels are many, and each pass over them in memory costs as much as the beamformer itself. The gradients of
-            # amin and amax take four; min and max, whose gradients take none, are slower themselves.
-            if torch.is_grad_enabled():
+            # Pixels are many, and each pass over them in memory costs as much as the beamformer itself. Gradients of
+            # amin and amax take four, those of min and max hardly one; without gradients amin and amax are faster.
+            if shown.requires_grad:
                 low, high = shown.min(1, keepdim=True).values, shown.max(1, keepdim=True).values
                 scaled = (amplitudes - low) / torch.where(high > low, high - low, 1)
             else:

@@ -43,7 +43,7 @@ CALIBRATION_FOLDS, MOST = 5, 1000
 """Folds of known links that calibrate a look-up, and most links that they ask for."""
 
 INTERVALS = "interval_"
-"""Beginning of the names of scores of intervals."""
+"""Beginning of the names of scores of intervals; ``interval_places`` has the number of each link's place."""
 
 Scores = dict[str, dict[str, Tensor]]
 """Scores of every link, by the names of model and score."""
@@ -234,10 +234,15 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
 
 def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
     """The numbers of a table, and those of intervals where a model has them."""
-    own = {name: score for name, score in scores.items() if not name.startswith(INTERVALS)}
+    own = own_scores(scores)
     return task.summarise(own) | summarise_intervals(
         {name.removeprefix(INTERVALS): score for name, score in scores.items() if name not in own}
     )
+
+
+def own_scores(scores: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The scores of the task, without those of intervals."""
+    return {name: score for name, score in scores.items() if not name.startswith(INTERVALS)}
 
 
 def score(
@@ -286,16 +291,17 @@ def score(
             if key == next(iter(models), None):
                 stated = (calibration.estimate(values[some], deviations[some], query[some], 0.9) for some in batches)
                 content["deviation"] = np.concatenate([task.packed(estimate.std) for estimate in stated])
-            aligned, own, stds = thinned(task, labels, values, deviations)
+            aligned, thin_values, thin_deviations = thinned(task, labels, values, deviations)
             parts = []
             for some in batches:
-                half, most = (calibration.estimate(own[some], stds[some], query[some], level) for level in (0.5, 0.9))
+                own = thin_values[some], thin_deviations[some], query[some]
+                half, most = (calibration.estimate(*own, level) for level in (0.5, 0.9))
                 parts.append(interval_scores(aligned[some], half, most))
             found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
             found["calibration_links"] = torch.full((len(index),), float(calibration.counts.sum()))
-            found["places"] = query.place_keys
+            found["places"] = query.place_keys.unique(return_inverse=True)[1].double()
             scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
-            content[f"shares_{key}"] = shares(calibration, aligned, own, stds, query)
+            content[f"shares_{key}"] = shares(calibration, aligned, thin_values, thin_deviations, query)
     if links.held_out is not None:
         known: Any = links.task
         closest = (known.frequencies - frequencies[:, None]).abs().argmin(1)
@@ -333,7 +339,7 @@ def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
     receivers = links.query.receivers[links.split.test]
     return {
         receiver.name: {
-            name: links.task.summarise({key: score[receivers == i] for key, score in values.items()})
+            name: links.task.summarise({key: score[receivers == i] for key, score in own_scores(values).items()})
             for name, values in scores.items()
         }
         for i, receiver in enumerate(links.receivers)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gaigs.geometry import Grid
-from gaigs.query import Batch
+from gaigs.query import Batch, evenly
 
 Thinning = Callable[[Batch, torch.Generator], Batch]
 """A batch of whole labels -> the part of it that a training step reads."""
@@ -144,7 +144,7 @@ class Task(ABC):
         """Real numbers (k, m) of labels or predictions that change steadily with the place; by default at most
         ``NUMBERS`` of their own, evenly spread."""
         flat = values[..., None].flatten(1)
-        return flat[:, :: math.ceil(flat.shape[1] / NUMBERS)].float()
+        return flat[:, evenly(torch.arange(flat.shape[1]), NUMBERS)].float()
 
     def thinning(self) -> Thinning:
         """The part of a batch that a step reads, by default all; parameters are options of ``training.thinning``."""

@@ -189,6 +189,31 @@ def test_readings_of_one_place_count_as_one_where_they_err_together():
     assert error(together) == pytest.approx(0.3 / 20, rel=0.15)
 
 
+def test_the_places_of_test_links_are_theirs():
+    links = gaigs.links("synthetic_rssi", transmitters=100, order=0)
+    assert len(links.receivers) > 1
+    found = gaigs.evaluate(gaigs.train("mean", links), links, []).scores["mean"]["interval_places"]
+    same = links.query.transmitters[links.split.test]
+    assert torch.equal(found[:, None] == found, (same[:, None] == same).all(-1))
+
+
+def test_intervals_of_few_numbers_have_the_shares_of_all():
+    """Labels of more numbers than count: an unknown phase is that of all, and no row or column is left out."""
+    frequencies = np.linspace(2.4e9, 2.48e9, 256)
+    task = Csi(16, frequencies, "per_link")
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(80, 16, 256, dtype=task.dtype, generator=generator)
+    sizes = torch.where(torch.arange(256) % 4 == 1, 1.0, 0.1)
+    labels = values + sizes * torch.randn(80, 16, 256, dtype=task.dtype, generator=generator)
+    labels = labels * torch.polar(torch.ones(80), 6 * torch.rand(80, generator=generator))[:, None, None]
+    query, ones = Query(torch.rand(80, 3), torch.zeros(80, dtype=torch.long)), torch.ones(80)
+    calibration = Calibration.of(task, labels, values, ones, query, None, query[:1])
+    for level in (0.5, 0.9):
+        estimate = calibration.estimate(values, ones, query, level)
+        share = interval_scores(task.align(labels, values), estimate, estimate)["coverage_90"].mean().item()
+        assert share == pytest.approx(level, abs=0.01)
+
+
 def test_distances_are_those_to_the_same_receivers_places():
     places, receivers = torch.tensor([[0.0, 0, 0], [1, 0, 0]]), torch.tensor([0, 1])
     query = Query(torch.tensor([[0.0, 2, 0], [0.0, 2, 0], [0, 0, 0]]), torch.tensor([0, 1, 2]))
