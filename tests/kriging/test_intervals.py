@@ -200,18 +200,18 @@ def test_the_places_of_test_links_are_theirs():
 def test_intervals_of_few_numbers_have_the_shares_of_all():
     """Labels of more numbers than count: an unknown phase is that of all, and no row or column is left out."""
     frequencies = np.linspace(2.4e9, 2.48e9, 256)
-    task = Csi(16, frequencies, "per_link")
+    task = Csi(64, frequencies, "per_link")
     generator = torch.Generator().manual_seed(0)
-    values = torch.randn(80, 16, 256, dtype=task.dtype, generator=generator)
-    sizes = torch.where(torch.arange(256) % 4 == 1, 1.0, 0.1)
-    labels = values + sizes * torch.randn(80, 16, 256, dtype=task.dtype, generator=generator)
+    values = torch.randn(80, 64, 256, dtype=task.dtype, generator=generator)
+    sizes = torch.where((torch.arange(256) % 16 - 8).abs() < 5, 1.0, 0.1)
+    labels = values + sizes * torch.randn(80, 64, 256, dtype=task.dtype, generator=generator)
     labels = labels * torch.polar(torch.ones(80), 6 * torch.rand(80, generator=generator))[:, None, None]
     query, ones = Query(torch.rand(80, 3), torch.zeros(80, dtype=torch.long)), torch.ones(80)
     calibration = Calibration.of(task, labels, values, ones, query, None, query[:1])
     for level in (0.5, 0.9):
         estimate = calibration.estimate(values, ones, query, level)
         share = interval_scores(task.align(labels, values), estimate, estimate)["coverage_90"].mean().item()
-        assert share == pytest.approx(level, abs=0.01)
+        assert share == pytest.approx(level, abs=0.04)
 
 
 def test_distances_are_those_to_the_same_receivers_places():
