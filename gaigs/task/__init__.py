@@ -10,14 +10,15 @@ import torch
 from torch import Tensor
 
 from gaigs.geometry import Grid
-from gaigs.query import Batch, evenly
+from gaigs.query import Batch
 
 Thinning = Callable[[Batch, torch.Generator], Batch]
 """A batch of whole labels -> the part of it that a training step reads."""
 
 
-NUMBERS = 512
-"""Most numbers of a label by which places are told apart; arrays resolve fewer."""
+NUMBERS, EACH = 512, 8
+"""Most numbers of a label by which places are told apart, as arrays resolve fewer; they are of every eighth column at
+least."""
 
 
 class Metric(NamedTuple):
@@ -144,7 +145,10 @@ class Task(ABC):
         """Real numbers (k, m) of labels or predictions that change steadily with the place; by default at most
         ``NUMBERS`` of their own, evenly spread."""
         flat = values[..., None].flatten(1)
-        return flat[:, evenly(torch.arange(flat.shape[1]), NUMBERS)].float()
+        step, columns = math.ceil(flat.shape[1] / NUMBERS), values.shape[-1]
+        while math.gcd(step, columns) > EACH:
+            step += 1
+        return flat[:, ::step].float()
 
     def thinning(self) -> Thinning:
         """The part of a batch that a step reads, by default all; parameters are options of ``training.thinning``."""
