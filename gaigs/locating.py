@@ -42,8 +42,9 @@ HELD_OUT, SCORED, ENOUGH = 500, 200, 300
 """Most fingerprints of a fold whose errors give the axes, most that are located, and number after which no fold is
 added."""
 
-DEGREES = (0.25, 1.0, 4.0, 30.0)
-"""Degrees of freedom of the likelihood to choose from."""
+DEGREES, FEW = (0.25, 1.0, 4.0, 30.0), 20
+"""Degrees of freedom of the likelihood to choose from, and fewest fingerprints that choose: fewer hardly show whether
+one of twenty is an outlier, and take the heaviest tails."""
 
 TEMPERS = tuple(2.0 ** (power / 2) for power in range(-8, 17))
 """Exponents of the likelihood to choose from."""
@@ -683,11 +684,12 @@ class Try(NamedTuple):
 
 def fitted(prints: Fingerprints, tries: Sequence[Try]) -> Fingerprints:
     """The likelihood with the least energy score of held-out values, and these values by that of the other folds."""
-    scores = torch.tensor([[one.score(*choice) for choice in CHOICES] for one in tries])
-    degrees, temper = CHOICES[int(scores.sum(0).argmin())]
+    choices = CHOICES[: len(TEMPERS)] if sum(len(one.truth) for one in tries) < FEW else CHOICES
+    scores = torch.tensor([[one.score(*choice) for choice in choices] for one in tries])
+    degrees, temper = choices[int(scores.sum(0).argmin())]
     held = []
     for one, own in zip(tries, scores, strict=True):
-        choice = CHOICES[int((scores.sum(0) - own if len(tries) > 1 else own).argmin())]
+        choice = choices[int((scores.sum(0) - own if len(tries) > 1 else own).argmin())]
         likelihoods = torch.stack([log_likelihood(*part, *choice).float() for part in one.squares])
         there = Candidates(one.prints.places, one.prints.prior, one.prints.density)
         held.append(Held(there, likelihoods, one.truth))

@@ -215,6 +215,13 @@ def test_prior_follows_the_known_places_and_a_region_replaces_it(rssi):
     assert not gaigs.locate(even, [-50.0, -60.0, -55.0, -70.0]).calibrated
 
 
+def test_few_fingerprints_do_not_rule_outliers_out():
+    links = gaigs.links("synthetic_rssi", transmitters=16, order=0)
+    prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=200)
+    assert 0 < sum(len(one.truth) for one in prints.held) < locating.FEW
+    assert prints.degrees == min(locating.DEGREES)  # the least energy score of these would be at 30
+
+
 def test_held_out_fingerprints_are_located_among_the_other_places(monkeypatch):
     # A density that knew them would put each region about its own place.
     links = gaigs.links("synthetic_rssi", transmitters=60, order=0)
