@@ -17,8 +17,8 @@ Thinning = Callable[[Batch, torch.Generator], Batch]
 
 
 NUMBERS, EACH = 512, 8
-"""Most numbers of a label by which places are told apart, as arrays resolve fewer; they are of every eighth column at
-least."""
+"""Most numbers of a label that tell places apart, as arrays resolve fewer, and largest common factor of their stride
+and the columns: at least every eighth column counts."""
 
 
 class Metric(NamedTuple):
