@@ -264,19 +264,19 @@ def interval_scores(
 def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
     """Means over links, and the standard errors of both coverages, ``coverage_50_error`` and ``coverage_90_error``.
 
-    The errors are those of the test's links and of the ``calibration_links`` together, both placed alike. ``places``
-    has the number of each link's place: errors of one place depend on each other, those of different ones count as
-    independent. NaN with one place.
+    The errors are those of the test's links and of the ``calibration_links`` together, both placed alike; NaN with one
+    place. ``places`` has the number of each link's place, from 0: errors of one place depend on each other, those of
+    different ones count as independent.
 
     Source: Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015.
     """
-    numbers, which = {}, scores["places"].unique(return_inverse=True)[1] if scores else None
+    numbers = {}
     for name, score in scores.items():
         if name == "places":
             continue
         numbers[name] = score.mean().item()
         if name.startswith("coverage"):
-            sums = torch.zeros(int(which.max()) + 1).to(score).index_add(0, which, score - score.mean())
+            sums = scores["places"].long().bincount(score - score.mean())
             links = 1 / len(score) + 1 / scores["calibration_links"].mean().item()
             spread = sums.square().sum().item() / len(score) * len(sums) / max(len(sums) - 1, 1)
             numbers[f"{name}_error"] = math.sqrt(spread * links) if len(sums) > 1 else math.nan

@@ -16,9 +16,8 @@ Thinning = Callable[[Batch, torch.Generator], Batch]
 """A batch of whole labels -> the part of it that a training step reads."""
 
 
-NUMBERS, EACH = 512, 8
-"""Most numbers of a label that tell places apart, as arrays resolve fewer, and largest common factor of their stride
-and the columns: at least every eighth column counts."""
+NUMBERS = 512
+"""Most numbers of a label by which places are told apart; arrays resolve fewer."""
 
 
 class Metric(NamedTuple):
@@ -146,7 +145,7 @@ class Task(ABC):
         ``NUMBERS`` of their own, evenly spread."""
         flat = values[..., None].flatten(1)
         step, columns = math.ceil(flat.shape[1] / NUMBERS), values.shape[-1]
-        while math.gcd(step, columns) > EACH:
+        while math.gcd(step, columns) > 8:  # one that divides the columns would meet few of them
             step += 1
         return flat[:, ::step].float()
 
