@@ -1,6 +1,7 @@
 """Poses, quaternions, coordinates, harmonics, and grids of directions; conventions: docs/conventions.md."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -301,8 +302,15 @@ Directions = Grid | Rays
 """Directions of the values of a label or a map."""
 
 
-def even_places(lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], count: int) -> Float[Tensor, "g 3"]:
-    """About so many evenly spaced places in a box; an edge shorter than their distance has one."""
+def even_places(
+    lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], count: int, floors: Sequence[float] | Tensor = ()
+) -> Float[Tensor, "g 3"]:
+    """About so many evenly spaced places in a box; an edge shorter than their distance has one. With the heights of
+    ``floors`` they are on these."""
+    if len(floors):
+        at = lambda end, floor: torch.cat((end[:2], end.new_tensor([floor])))
+        each = max(1, count // len(floors))
+        return torch.cat([even_places(at(lower, floor), at(upper, floor), each) for floor in floors])
     lower, edges = torch.minimum(lower, upper), (upper - lower).abs()
     longest, pitch = edges.double().sort(descending=True).values, 0.0
     for dimensions in (3, 2, 1):  # an edge below the pitch has no part in it

@@ -107,7 +107,13 @@ class Location:
 
 
 class Candidates(NamedTuple):
-    """Candidate places (g, 3) [m], and logarithms of their prior probability and, but for a constant, density."""
+    """Candidate places, and what is known of them before anything is received.
+
+    Attributes:
+        places: (g, 3) [m].
+        prior: Logarithm of each candidate's probability (g,).
+        density: Logarithm of the prior density there, but for a constant (g,).
+    """
 
     places: Float[Tensor, "g 3"]
     prior: Float[Tensor, " g"]
@@ -136,9 +142,7 @@ class Fingerprints:
         task: Of the values.
         frequency: Carrier [Hz]; None if unknown.
         receivers: Their names.
-        places: Candidates (g, 3) [m].
-        prior: Logarithm of each candidate's probability before anything is received (g,).
-        density: Logarithm of the prior density there, but for a constant (g,).
+        candidates: Where the values are predicted, g places.
         axes: Of the numbers of a label, of independent errors of the same size (m, k).
         values: Predictions at the candidates along these axes (g, r, k).
         deviations: Standard deviations of labels of one number (g, r); else 1.
@@ -149,16 +153,14 @@ class Fingerprints:
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
         >>> prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=500)
-        >>> len(prints.places) == len(prints.values), prints.degrees in (0.25, 1, 4, 30)
+        >>> len(prints.candidates.places) == len(prints.values), prints.degrees in (0.25, 1, 4, 30)
         (True, True)
     """
 
     task: Task
     frequency: float | None
     receivers: Sequence[str]
-    places: Float[Tensor, "g 3"]
-    prior: Float[Tensor, " g"]
-    density: Float[Tensor, " g"]
+    candidates: Candidates
     axes: Float[Tensor, "m k"]
     values: Float[Tensor, "g r k"]
     deviations: Float[Tensor, "g r"]
@@ -242,13 +244,13 @@ def fingerprints(
         points = min(POINTS, max(FEWEST, int(SECONDS * len(some) / (time.perf_counter() - start))))
 
     def mapped(one: Model, known: Tensor) -> Fingerprints:
-        places, prior, density = candidates(box, points, links if region is None else None, known)
-        values, deviations = predicted(one, places, frequency)
+        made = candidates(box, points, scene.floors, links, known) if region is None else candidates(box, points)
+        values, deviations = predicted(one, made.places, frequency)
         axes, hears = torch.eye(values.shape[2]), torch.full(values.shape[:2], 0.5)
         if len(known) and tells:
-            hears = chance_to_hear(places, *heard_places(links, known), towards=0.5)
+            hears = chance_to_hear(made.places, *heard_places(links, known), towards=0.5)
         names = [receiver.name for receiver in scene.receivers]
-        return Fingerprints(scene.task, frequency, names, places, prior, density, axes, values, deviations, hears)
+        return Fingerprints(scene.task, frequency, names, made, axes, values, deviations, hears)
 
     known = tested = torch.zeros(0).long()
     if links is not None:
@@ -258,7 +260,7 @@ def fingerprints(
         raise ValueError(f"frequency must be that of known links, {carriers} Hz, got {frequency:.7g}; or give a region")
     # A receiver may have no link of a transmission because that is in the test.
     tells = links is None or not torch.isin(*(rows_of(links)[part] for part in (known, tested))).any()
-    made = mapped(model, known)
+    whole = mapped(model, known)
     tries: list[Any] = []
     for one, part, others in unseen(model, links) if links is not None else ():
         one.calibration = model.calibration
@@ -283,8 +285,8 @@ def fingerprints(
         both = [squares(one, asked[some] @ one.axes, unknown) for unknown in (False, True)]
         if len(some):
             held.append(Try(one, both, truth[some]))
-    made = along(made, [errors for *_, errors in tries])
-    return fitted(made, held) if held else made
+    whole = along(whole, [errors for *_, errors in tries])
+    return fitted(whole, held) if held else whole
 
 
 @torch.no_grad()
@@ -322,7 +324,7 @@ def locate(
         >>> prints = gaigs.fingerprints(gaigs.train("gaussian_process", links), links, points=500)
         >>> walk = [[-50.0, -48.0, -55.0, -61.0], [-51.0, -47.0, -56.0, -60.0]]  # [dBm]
         >>> found = gaigs.locate(prints, walk, step=0.5)
-        >>> found.mean.shape, found.region.shape == (2, len(prints.places))
+        >>> found.mean.shape, found.region.shape == (2, len(found.places))
         (torch.Size([2, 3]), True)
 
     Source: Haeberlen et al., Practical robust localization over large-scale 802.11 wireless networks, 2004, for the
@@ -361,7 +363,7 @@ def posterior(
     # In parts: a value takes 60 bytes a candidate, and its posterior 9. A track is one part.
     for part in asked.split(64 if step is None else len(asked)):
         logarithms = log_likelihood(*squares(prints, part @ prints.axes, unknown_power), prints.degrees, prints.temper)
-        own, logarithms = Candidates(prints.places, prints.prior, prints.density), logarithms + prints.prior
+        own, logarithms = prints.candidates, logarithms + prints.candidates.prior
         if step is not None:
             own, logarithms = track(own, logarithms, step, ~part.isnan().all((1, 2)))
         probabilities, heights = torch.softmax(logarithms, 1), logarithms - own.prior + own.density
@@ -408,7 +410,7 @@ def run(config: dict, folder: Path) -> None:
         f"share_{100 * options['level']:g}": found.sizes.mean().item(),
         "milliseconds": 1e3 * taken / len(truth),
     }
-    numbers |= {"transmissions": len(truth), "candidates": len(prints.places), "map_seconds": made}
+    numbers |= {"transmissions": len(truth), "candidates": len(prints.values), "map_seconds": made}
     numbers["calibrated"] = found.calibrated
     numbers |= {"task": links.task.name, "split": links.split.name}
     folder.mkdir(parents=True, exist_ok=True)
@@ -459,23 +461,32 @@ def figure(
 
 
 def candidates(
-    box: Float[Tensor, "2 3"], points: int, links: Links | None, known: Int[Tensor, " k"]
-) -> tuple[Float[Tensor, "g 3"], Float[Tensor, " g"], Float[Tensor, " g"]]:
-    """Places, and logarithms of their prior probability and density: a grid, with links denser about known places.
+    box: Float[Tensor, "2 3"],
+    points: int,
+    floors: Sequence[float] | Float[Tensor, " f"] = (),
+    links: Links | None = None,
+    known: Int[Tensor, " k"] | None = None,
+) -> Candidates:
+    """A grid in the box or on separate floors, with links denser about known places.
 
-    The density about known places is a sum of normal ones. Places of other folds are most likely under their width.
+    The density about known places is a sum of normal ones, each on its floor. Places of other folds are most likely
+    under their width.
     """
     if links is None:
-        places = even_places(box[0], box[1], points)
-        return places, torch.full((len(places),), -math.log(len(places))), torch.zeros(len(places))
+        places = even_places(box[0], box[1], points, floors)
+        return Candidates(places, torch.full((len(places),), -math.log(len(places))), torch.zeros(len(places)))
     sites, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
     folds = torch.zeros(len(sites), dtype=torch.long).index_copy(0, which, folds_of(links, known))
     edges = (box[1] - box[0]).double()
     extended = edges > 1e-3 * edges.max()
-    dimensions, volume = int(extended.sum()), edges[extended].prod()
+    extended[2] &= not len(floors)
+    dimensions, volume = int(extended.sum()), edges[extended].prod() * max(1, len(floors))
+    floor_of = lambda places: (places[:, 2:] - floors).abs().argmin(1)
 
     def log_density(asked: Tensor, width: float, own: Tensor | None = None) -> Tensor:
         squared = distances(asked[:, extended], sites[:, extended]).square_()
+        if len(floors):
+            squared = squared.masked_fill(floor_of(asked)[:, None] != floor_of(sites), math.inf)
         if own is not None:
             squared = squared.masked_fill(own[:, None] == folds, math.inf)
         size = math.log(1 - ELSEWHERE) - math.log(len(sites)) - dimensions * math.log(width * math.sqrt(2 * math.pi))
@@ -485,12 +496,12 @@ def candidates(
     some = evenly(torch.arange(len(sites)), POINTS // 20)
     widths = torch.logspace(math.log10(links.scene.spacing / 4), math.log10(edges.norm()), 24).tolist()
     width = max(widths, key=lambda width: log_density(sites[some], width, folds[some]).mean().item())
-    even, count = even_places(box[0], box[1], max(1, points // 4)), points - points // 4
+    even, count = even_places(box[0], box[1], max(1, points // 4), floors), points - points // 4
     noise = width * extended * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
     places = torch.cat((even, (sites[torch.arange(count) * len(sites) // count] + noise).float()))
     shares = torch.tensor([ELSEWHERE / len(even), (1 - ELSEWHERE) / count]).log()
     density = torch.cat([log_density(part.double(), width) for part in places.split(1024)])
-    return places, shares.repeat_interleave(torch.tensor([len(even), count])), density.float()
+    return Candidates(places, shares.repeat_interleave(torch.tensor([len(even), count])), density.float())
 
 
 def predicted(
@@ -612,7 +623,7 @@ def squares(
     of receivers, and logarithms of the probability that these receivers hear the value and no other; with
     ``unknown_power`` the least distance with any offset of the value, or any factor of the prediction, which a factor
     of the value leaves as it is, and 0 in place of these logarithms."""
-    shape = len(asked), len(prints.places)
+    shape = len(asked), len(prints.values)
     total, logarithms, count = torch.zeros(shape), torch.zeros(shape), torch.zeros(len(asked))
     with_all, alone, powers = torch.zeros(shape), torch.zeros(shape), torch.zeros(len(asked), 1)
     for receiver in range(asked.shape[1]):
@@ -675,9 +686,10 @@ class Try(NamedTuple):
 
         Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation, 2007, section 4.3.
         """
-        probabilities = torch.softmax(log_likelihood(*self.squares[0], degrees, temper) + self.prints.prior, 1)
+        places, prior, _ = self.prints.candidates
+        probabilities = torch.softmax(log_likelihood(*self.squares[0], degrees, temper) + prior, 1)
         rng = torch.Generator().manual_seed(0)
-        drawn = self.prints.places[torch.multinomial(probabilities, 128, True, generator=rng)]
+        drawn = places[torch.multinomial(probabilities, 128, True, generator=rng)]
         apart = (drawn[:, ::2] - drawn[:, 1::2]).norm(dim=2).mean(1)
         return ((drawn - self.truth[:, None]).norm(dim=2).mean(1) - apart / 2).sum().item()
 
@@ -691,8 +703,7 @@ def fitted(prints: Fingerprints, tries: Sequence[Try]) -> Fingerprints:
     for one, own in zip(tries, scores, strict=True):
         choice = choices[int((scores.sum(0) - own if len(tries) > 1 else own).argmin())]
         likelihoods = torch.stack([log_likelihood(*part, *choice).float() for part in one.squares])
-        there = Candidates(one.prints.places, one.prints.prior, one.prints.density)
-        held.append(Held(there, likelihoods, one.truth))
+        held.append(Held(one.prints.candidates, likelihoods, one.truth))
     return replace(prints, degrees=degrees, temper=temper, held=tuple(held))
 
 

@@ -166,10 +166,7 @@ def survey(
         if len(box) != 2:
             advice = "\ngive places that can be measured as candidates" if len(box) > 2 else ""
             raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points{advice}")
-        even = even_places(box[0], box[1], POINTS)
-        if is_whole and len(floors := model.scene.floors):  # places are on floors, not between them
-            levels = [torch.cat((box[:, :2], floor.expand(2, 1)), 1) for floor in floors]
-            even = torch.cat([even_places(lower, upper, POINTS // len(floors)) for lower, upper in levels])
+        even = even_places(box[0], box[1], POINTS, model.scene.floors if is_whole else ())
     places = even if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
     beside = even[:0] if candidates is None else even
     points, stated = torch.cat((places, beside)), slice(len(places) if len(beside) else 0, None)

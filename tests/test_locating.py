@@ -12,6 +12,7 @@ import gaigs
 from gaigs import locating
 from gaigs.geometry import ExtrapolationWarning
 from gaigs.locating import (
+    Candidates,
     Fingerprints,
     geometric_median,
     independent,
@@ -35,7 +36,7 @@ def scalars(values, deviations, hearing=None, **options):
     parts = torch.tensor(values)[..., None], torch.tensor(deviations)
     parts = *parts, torch.full_like(parts[1], 0.5) if hearing is None else torch.tensor(hearing)
     names = [f"rx{number}" for number in range(len(values[0]))]
-    return Fingerprints(task, None, names, places, *even, torch.eye(1), *parts, **options)
+    return Fingerprints(task, None, names, Candidates(places, *even), torch.eye(1), *parts, **options)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +101,7 @@ def test_a_receiver_that_hears_nothing_tells_where_a_transmitter_is(parted):
         links = replace(links, split=replace(links.split, test=torch.arange(len(links))[1::2]))
     prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=400)
     for value, is_right in (([-50.0, -50.0], False), ([-50.0, math.nan], True)):
-        likely = gaigs.locate(prints, value).probabilities[0] @ (prints.places[:, 0] > 5).double()
+        likely = gaigs.locate(prints, value).probabilities[0] @ (prints.candidates.places[:, 0] > 5).double()
         assert abs(likely - 0.5) < 0.35 if parted else (likely > 0.85) == is_right and abs(likely - 0.5) > 0.3
 
 
@@ -171,7 +172,7 @@ def test_transmitters_are_nearer_than_their_neighbours_and_in_their_regions():
     assert own < other
     assert found.holds(truth).double().mean() >= 0.75
     assert posterior(prints, asked, False, None, 0.5).region.sum() < 0.7 * found.region.sum()
-    torch.testing.assert_close(prints.prior.exp().sum(), torch.tensor(1.0))
+    torch.testing.assert_close(prints.candidates.prior.exp().sum(), torch.tensor(1.0))
 
 
 def test_values_are_located_in_parts(rssi, monkeypatch):
@@ -209,8 +210,8 @@ def test_prior_follows_the_known_places_and_a_region_replaces_it(rssi):
     apart = lambda places: torch.cdist(places, known).amin(1).median()
     box = torch.stack((known.amin(0), known.amax(0)))
     even = gaigs.fingerprints(model, region=box, points=1000)
-    assert apart(prints.places) < 0.95 * apart(even.places)
-    assert even.prior.unique().numel() == 1
+    assert apart(prints.candidates.places) < 0.95 * apart(even.candidates.places)
+    assert even.candidates.prior.unique().numel() == 1
     assert not len(even.drops())
     assert not gaigs.locate(even, [-50.0, -60.0, -55.0, -70.0]).calibrated
 
@@ -367,3 +368,15 @@ def test_the_command_locates_the_test_transmitters_of_a_run(tmp_path, capsys):
     assert "8 transmitters: median" in capsys.readouterr().out
     with pytest.raises(ValueError, match="needs the folder of a finished run"):
         gaigs.run(gaigs.compose("command=locate"), tmp_path / "found")
+
+
+def test_candidates_are_on_floors():
+    rng = np.random.default_rng(0)
+    places = np.concatenate((rng.uniform(0, 6, (40, 2)), np.repeat([[1.0], [4.2]], 20, 0)), 1)
+    labels = rng.normal(-60, 8, (40, 2))
+    links = gaigs.links(task="rssi", transmitters=places, receivers=[[0, 0, 2], [6, 6, 5]], labels=labels)
+    model = gaigs.train("knn", links)
+    for prints in (gaigs.fingerprints(model, links, points=200), gaigs.fingerprints(model, points=200)):
+        own, prior, _ = prints.candidates
+        assert {*own[:, 2].tolist()} == {1.0, torch.tensor(4.2).item()}
+        torch.testing.assert_close(prior.exp().sum(), torch.tensor(1.0))
