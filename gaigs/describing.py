@@ -14,10 +14,11 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from gaigs.antenna import lacking
-from gaigs.data import Links, load, phase_doubts, shortened
+from gaigs.data import Links, load, phase_doubts
 from gaigs.data.doubts import doubts, places_doubts
 from gaigs.data.readings import marks_of
 from gaigs.io.files import write_text
+from gaigs.io.tables import shortened
 from gaigs.kriging.links import distances
 from gaigs.query import evenly
 from gaigs.registry import check_instance

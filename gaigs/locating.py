@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from matplotlib import rc_context
@@ -18,8 +19,9 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
-from gaigs.geometry import ExtrapolationWarning, even_places
+from gaigs.geometry import ExtrapolationWarning, Frame, even_places
 from gaigs.io.files import write_text
+from gaigs.io.tables import read_table, refuse
 from gaigs.kriging.intervals import fewest
 from gaigs.kriging.links import chance_to_hear, distances, folds_of
 from gaigs.model import Model
@@ -44,7 +46,7 @@ added."""
 
 DEGREES, FEW = (0.25, 1.0, 4.0, 30.0), 20
 """Degrees of freedom of the likelihood to choose from, and fewest fingerprints that choose: fewer hardly show whether
-one of twenty is an outlier, and take the heaviest tails."""
+one of twenty is an outlier. Levels then keep the likelihood of ``Fingerprints``, others take the heaviest tails."""
 
 TEMPERS = tuple(2.0 ** (power / 2) for power in range(-8, 17))
 """Exponents of the likelihood to choose from."""
@@ -60,6 +62,9 @@ spreads: regions of tracks reach far beyond the likeliest candidates."""
 
 FARTHEST = 5.0
 """Deviations that a reading may be beyond all predictions without a warning, and half of their range at least."""
+
+CELL = 8
+"""Mean number of candidates in a cell of the map of the posterior."""
 
 STAYS = 10
 """Most values of a held-out track at each of its places."""
@@ -78,12 +83,14 @@ class Location:
         region: True for candidates in the region that holds the transmitter with the asked probability (n, g).
         sizes: Prior probability of each region (n,).
         calibrated: True if held-out fingerprints set the region; else the posterior does, often too small.
+        frame: Place of x and y on a map; None if unknown.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
         >>> found = gaigs.locate(gaigs.train("knn", links), [-50.0, -48.0, -55.0, -61.0])
         >>> found.holds(found.likeliest)
         tensor([True])
+        >>> found.save("locate.csv")
     """
 
     places: Float[Tensor, "g 3"]
@@ -94,6 +101,7 @@ class Location:
     region: Bool[Tensor, "n g"]
     sizes: Float[Tensor, " n"]
     calibrated: bool
+    frame: Frame | None = None
 
     def __repr__(self) -> str:
         count, place = len(self.median), ", ".join(f"{x:.2f}" for x in self.median[0].tolist())
@@ -104,6 +112,21 @@ class Location:
         """True for each value whose region holds a place: that has the candidate nearest to it."""
         near = distances(places.double(), self.places.double()).argmin(1)
         return self.region.gather(1, near[:, None])[:, 0]
+
+    def save(self, path: str | Path) -> None:
+        """Writes a CSV table of each value's mean, median and likeliest place, with a ``frame`` also their eastings and
+        northings, and the size of its region."""
+        write_table(path, self.columns())
+
+    def columns(self) -> dict[str, Tensor]:
+        """Columns (n,) of ``save`` by their names."""
+        found: dict[str, Tensor] = {}
+        for name in ("mean", "median", "likeliest"):
+            x, y, z = getattr(self, name).double().T
+            found |= {f"{name}_x": x, f"{name}_y": y, f"{name}_z": z}
+            if self.frame is not None:
+                found |= {f"{name}_easting": self.frame.x + x, f"{name}_northing": self.frame.y + y}
+        return found | {"region_share": self.sizes}
 
 
 class Candidates(NamedTuple):
@@ -149,6 +172,7 @@ class Fingerprints:
         hearing: Probability that each receiver hears a transmitter there (g, r); without links a half.
         degrees, temper: Of the likelihood, see ``log_likelihood``.
         held: Held-out fingerprints of each fold, which calibrate regions; empty without links.
+        frame: Place of x and y on a map; None if unknown.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -168,6 +192,7 @@ class Fingerprints:
     degrees: float = 4.0
     temper: float = 1.0
     held: tuple[Held, ...] = ()
+    frame: Frame | None = None
     _drops: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -250,7 +275,8 @@ def fingerprints(
         if len(known) and tells:
             hears = chance_to_hear(made.places, *heard_places(links, known), towards=0.5)
         names = [receiver.name for receiver in scene.receivers]
-        return Fingerprints(scene.task, frequency, names, made, axes, values, deviations, hears)
+        parts = scene.task, frequency, names, made, axes, values, deviations, hears
+        return Fingerprints(*parts, frame=scene.frame)
 
     known = tested = torch.zeros(0).long()
     if links is not None:
@@ -379,32 +405,45 @@ def posterior(
         sizes = (region * own.prior.softmax(0)).sum(1)
         found.append((probabilities, mean, median, own.places[order[:, 0]], region, sizes))
     probabilities, mean, median, likeliest, region, sizes = map(torch.cat, zip(*found, strict=True))
-    return Location(own.places, probabilities, mean, median, likeliest, region, sizes, calibrated)
+    return Location(own.places, probabilities, mean, median, likeliest, region, sizes, calibrated, prints.frame)
 
 
 def run(config: dict, folder: Path) -> None:
-    """Locates the test transmitters of a finished run; writes ``locate.json``, ``.csv`` and ``.png`` into a folder."""
+    """Locates the transmitters of received values, or those of a finished run's test; writes ``locate.csv``,
+    ``locate.png`` and, of a test, ``locate.json`` into a folder."""
     if config["folder"] is None:
         raise ValueError("command=locate needs the folder of a finished run; add folder=runs/...")
     model, links, options = model_of(config["folder"]), links_of(config["folder"]), dict(config["locate"])
-    own = {name: options.pop(name) for name in ("region", "frequency", "points")}
+    own, value = {name: options.pop(name) for name in ("region", "frequency", "points")}, options.pop("value")
+    value = read_value(Path(value), links) if isinstance(value, str) else value
     start = time.perf_counter()
     prints = call("locate", fingerprints, own, model=model, links=links)
     made = time.perf_counter() - start
     index, rows = (at_carrier(links, prints.frequency, *parts) for parts in (("test",), ("train", "validation")))
+    known, places = received(links, rows)
+    if value is not None:
+        found = call("locate", locate, options, model=prints, value=value)
+        folder.mkdir(parents=True, exist_ok=True)
+        found.save(folder / "locate.csv")
+        style.save(map_figure(found, places, options["level"]), folder / "locate.png")
+        print(str(found)[1:-1])
+        conclude(prints, found, options["level"], folder)
+        return
     if not len(index):
         raise ValueError("the run has no test links at this carrier; take another split or locate.frequency")
-    (asked, truth), (known, places) = received(links, index), received(links, rows)
+    asked, truth = received(links, index)
     start = time.perf_counter()
     found = call("locate", posterior, options, prints=prints, asked=asked)
     taken = time.perf_counter() - start
     _, groups = places.unique(dim=0, return_inverse=True)
-    guesses = {"locate": found.mean, "median": found.median, "likeliest": found.likeliest}
-    guesses["knn"] = neighbours(asked, known, places, groups)
+    strip = without_power if options["unknown_power"] else lambda prints: prints
+    guess = neighbours(strip(asked), strip(known), places, groups)
+    guesses = {"mean": found.mean, "median": found.median, "likeliest": found.likeliest, "knn": guess}
     errors = {name: (guess - truth).norm(dim=1) for name, guess in guesses.items()}
     numbers: dict[str, Any] = {
         name: {"median_m": error.median().item(), "mean_m": error.mean().item()} for name, error in errors.items()
     }
+    numbers = {"locate": numbers.pop("mean"), **numbers}
     numbers["locate"] |= {
         f"region_{100 * options['level']:g}": found.holds(truth).double().mean().item(),
         f"share_{100 * options['level']:g}": found.sizes.mean().item(),
@@ -415,21 +454,72 @@ def run(config: dict, folder: Path) -> None:
     numbers |= {"task": links.task.name, "split": links.split.name}
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "locate.json", json.dumps(numbers, indent=2) + "\n")
-    columns = torch.cat((truth, *guesses.values(), *(error[:, None] for error in errors.values())), 1)
-    names = [f"{part}{axis}" for part in ("", *(f"{name}_" for name in guesses)) for axis in "xyz"]
-    names += [f"{name}_error_m" for name in errors]
-    lines = (",".join(f"{x:.3f}" for x in row) for row in columns.tolist())
-    write_text(folder / "locate.csv", "\n".join((",".join(names), *lines, "")))
+    named = lambda places, prefix: {f"{prefix}{axis}": column for axis, column in zip("xyz", places.T, strict=True)}
+    own_errors = {f"{name}_error": error for name, error in errors.items()}
+    write_table(folder / "locate.csv", named(truth, "") | found.columns() | named(guess, "knn_") | own_errors)
     style.save(figure(truth, found.mean, places, errors), folder / "locate.png")
     shown = numbers["locate"], numbers["knn"]
     words = (f"median {part['median_m']:.3g} m, mean {part['mean_m']:.3g} m" for part in shown)
     print(f"{len(truth)} transmitters: {'; nearest neighbours '.join(words)}")
+    conclude(prints, found, options["level"], folder)
+
+
+def conclude(prints: Fingerprints, found: Location, level: float, folder: Path) -> None:
+    """Prints what a user has to know of the results in a folder."""
     if not found.calibrated:
         count = sum(len(one.truth) for one in prints.held)
-        print(f"regions are not calibrated: {count} fingerprints are held out, and {fewest(options['level'])} needed")
-    if (frame := model.scene.frame) is not None:
-        print(f"x and y are metres from ({frame.x:.10g}, {frame.y:.10g}) of EPSG:{frame.epsg}")
+        print(f"regions are not calibrated: {count} fingerprints are held out, and {fewest(level)} needed")
+    if found.frame is not None:
+        print(f"easting and northing are those of EPSG:{found.frame.epsg}")
     print(f"results: {folder}")
+
+
+def read_value(file: Path, links: Links) -> object:
+    """Values for ``locate`` from a file: an array (n, r, *shape) of NumPy or, of RSSI, a table with a column for each
+    receiver's name, whose cells are empty where it has not heard a value."""
+    file = file.expanduser()
+    if file.suffix.lower() == ".npy":
+        return np.load(file)
+    if not links.task.is_scalar:
+        raise ValueError(f"locate.value must be a .npy array of labels of each receiver, got {file}")
+    table = read_table(file, "a heading with names of receivers, and one value a line")
+    bad = np.isinf(table.numbers)
+    wrong = {row + 2: table.cell(row, int(bad[row].argmax())) for row in bad.any(1).nonzero()[0].tolist()}
+    refuse(file, wrong, "a level [dBm], or an empty cell")
+    return dict(zip(table.names, table.numbers.T, strict=True))
+
+
+def write_table(path: str | Path, columns: Mapping[str, Tensor]) -> None:
+    """Writes columns as a CSV table; metres have four decimals."""
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    lines = (",".join(f"{round(x, 4):.11g}" for x in row) for row in rows)
+    write_text(Path(path), "\n".join((",".join(columns), *lines, "")))
+
+
+def map_figure(found: Location, known: Float[Tensor, "k 3"], level: float) -> Figure:
+    """Where the transmitters are from above: the probability of cells, of a single value also its region."""
+    places, probabilities = found.places[:, :2].double().numpy(), found.probabilities.mean(0).numpy()
+    low, high = np.quantile(places[probabilities > 0], (0.001, 0.999), 0)
+    low, high = np.minimum(low, known[:, :2].numpy().min(0)), np.maximum(high, known[:, :2].numpy().max(0))
+    edges = np.maximum(high - low, 1e-3 * (high - low).max())
+    counts = np.maximum(1, np.round(edges * np.sqrt(len(places) / CELL / edges.prod()))).astype(int)
+    across, up = (np.linspace(start, start + edge, n + 1) for start, edge, n in zip(low, edges, counts, strict=True))
+    middles = [(lines[1:] + lines[:-1]) / 2 for lines in (across, up)]
+    summed = lambda weights: np.histogram2d(places[:, 0], places[:, 1], (across, up), weights=weights)[0].T
+    with rc_context(style.STYLE):
+        drawn = Figure(figsize=(0.6 * style.PAGE, 0.55 * style.PAGE), layout="compressed")
+        axis = drawn.subplots()
+        image = axis.pcolormesh(across, up, 100 * summed(probabilities), cmap="Blues", rasterized=True)
+        drawn.colorbar(image, ax=axis, label="probability of a cell [%]")
+        axis.plot(*known[:, :2].T.numpy(), "o", markersize=1.5, color=style.GREY, label="known places")
+        axis.plot(*found.mean[:, :2].T.numpy(), "o", markersize=4, color=style.ORANGE, label="mean")
+        if len(found.mean) == 1 and min(counts) > 1:
+            inside = summed(found.region[0].double().numpy()) / np.maximum(1, summed(np.ones(len(places))))
+            axis.contour(*middles, inside, [0.5], colors=style.ORANGE, linewidths=0.8)
+            axis.plot([], [], color=style.ORANGE, lw=0.8, label=f"region of {100 * level:g} %")
+        axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+        drawn.legend(loc="outside lower left", ncols=3)
+    return drawn
 
 
 def figure(
@@ -447,7 +537,7 @@ def figure(
         left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         shares = (torch.arange(len(truth)) + 0.5) / len(truth)
         neighbours, _ = style.looks(["knn"])["knn"]
-        for name, colour, words in (("locate", style.ORANGE, "estimates"), ("knn", neighbours, "nearest neighbours")):
+        for name, colour, words in (("mean", style.ORANGE, "estimates"), ("knn", neighbours, "nearest neighbours")):
             right.plot(errors[name].sort().values.numpy(), shares.numpy(), color=colour, label=words)
         right.set(xlabel="error [m]", ylabel="share of transmitters", ylim=(0, 1), xlim=(0, None))
         right.grid()
@@ -470,7 +560,7 @@ def candidates(
     """A grid in the box or on separate floors, with links denser about known places.
 
     The density about known places is a sum of normal ones, each on its floor. Places of other folds are most likely
-    under their width.
+    under their width, which along an axis is at most the deviation of an even spread over the box.
     """
     if links is None:
         places = even_places(box[0], box[1], points, floors)
@@ -478,26 +568,29 @@ def candidates(
     sites, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
     folds = torch.zeros(len(sites), dtype=torch.long).index_copy(0, which, folds_of(links, known))
     edges = (box[1] - box[0]).double()
+    edges[2] *= not len(floors)
     extended = edges > 1e-3 * edges.max()
-    extended[2] &= not len(floors)
-    dimensions, volume = int(extended.sum()), edges[extended].prod() * max(1, len(floors))
+    volume = edges[extended].prod() * max(1, len(floors))
     floor_of = lambda places: (places[:, 2:] - floors).abs().argmin(1)
 
+    along_axes = lambda width: (edges / math.sqrt(12)).clamp_max(width)
+
     def log_density(asked: Tensor, width: float, own: Tensor | None = None) -> Tensor:
-        squared = distances(asked[:, extended], sites[:, extended]).square_()
+        scales = along_axes(width)[extended]
+        squared = distances(asked[:, extended] / scales, sites[:, extended] / scales).square_()
         if len(floors):
             squared = squared.masked_fill(floor_of(asked)[:, None] != floor_of(sites), math.inf)
         if own is not None:
             squared = squared.masked_fill(own[:, None] == folds, math.inf)
-        size = math.log(1 - ELSEWHERE) - math.log(len(sites)) - dimensions * math.log(width * math.sqrt(2 * math.pi))
-        near = torch.logsumexp(squared / (-2 * width**2), 1) + size
+        size = math.log(1 - ELSEWHERE) - math.log(len(sites)) - (scales * math.sqrt(2 * math.pi)).log().sum()
+        near = torch.logsumexp(squared / -2, 1) + size
         return torch.logaddexp(near, (ELSEWHERE / volume).log())
 
     some = evenly(torch.arange(len(sites)), POINTS // 20)
     widths = torch.logspace(math.log10(links.scene.spacing / 4), math.log10(edges.norm()), 24).tolist()
     width = max(widths, key=lambda width: log_density(sites[some], width, folds[some]).mean().item())
     even, count = even_places(box[0], box[1], max(1, points // 4), floors), points - points // 4
-    noise = width * extended * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    noise = along_axes(width) * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
     places = torch.cat((even, (sites[torch.arange(count) * len(sites) // count] + noise).float()))
     shares = torch.tensor([ELSEWHERE / len(even), (1 - ELSEWHERE) / count]).log()
     density = torch.cat([log_density(part.double(), width) for part in places.split(1024)])
@@ -695,16 +788,15 @@ class Try(NamedTuple):
 
 
 def fitted(prints: Fingerprints, tries: Sequence[Try]) -> Fingerprints:
-    """The likelihood with the least energy score of held-out values, and these values by that of the other folds."""
-    choices = CHOICES[: len(TEMPERS)] if sum(len(one.truth) for one in tries) < FEW else CHOICES
-    scores = torch.tensor([[one.score(*choice) for choice in choices] for one in tries])
-    degrees, temper = choices[int(scores.sum(0).argmin())]
-    held = []
-    for one, own in zip(tries, scores, strict=True):
-        choice = choices[int((scores.sum(0) - own if len(tries) > 1 else own).argmin())]
-        likelihoods = torch.stack([log_likelihood(*part, *choice).float() for part in one.squares])
-        held.append(Held(one.prints.candidates, likelihoods, one.truth))
-    return replace(prints, degrees=degrees, temper=temper, held=tuple(held))
+    """The likelihood with the least energy score of held-out values, and what it says of them; few labels of one number
+    keep that of ``prints``."""
+    choices = CHOICES
+    if sum(len(one.truth) for one in tries) < FEW:
+        choices = CHOICES[: len(TEMPERS)] if prints.task.shape else ((prints.degrees, prints.temper),)
+    choice = min(choices, key=lambda choice: sum(one.score(*choice) for one in tries))
+    likelihoods = [torch.stack([log_likelihood(*part, *choice).float() for part in one.squares]) for one in tries]
+    held = tuple(Held(one.prints.candidates, own, one.truth) for one, own in zip(tries, likelihoods, strict=True))
+    return replace(prints, degrees=choice[0], temper=choice[1], held=held)
 
 
 def walk(places: Float[Tensor, "n 3"], step: float) -> Int[Tensor, " k"]:
@@ -790,6 +882,13 @@ def smoothed(
         backward.append(moved(own + backward[-1], *pair))
     found = torch.stack(forward) + torch.stack(backward[::-1])
     return torch.full_like(logarithms, -math.inf).scatter(1, indices, found)
+
+
+def without_power(prints: Float[Tensor, "n r m"]) -> Float[Tensor, "n r m"]:
+    """Fingerprints less their mean level, or over their norm: of all receivers that hear a transmission."""
+    if prints.shape[2] == 1:
+        return prints - prints.nanmean(1, keepdim=True)
+    return prints / prints.nan_to_num(0).flatten(1).norm(dim=1)[:, None, None]
 
 
 def neighbours(

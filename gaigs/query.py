@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from gaigs.geometry import FAR, WITHIN, Directions, Grid, Rays
@@ -41,6 +41,12 @@ def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
     if len(index) <= most:
         return index
     return index[torch.linspace(0, len(index) - 1, most).round().long()]
+
+
+def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped[Tensor, "k m"]:
+    """At most so many numbers of each label, evenly spread: arrays resolve fewer."""
+    numbers = labels[..., None].flatten(1)
+    return numbers[:, evenly(torch.arange(numbers.shape[1]), most)]
 
 
 def as_tensor(name: str, values: object, expected: str) -> Tensor:

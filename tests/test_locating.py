@@ -216,11 +216,12 @@ def test_prior_follows_the_known_places_and_a_region_replaces_it(rssi):
     assert not gaigs.locate(even, [-50.0, -60.0, -55.0, -70.0]).calibrated
 
 
-def test_few_fingerprints_do_not_rule_outliers_out():
-    links = gaigs.links("synthetic_rssi", transmitters=16, order=0)
+@pytest.mark.parametrize(("data", "degrees"), [("synthetic_rssi", 4.0), ("synthetic", min(locating.DEGREES))])
+def test_few_fingerprints_do_not_rule_outliers_out(data, degrees):
+    links = gaigs.links(data, transmitters=16, order=0)
     prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=200)
     assert 0 < sum(len(one.truth) for one in prints.held) < locating.FEW
-    assert prints.degrees == min(locating.DEGREES)  # the least energy score of these would be at 30
+    assert prints.degrees == degrees  # the least energy score of the levels would be at 30
 
 
 def test_held_out_fingerprints_are_located_among_the_other_places(monkeypatch):
@@ -357,15 +358,26 @@ def test_the_command_locates_the_test_transmitters_of_a_run(tmp_path, capsys):
     gaigs.run(gaigs.compose(*words), tmp_path / "run")
     command = ("command=locate", f"folder={tmp_path / 'run'}", "locate.points=300")
     gaigs.run(gaigs.compose(*command), tmp_path / "found")
-    assert {path.name for path in (tmp_path / "found").iterdir()} == {"locate.csv", "locate.json", "locate.png"}
+    files = {"locate.csv", "locate.json", "locate.png"}
+    assert {path.name for path in (tmp_path / "found").iterdir()} == files
     numbers = json.loads((tmp_path / "found" / "locate.json").read_text())
     rows = (tmp_path / "found" / "locate.csv").read_text().splitlines()
     assert numbers["transmissions"] == len(rows) - 1 == 8
-    errors = [float(row.split(",")[rows[0].split(",").index("locate_error_m")]) for row in rows[1:]]
+    errors = [float(row.split(",")[rows[0].split(",").index("mean_error")]) for row in rows[1:]]
     assert numbers["locate"]["mean_m"] == pytest.approx(np.mean(errors), abs=1e-3)
     assert {"median_m", "mean_m", "region_90", "share_90"} <= numbers["locate"].keys()
     assert {"median_m", "mean_m"} == numbers["knn"].keys()
     assert "8 transmitters: median" in capsys.readouterr().out
+    values = tmp_path / "values.csv"
+    values.write_text("west;south;north\n-50,5;-48;\n-50,5;-48;-61\n")
+    for name, value in (("one", "[-50.5,-48,null,null]"), ("many", str(values))):
+        gaigs.run(gaigs.compose(*command, f"locate.value={value}"), tmp_path / name)
+        assert {path.name for path in (tmp_path / name).iterdir()} == files - {"locate.json"}
+    one, many = ((tmp_path / name / "locate.csv").read_text().splitlines() for name in ("one", "many"))
+    assert (many[:2], len(many)) == (one, 3)
+    values.write_text("west,south\n-50.5,far\n")
+    with pytest.raises(ValueError, match=r"line 2: expected a level .* got 'far' in column south"):
+        gaigs.run(gaigs.compose(*command, f"locate.value={values}"), tmp_path / "one")
     with pytest.raises(ValueError, match="needs the folder of a finished run"):
         gaigs.run(gaigs.compose("command=locate"), tmp_path / "found")
 

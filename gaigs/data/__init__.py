@@ -1,7 +1,7 @@
 """Measured and simulated links, each from one transmitter position to one receiver, with their labels."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from gaigs.data.doubts import doubts
 from gaigs.data.gateways import estimate_place
 from gaigs.geometry import Frame, Pose
 from gaigs.io.images import GreyImages
+from gaigs.io.tables import shortened
 from gaigs.phases import MANY, phase_sign, strange_parts, unknown_phase
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
@@ -336,9 +337,3 @@ def with_places(links: Links) -> Links:
         uncertainties=deviations,
         remarks="; ".join(filter(None, (links.remarks, remark))),
     )
-
-
-def shortened(names: Sequence[str], most: int = 10) -> str:
-    """Names joined by commas; of many the first, and the number of the others."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from gaigs import configuration
 from gaigs.antenna import Array, Receiver
-from gaigs.data import Links, divide, load, shortened
+from gaigs.data import Links, divide, load
 from gaigs.data.readings import loud_remark, marks_of
 from gaigs.geometry import Frame, Pose
-from gaigs.io.tables import number_places
+from gaigs.io.tables import number_places, shortened
 from gaigs.query import Query, as_numbers, as_positions, as_tensor, check_carrier
 from gaigs.registry import check_instance, check_type, registry, suggest
 from gaigs.task import Task, check_range

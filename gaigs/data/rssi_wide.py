@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from gaigs.data import Links, shortened
+from gaigs.data import Links
 from gaigs.data.maps import to_utm
 from gaigs.data.readings import LOUDEST, QUIETEST, carriers_of, gateway, loud_remark, marks_of
 from gaigs.geometry import FAR, Frame
@@ -35,34 +35,8 @@ NAMES = {"name", "gateway", "ap", "id", "mac", "bssid", "ssid", "station", "anch
 
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
 
-EMPTY = {"", "nan", "na", "n/a", "null", "none", "-inf", "-"}
-"""Cells that mean "not heard" in any table."""
-
 WEAK = -20.0
 """Upper bound of the median of a gateway's column [dBm]; columns of larger numbers are something else."""
-
-
-class Wide(NamedTuple):
-    """A table in numbers: NaN for an empty cell, infinity for another text."""
-
-    file: Path
-    lines: list[str]
-    delimiter: str
-    names: list[str]
-    numbers: Float[ndarray, "rows columns"]
-
-    def cell(self, row: int, column: int) -> str:
-        """The text of a cell with its column, for messages."""
-        text = tables.split_cells(self.lines[row + 1], self.delimiter)[column]
-        return f"{tables.quote(text)} in column {self.names[column]}"
-
-    def column(self, name: str) -> int:
-        """The number of a column; a ``ValueError`` if there is none of that name."""
-        if name not in self.names:
-            raise ValueError(
-                f"{self.file}, line 1: expected a column {tables.quote(name)}, got {shortened(self.names)}"
-            )
-        return self.names.index(name)
 
 
 class Columns(NamedTuple):
@@ -121,7 +95,9 @@ def read(
         ImportError: Coordinates are to be converted, and pyproj is not installed.
         ValueError: A file has a defect; the message names file, line, column and value.
     """
-    table = _read_wide(tables.find_file(file, "a table of readings"), "a heading x,y,ap1,ap2,... and one place a line")
+    table = tables.read_table(
+        tables.find_file(file, "a table of readings"), "a heading x,y,ap1,ap2,... and one place a line"
+    )
     axes = _find_axes(table, coordinates)
     points = _read_points(table, axes, height, storey)
     placed: dict[str, list[float]] = {}
@@ -166,15 +142,15 @@ def read(
         repeats
         and f"repeated readings of one place, of {len(levels)} rows, are averaged, and scatter by {scatter:.2g} dB",
         empty and f"{empty} places hear nothing, and are left out",
-        silent and f"gateways that heard nothing are left out: {shortened(silent)}",
-        placed and unplaced and f"gateways without a place in {Path(gateways).name}: {shortened(unplaced)}",
-        unused and f"gateways of {Path(gateways).name} without a column: {shortened(unused)}",
+        silent and f"gateways that heard nothing are left out: {tables.shortened(silent)}",
+        placed and unplaced and f"gateways without a place in {Path(gateways).name}: {tables.shortened(unplaced)}",
+        unused and f"gateways of {Path(gateways).name} without a column: {tables.shortened(unused)}",
         not is_placed.all() and f"{int((~is_placed).sum())} rows without coordinates are left out",
         axes.z < 0 and f"all places are {height:g} m high (data.height)",
-        level and f"gateways that are {height:g} m high (data.height): {shortened(level)}",
+        level and f"gateways that are {height:g} m high (data.height): {tables.shortened(level)}",
         axes.is_floor and f"heights are those of floors, {storey:g} m each (data.storey)",
         moved,
-        columns.ignored and f"columns ignored: {shortened(columns.ignored)}",
+        columns.ignored and f"columns ignored: {tables.shortened(columns.ignored)}",
     ]
     labels = torch.from_numpy(means[counts > 0]).float()
     return Links(
@@ -196,41 +172,7 @@ def _plain(name: str) -> tuple[str, float]:
     return re.sub(r"[\W_]", "", match[1]), UNITS.get(match[2], 1.0)
 
 
-def _read_wide(file: Path, content: str) -> Wide:
-    lines = tables.read_lines(file, content)
-    counts = {mark: {len(tables.split_cells(line, mark)) for line in lines[:3]} for mark in ("\t", ";", "|", ",")}
-    delimiter = next((mark for mark, found in counts.items() if len(found) == 1 and found != {1}), ",")
-    names = tables.split_cells(lines[0], delimiter)
-    for name in names:
-        if not name.isprintable():
-            raise ValueError(f"{file}, line 1: expected names of columns, got {tables.quote(name)}")
-        if name and names.count(name) > 1:
-            raise ValueError(
-                f"{file}, line 1: expected each column once, got {tables.quote(name)} {names.count(name)} times"
-            )
-    has_commas = delimiter != ","
-    numbers: dict[str, float] = {}
-
-    def number(cell: str) -> float:
-        if cell not in numbers:
-            text = re.sub(r"(?i)\s*dbm$", "", cell.replace("−", "-"))
-            value = tables.to_number(text.replace(",", ".") if has_commas else text)
-            numbers[cell] = math.inf if math.isnan(value) and text.strip().lower() not in EMPTY else value
-        return numbers[cell]
-
-    rows, wrong = [], {}
-    for line, text in enumerate(lines[1:], 2):
-        cells = tables.split_cells(text, delimiter)
-        rows.append(np.array([number(cell) for cell in cells]))
-        if len(cells) != len(names):
-            wrong[line] = f"{len(cells)}: {tables.quote(text)}"
-    tables.refuse(file, wrong, f"{len(names)} columns {tables.quote(delimiter.join(names))}")
-    if not rows:
-        raise ValueError(f"{file}: no rows below the heading")
-    return Wide(file, lines, delimiter, names, np.stack(rows))
-
-
-def _find_axes(table: Wide, coordinates: Sequence[str] | None = None) -> Axes:
+def _find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) -> Axes:
     """The columns of coordinates, by the names given or by usual ones."""
     plain = [_plain(name)[0] for name in table.names]
     here = f"{table.file}, line 1"
@@ -259,7 +201,7 @@ def _find_axes(table: Wide, coordinates: Sequence[str] | None = None) -> Axes:
     )
 
 
-def _read_points(table: Wide, axes: Axes, height: float, storey: float) -> Float[ndarray, "rows 3"]:
+def _read_points(table: tables.Table, axes: Axes, height: float, storey: float) -> Float[ndarray, "rows 3"]:
     """Coordinates of all rows; NaN where they are empty."""
     columns = [axes.x, axes.y, *([axes.z] if axes.z >= 0 else [])]
     own = table.numbers[:, columns]
@@ -275,7 +217,7 @@ def _read_points(table: Wide, axes: Axes, height: float, storey: float) -> Float
 
 
 def _read_gateways(
-    file: Path, table: Wide, axes: Axes, height: float, storey: float
+    file: Path, table: tables.Table, axes: Axes, height: float, storey: float
 ) -> tuple[dict[str, list[float]], list[str]]:
     """Coordinates of the gateways of a file by the names of the table's columns, and the file's other gateways."""
     if file.suffix.lower() in (".yml", ".yaml"):
@@ -289,7 +231,7 @@ def _read_gateways(
                 place[2:] = [height + storey * floor for floor in place[2:]]
             found[name] = [*place, height][:3]
     else:
-        other = _read_wide(file, "a heading name,x,y,z and one gateway a line")
+        other = tables.read_table(file, "a heading name,x,y,z and one gateway a line")
         own = _find_axes(other)
         if own.is_global != axes.is_global:
             raise ValueError(f"{file}, line 1: expected the coordinates of {table.file.name}, got other ones")
@@ -307,14 +249,14 @@ def _read_gateways(
     known = {name.casefold(): name for name in table.names} | {name: name for name in table.names}
     matched = {name: known.get(name) or known.get(name.casefold()) for name in found}
     if not any(matched.values()):
-        raise ValueError(f"{file}: none of its gateways is a column of {table.file.name}: {shortened([*found])}")
+        raise ValueError(f"{file}: none of its gateways is a column of {table.file.name}: {tables.shortened([*found])}")
     return {own: found[name] for name, own in matched.items() if own}, [
         name for name, own in matched.items() if not own
     ]
 
 
 def _find_gateways(
-    table: Wide, axes: Axes, placed: Mapping, ignore: Sequence[str], not_heard: float | list[float] | None
+    table: tables.Table, axes: Axes, placed: Mapping, ignore: Sequence[str], not_heard: float | list[float] | None
 ) -> Columns:
     """The columns of gateways, and the marks of "not heard" in them."""
     reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
@@ -354,7 +296,12 @@ def _find_gateways(
 
 
 def _to_world(
-    table: Wide, axes: Axes, points: Float[ndarray, "n 3"], count: int, epsg: int | None, gateways: str | Path | None
+    table: tables.Table,
+    axes: Axes,
+    points: Float[ndarray, "n 3"],
+    count: int,
+    epsg: int | None,
+    gateways: str | Path | None,
 ) -> tuple[Float[ndarray, "n 3"], Frame | None, str]:
     """Places (the first ``count``) and gateways in the world frame [m], the place of this frame, and a remark."""
     largest = np.abs(points[:count]).max(0)

@@ -8,9 +8,12 @@ import re
 import sys
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy import ndarray
 from torch import Tensor
 
 from gaigs.geometry import FAR, WITHIN
@@ -26,6 +29,12 @@ def quote(value: object) -> str:
     """A value as errors show it: printable and short."""
     text = repr(value)
     return text if len(text) <= 100 else f"{text[:100]} ..."
+
+
+def shortened(names: Sequence[str], most: int = 10) -> str:
+    """Names joined by commas; of many the first, and the number of the others."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def find_folder(root: str | Path) -> Path:
@@ -84,12 +93,15 @@ def refuse(file: Path, wrong: Mapping[int, str], expected: str) -> None:
 
 
 def read_points(file: Path, names: Sequence[str], content: str) -> list[list[float]]:
-    """Coordinates [m], one point a line; the first line may hold their names."""
+    """Coordinates [m], one point a line; the first line may hold their names, and those of other columns."""
     lines = read_lines(file, content)
-    header = [cell.lower() for cell in split_cells(lines[0])] == [*names]
-    if header and len(lines) == 1:
+    header = [cell.lower() for cell in split_cells(lines[0])]
+    if not {*names} <= {*header}:
+        return to_coordinates(file, split_rows(file, lines, names, 0), names)
+    if len(lines) == 1:
         raise ValueError(f"{file}: no positions below the header")
-    return to_coordinates(file, split_rows(file, lines, names, int(header)), names)
+    rows = split_rows(file, lines, header, 1).items()
+    return to_coordinates(file, {line: [cells[header.index(name)] for name in names] for line, cells in rows}, names)
 
 
 def read_walls(file: Path) -> Float[Tensor, "k 2 3"]:
@@ -118,6 +130,64 @@ def split_rows(file: Path, lines: Sequence[str], names: Sequence[str], skip: int
     wrong = {n: f"{len(cells)}: {quote(lines[n - 1])}" for n, cells in rows.items() if len(cells) != len(names)}
     refuse(file, wrong, f"{len(names)} columns {quote(','.join(names))}")
     return rows
+
+
+EMPTY = {"", "nan", "na", "n/a", "null", "none", "-inf", "-"}
+"""Cells that mean "not heard" in any table."""
+
+
+class Table(NamedTuple):
+    """A table in numbers, a column a name: NaN for an empty cell, infinity for another text."""
+
+    file: Path
+    lines: list[str]
+    delimiter: str
+    names: list[str]
+    numbers: Float[ndarray, "rows columns"]
+
+    def cell(self, row: int, column: int) -> str:
+        """The text of a cell with its column, for messages."""
+        text = split_cells(self.lines[row + 1], self.delimiter)[column]
+        return f"{quote(text)} in column {self.names[column]}"
+
+    def column(self, name: str) -> int:
+        """The number of a column; a ``ValueError`` if there is none of that name."""
+        if name not in self.names:
+            raise ValueError(f"{self.file}, line 1: expected a column {quote(name)}, got {shortened(self.names)}")
+        return self.names.index(name)
+
+
+def read_table(file: Path, content: str) -> Table:
+    """A table with a heading, its cells separated by tabs, semicolons, bars or commas."""
+    lines = read_lines(file, content)
+    counts = {mark: {len(split_cells(line, mark)) for line in lines[:3]} for mark in ("\t", ";", "|", ",")}
+    delimiter = next((mark for mark, found in counts.items() if len(found) == 1 and found != {1}), ",")
+    names = split_cells(lines[0], delimiter)
+    for name in names:
+        if not name.isprintable():
+            raise ValueError(f"{file}, line 1: expected names of columns, got {quote(name)}")
+        if name and names.count(name) > 1:
+            raise ValueError(f"{file}, line 1: expected each column once, got {quote(name)} {names.count(name)} times")
+    has_commas = delimiter != ","
+    numbers: dict[str, float] = {}
+
+    def number(cell: str) -> float:
+        if cell not in numbers:
+            text = re.sub(r"(?i)\s*dbm$", "", cell.replace("−", "-"))
+            value = to_number(text.replace(",", ".") if has_commas else text)
+            numbers[cell] = math.inf if math.isnan(value) and text.strip().lower() not in EMPTY else value
+        return numbers[cell]
+
+    rows, wrong = [], {}
+    for line, text in enumerate(lines[1:], 2):
+        cells = split_cells(text, delimiter)
+        rows.append(np.array([number(cell) for cell in cells]))
+        if len(cells) != len(names):
+            wrong[line] = f"{len(cells)}: {quote(text)}"
+    refuse(file, wrong, f"{len(names)} columns {quote(delimiter.join(names))}")
+    if not rows:
+        raise ValueError(f"{file}: no rows below the heading")
+    return Table(file, lines, delimiter, names, np.stack(rows))
 
 
 def to_numbers(

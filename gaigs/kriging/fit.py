@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float, Inexact, Int
+from jaxtyping import Complex, Float, Int
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -45,12 +45,6 @@ class HeldOut(NamedTuple):
     asked: Query
     around: Query  # links around each held-out link, one group after the other
     products: Float[Tensor, "b j+1 j+1"]  # of the residuals of each held-out link and those around it
-
-
-def thin_labels(labels: Inexact[Tensor, " k *shape"]) -> Inexact[Tensor, "k m"]:
-    """At most 1,024 numbers of each label, for hyperparameters and intervals: arrays resolve fewer."""
-    numbers = labels[..., None].flatten(1)
-    return numbers[:, evenly(torch.arange(numbers.shape[1]), 1024)]
 
 
 LOUDEST = 10.0

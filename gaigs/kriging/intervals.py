@@ -9,9 +9,8 @@ from jaxtyping import Bool, Float, Inexact, Int
 from torch import Tensor
 
 from gaigs.geometry import FAR
-from gaigs.kriging.fit import thin_labels
 from gaigs.kriging.links import distances
-from gaigs.query import Query, evenly
+from gaigs.query import Query, evenly, thin_labels
 from gaigs.task import Task
 
 ENOUGH = 100

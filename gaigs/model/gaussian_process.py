@@ -8,12 +8,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations, thin_labels
+from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
 from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
 from gaigs.kriging.links import PART, at_directions, coordinates, distances, folds_of, known_links, thinned
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import Model, Prediction, build_trend
-from gaigs.query import Batch, Query, evenly
+from gaigs.query import Batch, Query, evenly, thin_labels
 from gaigs.registry import name_of, register
 from gaigs.scene import Scene
 from gaigs.task.csi import Csi

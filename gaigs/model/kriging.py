@@ -12,13 +12,13 @@ from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.kriging.field import Field
-from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters, thin_labels
+from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters
 from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, coordinates, folds_of, scaled, thinned
 from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import Model, Prediction, Wrapper, call_optional
-from gaigs.query import Batch
+from gaigs.query import Batch, thin_labels
 from gaigs.registry import name_of, register, registry
 from gaigs.scene import Scene
 from gaigs.task import Task

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gaigs.geometry import Grid
-from gaigs.query import Batch
+from gaigs.query import Batch, thin_labels
 
 Thinning = Callable[[Batch, torch.Generator], Batch]
 """A batch of whole labels -> the part of it that a training step reads."""
@@ -143,11 +143,7 @@ class Task(ABC):
     def fingerprint(self, values: Tensor) -> Tensor:
         """Real numbers (k, m) of labels or predictions that change steadily with the place; by default at most
         ``NUMBERS`` of their own, evenly spread."""
-        flat = values[..., None].flatten(1)
-        step, columns = math.ceil(flat.shape[1] / NUMBERS), values.shape[-1]
-        while math.gcd(step, columns) > 8:  # one that divides the columns would meet few of them
-            step += 1
-        return flat[:, ::step].float()
+        return thin_labels(values, NUMBERS).float()
 
     def thinning(self) -> Thinning:
         """The part of a batch that a step reads, by default all; parameters are options of ``training.thinning``."""
