@@ -21,7 +21,6 @@ from gaigs.version import __version__
 
 if TYPE_CHECKING:
     from gaigs.antenna import Array, Receiver
-    from gaigs.checkpoint import load
     from gaigs.configuration import compose
     from gaigs.data import Links
     from gaigs.data.links import links
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from gaigs.radio_maps import radio_map
     from gaigs.rasterizer import rasterize
     from gaigs.registry import register, registries
+    from gaigs.runs import load
     from gaigs.runs.evaluation import evaluate
     from gaigs.runs.training import train
     from gaigs.scene import Scene
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PLACES = {
-    "links": "data.links", "train": "runs.training", "evaluate": "runs.evaluation", "load": "checkpoint",
+    "links": "data.links", "train": "runs.training", "evaluate": "runs.evaluation", "load": "runs",
     "compose": "configuration", "rasterize": "rasterizer", "radio_map": "radio_maps", "register": "registry",
     "registries": "registry", "Model": "model", "Links": "data", "Query": "query", "Grid": "geometry",
     "Frame": "geometry", "Rays": "geometry", "Receiver": "antenna", "Array": "antenna", "Pose": "geometry",

@@ -46,7 +46,7 @@ def write(content: dict, path: Path) -> None:
 
 
 def read(path: str | Path) -> dict:
-    """The content of a checkpoint, tensors and plain Python only; errors as of ``load``."""
+    """The content of a checkpoint, tensors and plain Python only; errors as of ``gaigs.load``."""
     check_type("path", path, str | Path)
     path = Path(path)
     if not os.path.isfile(path):  # False for a name that is too long
@@ -83,26 +83,7 @@ def save(model: nn.Module, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> nn.Module:
-    """The model of a checkpoint, ready to predict; needs neither data nor Hydra.
-
-    Args:
-        path: ``best.ckpt`` or ``last.ckpt`` of a run, or a file of ``Model.save``.
-
-    Returns:
-        The model in evaluation mode, on the CPU: ``load(path).predict(transmitters)``.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The file is damaged or of another format, a component is not installed, or the weights do not fit
-            the configuration or are not finite.
-        ImportError: A component cannot be imported.
-
-    Example:
-        >>> gaigs.train("mean", gaigs.links("synthetic_rssi", transmitters=50)).save("room.ckpt")
-        >>> model = gaigs.load("room.ckpt")
-        >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]], receiver="west").shape  # [dBm]
-        torch.Size([2])
-    """
+    """The model of a checkpoint in evaluation mode, on the CPU; errors as of ``gaigs.load``."""
     content = read(path)
     weights, scene = content["state_dict"], content[KEY]["scene"]
     try:

@@ -29,7 +29,7 @@ from gaigs.model.knn import COUNTS
 from gaigs.query import ROUNDING, as_positions, as_receivers, as_tensor, evenly
 from gaigs.registry import call, check_instance, check_type
 from gaigs.report import style
-from gaigs.runs import links_of, model_of
+from gaigs.runs import links_of, load
 from gaigs.runs.evaluation import is_trained, unseen
 from gaigs.split import rows_of
 from gaigs.task import Task, check_range
@@ -413,7 +413,7 @@ def run(config: dict, folder: Path) -> None:
     ``locate.png`` and, of a test, ``locate.json`` into a folder."""
     if config["folder"] is None:
         raise ValueError("command=locate needs the folder of a finished run; add folder=runs/...")
-    model, links, options = model_of(config["folder"]), links_of(config["folder"]), dict(config["locate"])
+    model, links, options = load(config["folder"]), links_of(config["folder"]), dict(config["locate"])
     own, value = {name: options.pop(name) for name in ("region", "frequency", "points")}, options.pop("value")
     value = read_value(Path(value), links) if isinstance(value, str) else value
     start = time.perf_counter()

@@ -21,7 +21,7 @@ from gaigs.model import Model, call_optional
 from gaigs.query import Query, as_positions, evenly
 from gaigs.registry import call, check_type
 from gaigs.report import style
-from gaigs.runs import model_of
+from gaigs.runs import load
 
 POINTS = 1000
 """Approximate number of candidates, and of places at which the error is stated, of a region."""
@@ -177,7 +177,7 @@ def survey(
             f"a survey takes 1 to {most} candidates, got {len(places)}\nchange candidates, or leave them out"
         )
     if model is None:
-        asked, factor = points.double(), 1.0
+        asked, factor = points.double(), MEAN
         processes = [default_process(asked)]
     else:
         scene = model.scene
@@ -187,14 +187,14 @@ def survey(
         asked = coordinates(scene, query, 1.0).to(processes[0].places)
         centres = scene.positions(asked) if scene.task.is_scalar else [None] * len(processes)
         processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
-        factor = 1.0 if model.calibration is None else model.calibration.sizes.square().mean().sqrt().item()
+        factor = MEAN if model.calibration is None else model.calibration.mean_error
     posteriors, hears = [posterior(process, asked) for process in processes], heard(processes, asked)
     noises = [process.noise for process in processes]
 
     def error(parts: list[Tensor]) -> float:
         variances = torch.stack([part.diagonal()[stated] for part in parts]).clamp_min(0)
         deviations = (variances + variances.new_tensor(noises)[:, None]).sqrt()
-        return MEAN * factor * mean_of_heard(deviations, hears[:, stated])
+        return factor * mean_of_heard(deviations, hears[:, stated])
 
     chosen, errors = [], [error(posteriors)]
     free = torch.ones(len(places), dtype=torch.bool)
@@ -213,14 +213,14 @@ def survey(
         errors.append(error(posteriors))
     if model is None:
         return SurveyPlan(places[chosen], None, places[:0], places[:0, 0], torch.zeros(0, dtype=torch.bool))
-    known, losses, superfluous = without(processes, asked[stated], MEAN * factor)
+    known, losses, superfluous = without(processes, asked[stated], factor)
     unit = getattr(model.scene.task, "error_unit", model.scene.task.unit)
     return SurveyPlan(places[chosen], torch.tensor(errors), known, losses, superfluous, unit, model.scene.frame)
 
 
 def run(config: dict, folder: Path) -> None:
     """Plans a survey, by the model of a finished run if given; writes ``survey.csv`` and ``survey.png``."""
-    model = None if config["folder"] is None else model_of(config["folder"])
+    model = None if config["folder"] is None else load(config["folder"])
     options = dict(config["survey"])
     if isinstance(options["candidates"], str):
         options["candidates"] = read_points(Path(options["candidates"]), "xyz", "x,y,z [m] of one candidate a line")

@@ -188,7 +188,7 @@ def test_the_command_plans_by_a_finished_run(tmp_path, capsys):
     gaigs.run(gaigs.compose(*words), tmp_path / "run")
     gaigs.run(gaigs.compose("command=survey", f"folder={tmp_path / 'run'}", "survey.count=2"), tmp_path / "plan")
     assert {path.name for path in (tmp_path / "plan").iterdir()} == {"survey.csv", "survey.png"}
-    assert "2 more places bring" in capsys.readouterr().out
+    assert str(gaigs.survey(gaigs.load(tmp_path / "run"), count=2)) in capsys.readouterr().out
     with pytest.raises(FileNotFoundError, match="holds no run"):
         gaigs.run(gaigs.compose("command=survey", f"folder={tmp_path}"), tmp_path / "plan")
     with pytest.raises(ValueError, match="takes a region or candidates, got neither"):

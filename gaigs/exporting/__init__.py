@@ -7,7 +7,7 @@ from gaigs.io.tables import read_points
 from gaigs.model import Model
 from gaigs.radio_maps import radio_map
 from gaigs.registry import call, check_instance, check_type
-from gaigs.runs import links_of, model_of
+from gaigs.runs import links_of, load
 
 MAPS = {
     ".tif": maps.write_geotiff,
@@ -91,7 +91,7 @@ def run(config: dict, folder: Path) -> None:
     if form is None:
         raise ValueError(f"command=export needs export.format, one of {', '.join(one[1:] for one in SUFFIXES)}")
     suffix = check_suffix(Path(f"export.{form}"))
-    model = model_of(config["folder"])
+    model = load(config["folder"])
     takes_places = suffix in (*PREDICTIONS, SCENARIO)
     if places is None and takes_places and (suffix not in MAPS or not model.scene.task.is_scalar):
         places = "test"

@@ -162,7 +162,7 @@ class Calibration:
         if len(counts) and (few := int(counts.min())) < need:
             raise ValueError(
                 f"an interval of {100 * level:g} % needs {need} links to calibrate it, the model has {few}\n"
-                "ask for a narrower interval, or train with a larger split.validation"
+                "ask for a narrower interval, or give more links: to a look-up known ones, else by split.validation"
             )
         numbers = value[..., None].flatten(1)
         amplitudes = self.amplitudes.to(value.device)
@@ -181,6 +181,11 @@ class Calibration:
         lower = (value - half).clamp_min(self.lowest.item())
         # Some models predict less than the least label.
         return Estimate(value, std, torch.minimum(lower, value), value + half)
+
+    @property
+    def mean_error(self) -> float:
+        """Mean absolute error over the model's own deviation."""
+        return torch.trapezoid(self.quantiles, dx=1 / STEPS).mean().item()
 
     def gives(self, level: float) -> bool:
         """True if every group has enough links for intervals of a level."""
@@ -265,7 +270,7 @@ def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
 
     The errors are those of the test's links and of the ``calibration_links`` together, both placed alike; NaN with one
     place. ``places`` has the number of each link's place, from 0: errors of one place depend on each other, those of
-    different ones count as independent.
+    different ones count as independent. If all links have one share, places scatter as the level says.
 
     Source: Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015.
     """
@@ -275,9 +280,10 @@ def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
             continue
         numbers[name] = score.mean().item()
         if name.startswith("coverage"):
-            sums = scores["places"].long().bincount(score - score.mean())
+            sums, level = scores["places"].long().bincount(score - score.mean()), int(name[-2:]) / 100
             links = 1 / len(score) + 1 / scores["calibration_links"].mean().item()
             spread = sums.square().sum().item() / len(score) * len(sums) / max(len(sums) - 1, 1)
+            spread = spread if score.min() < score.max() else level * (1 - level)
             numbers[f"{name}_error"] = math.sqrt(spread * links) if len(sums) > 1 else math.nan
     return numbers
 

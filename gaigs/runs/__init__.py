@@ -2,21 +2,21 @@
 
 import json
 import logging
+import os
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from gaigs import checkpoint
-from gaigs.data import Links, load
+from gaigs import checkpoint, data
+from gaigs.data import Links
 from gaigs.io.files import write_text
 from gaigs.kriging.links import check_known
 from gaigs.model import Model, call_optional
 from gaigs.processes import is_first, limited_threads, only_run
 from gaigs.radio_maps import radio_map
-from gaigs.registry import registry
-from gaigs.report.runs import read_metrics
+from gaigs.registry import check_type, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store, warn_of_changes
 
@@ -46,6 +46,8 @@ def run(config: dict, folder: Path) -> dict | None:
             claim(folder, config)
             finished = folder / "metrics.json"
             if finished.is_file():
+                from gaigs.report.runs import read_metrics  # with Hydra, which loading does without
+
                 log.info("finished already: %s", finished)
                 metrics = read_metrics(finished)
             else:
@@ -60,12 +62,35 @@ def run(config: dict, folder: Path) -> dict | None:
     return metrics
 
 
-def model_of(folder: str | Path) -> Model:
-    """The model of a checkpoint, or of a finished run: for a look-up fitted anew to the run's data."""
-    if Path(folder).is_file():
-        loaded: Any = checkpoint.load(folder)
+def load(path: str | Path) -> Model:
+    """The model of a checkpoint or of a finished run, ready to predict.
+
+    A checkpoint needs neither data nor Hydra. The folder of a run with a look-up needs the data, to which it is fitted
+    anew.
+
+    Args:
+        path: ``best.ckpt`` or ``last.ckpt`` of a run, a file of ``Model.save``, or the folder of a run.
+
+    Returns:
+        The model in evaluation mode, on the CPU: ``load(path).predict(transmitters)``.
+
+    Raises:
+        FileNotFoundError: The file or folder does not exist, or the run is not finished.
+        ValueError: The file is damaged or of another format, a component is not installed, or the weights do not fit
+            the configuration or are not finite; or the run is not finished, or its data were arrays.
+        ImportError: A component cannot be imported.
+
+    Example:
+        >>> gaigs.train("mean", gaigs.links("synthetic_rssi", transmitters=50)).save("room.ckpt")
+        >>> model = gaigs.load("room.ckpt")
+        >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]], receiver="west").shape  # [dBm]
+        torch.Size([2])
+    """
+    check_type("path", path, str | Path)
+    if not os.path.isdir(path):
+        loaded: Any = checkpoint.load(path)
         return loaded
-    folder, config = Path(folder), configuration_of(folder)
+    folder, config = Path(path), configuration_of(path)
     warn_of_changes(folder, config["model"])
     if (folder / "best.ckpt").is_file():
         trained: Any = checkpoint.load(folder / "best.ckpt")
@@ -96,7 +121,7 @@ def links_of(folder: str | Path) -> Links:
     config = configuration_of(folder)
     if config["data"]["name"] == "arrays":
         raise ValueError(f"the data of {folder} were arrays, which are not stored; use the model in Python")
-    return load(config["data"], config["split"], config["task"]["name"])
+    return data.load(config["data"], config["split"], config["task"]["name"])
 
 
 def train_and_test(config: dict, folder: Path) -> dict | None:
@@ -104,7 +129,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     import lightning
 
     lightning.seed_everything(config["seed"], verbose=False)
-    links = load(config["data"], config["split"], config["task"]["name"])
+    links = data.load(config["data"], config["split"], config["task"]["name"])
     if not len(links.split.test):
         raise ValueError("a run takes links to test on; set split.test above 0, or use gaigs.train in Python")
     # Slow to import: errors in data come first.

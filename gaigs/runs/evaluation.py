@@ -23,7 +23,7 @@ from gaigs.configuration import composed, files_of
 from gaigs.data import Links, with_places
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
-from gaigs.kriging.intervals import Calibration, holds, interval_scores, nearest, summarise_intervals, thinned
+from gaigs.kriging.intervals import Calibration, fewest, holds, interval_scores, nearest, summarise_intervals, thinned
 from gaigs.kriging.links import folds_of
 from gaigs.model import Model, call_optional
 from gaigs.model.gaussian_process import GaussianProcess
@@ -285,7 +285,11 @@ def score(
         values = predicted(model, links, index, frequencies)
         add(key, values)
         calibration = model.calibration if key in models or not has_intervals else calibrated(model, links)
-        if has_intervals and frequencies is None and calibration is not None and calibration.gives(0.9):
+        enough = calibration is not None and calibration.gives(0.9)
+        if has_intervals and frequencies is None and key == next(iter(models), None) and not enough:
+            count = 0 if calibration is None else int(calibration.counts.min())
+            log.warning("%s has no intervals: %d links calibrate them, and %d are needed", key, count, fewest(0.9))
+        if has_intervals and frequencies is None and enough:
             deviations = spreads(model, links, index, values)
             batches = torch.arange(len(index)).split(BATCH)  # estimates take ten times the memory of labels
             if key == next(iter(models), None):

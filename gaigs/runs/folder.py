@@ -11,7 +11,6 @@ import yaml
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from gaigs.configuration import differences
 from gaigs.data import Links
 from gaigs.data.matching import are_alike
 from gaigs.io.files import atomic_write, write_text
@@ -42,6 +41,8 @@ def claim(folder: Path, config: dict) -> None:
         there = OmegaConf.to_container(OmegaConf.load(file))
     except Exception as error:  # any error of YAML or OmegaConf
         raise ValueError(f"cannot parse {file}: {' '.join(str(error).split())}") from error
+    from gaigs.configuration import differences  # with Hydra, which loading does without
+
     differing = differences(there, config)
     if differing:
         keys = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]

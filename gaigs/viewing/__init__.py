@@ -13,7 +13,6 @@ from pathlib import Path
 import torch
 from matplotlib import colormaps
 
-from gaigs import checkpoint
 from gaigs.data import Links
 from gaigs.geometry import even_places
 from gaigs.io.files import write_text
@@ -21,7 +20,7 @@ from gaigs.model import Model
 from gaigs.model.kriging import Kriging
 from gaigs.query import evenly
 from gaigs.registry import call, check_instance, name_of
-from gaigs.runs import configuration_of, links_of, model_of
+from gaigs.runs import configuration_of, links_of, load
 from gaigs.viewing.contents import Contents
 from gaigs.viewing.server import server
 
@@ -162,9 +161,9 @@ def contents_of(source: str | Path) -> Contents:
     """The contents of a run's folder, or of a checkpoint without its data."""
     path = Path(source)
     if path.is_file():
-        return Contents(checkpoint.load(path), title=path.stem)
+        return Contents(load(path), title=path.stem)
     in_memory = configuration_of(path)["data"]["name"] == "arrays"  # which a run does not store
-    return Contents(model_of(path), None if in_memory else links_of(path), path.name)
+    return Contents(load(path), None if in_memory else links_of(path), path.name)
 
 
 def run(config: dict) -> None:
