@@ -52,7 +52,8 @@ class SurveyPlan:
             in the label's unit (n + 1,); None without a model.
         known: Places that were measured (k, 3) [m].
         losses: Rise of the mean error if one of them had been left out (k,).
-        superfluous: Known places that together raise the error by at most 5 % if left out (k,).
+        superfluous: Known places that together raise the error over the region, or else the box of the training
+            transmitters, by at most 5 % if left out (k,).
         unit: Of the errors.
         frame: Place of x and y on a map; None if unknown.
 
@@ -95,12 +96,12 @@ class SurveyPlan:
         row = lambda use, place, word: rows.writerow([use, *(f"{x:.3f}" for x in (*place, *on_map(*place))), word])
         words = [""] * len(self.places)
         if self.errors is not None:
-            words = [f"{error:.4g}" for error in self.errors[1:].tolist()]
+            words = [f"{error:.6g}" for error in self.errors[1:].tolist()]
         for place, word in zip(self.places.tolist(), words, strict=True):
             row("measure", place, word)
         known, losses = self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist()
         for place, loss in zip(known, losses, strict=True):
-            row("leave out", place, f"{self.errors[0] + loss:.4g}")
+            row("leave out", place, f"{self.errors[0] + loss:.6g}")
         write_text(Path(path), table.getvalue())
 
 
@@ -183,8 +184,12 @@ def survey(
         scene = model.scene
         frequency = scene.middle_frequency if frequency is None else frequency
         names = [receiver.name for receiver in scene.receivers]
-        query, _ = Query.from_positions(points, 0, frequency, names, scene.frequencies)
-        asked = coordinates(scene, query, 1.0).to(processes[0].places)
+
+        def at(places: Tensor) -> Tensor:
+            query, _ = Query.from_positions(places, 0, frequency, names, scene.frequencies)
+            return coordinates(scene, query, 1.0).to(processes[0].places)
+
+        asked = at(points)
         centres = scene.positions(asked) if scene.task.is_scalar else [None] * len(processes)
         processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
         factor = MEAN if model.calibration is None else model.calibration.mean_error
@@ -213,7 +218,8 @@ def survey(
         errors.append(error(posteriors))
     if model is None:
         return SurveyPlan(places[chosen], None, places[:0], places[:0, 0], torch.zeros(0, dtype=torch.bool))
-    known, losses, superfluous = without(processes, asked[stated], factor)
+    box = asked[stated] if region is not None else at(even_places(scene.lower, scene.upper, POINTS, scene.floors))
+    known, losses, superfluous = without(processes, box, factor)
     unit = getattr(model.scene.task, "error_unit", model.scene.task.unit)
     return SurveyPlan(places[chosen], torch.tensor(errors), known, losses, superfluous, unit, model.scene.frame)
 
@@ -260,7 +266,7 @@ def figure(plan: SurveyPlan) -> Figure:
         label = f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
         for axis in right:
             axis.plot(plan.errors.numpy(), color=style.BLUE)
-            axis.set(xlabel="new places", ylabel=label)
+            axis.set(xlabel="new places", ylabel=label, ylim=(0, None))
             axis.xaxis.get_major_locator().set_params(integer=True)
             axis.grid()
             axis.set_axisbelow(True)

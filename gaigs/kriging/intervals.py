@@ -164,16 +164,11 @@ class Calibration:
                 f"an interval of {100 * level:g} % needs {need} links to calibrate it, the model has {few}\n"
                 "ask for a narrower interval, or give more links: to a look-up known ones, else by split.validation"
             )
-        numbers = value[..., None].flatten(1)
-        amplitudes = self.amplitudes.to(value.device)
-        bins = (
-            torch.bucketize(numbers.double(), amplitudes) if len(amplitudes) else torch.zeros_like(numbers.abs()).long()
-        )
-        rank = math.ceil(level * STEPS - 1e-9)
-        scale = _shaped(deviations, value)
-        factors = lambda table: table.reshape(value.shape).to(scale)
-        half = scale * factors(self.quantiles.to(value.device)[own[:, None], bins, rank])
-        std = scale * factors(self.sizes.to(value.device)[own[:, None], bins])
+        cells, amplitudes = own.reshape(-1, *[1] * (value.ndim - 1)), self.amplitudes.to(value.real)
+        if len(amplitudes):
+            cells = cells * (len(amplitudes) + 1) + torch.bucketize(value.contiguous(), amplitudes)
+        scale, rank = _shaped(deviations, value), math.ceil(level * STEPS - 1e-9)
+        half, std = (scale * table.flatten().to(scale).take(cells) for table in (self.quantiles[..., rank], self.sizes))
         if value.is_complex():
             exists = [part.masked_fill(std.isnan(), 0) for part in (value, std)]
             powers, errors = (part.abs().square().flatten(1).sum(1) for part in exists)

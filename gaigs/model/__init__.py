@@ -218,7 +218,8 @@ class Model(nn.Module):
                 "train it with split.validation above 0, on two places, runs or blocks or more, without data.band_train"
             )
         estimates, shape = self._values(*arguments, float(interval))
-        parts = (None if part[0] is None else torch.cat(part) for part in zip(*estimates, strict=True))
+        join = lambda parts: torch.cat(parts) if len(parts) > 1 else parts[0]
+        parts = (None if part[0] is None else join(part) for part in zip(*estimates, strict=True))
         return Estimate(*(None if part is None else part.reshape(shape + part.shape[1:]) for part in parts))
 
     def predict_batches(

@@ -20,6 +20,18 @@ from gaigs.report.table import Spread, columns_of, markdown, task_class, termina
 COSTS = {key: systems.COSTS[key] for key in ("train_seconds", "num_gaussians", "num_parameters", "inference_ms")}
 """Titles of the costs in a table of runs."""
 
+INTERVALS = {
+    "coverage_50": "within 50 %",
+    "coverage_50_error": "standard error of it",
+    "coverage_90": "within 90 %",
+    "coverage_90_error": "standard error of it",
+    "width_90": "width of 90 %",
+    "crps": "CRPS",
+    "nll": "NLL",
+    "calibration_links": "calibrating links",
+}
+"""Titles of the scores of intervals."""
+
 SEEDS = "Runs that differ in the seed alone: mean ± standard deviation (n - 1), and the least"
 
 
@@ -102,7 +114,7 @@ def report(folder: str | Path) -> Group:
         listed = ", ".join(f"{task} in {name}" for task, name in tasks.items())
         raise ValueError(f"the runs of a table must be of one task, got {listed}; pass a folder with runs of one")
     known = task_class(next(iter(tasks))).metrics() if tasks else {}
-    titles = {name: metric.title for name, metric in known.items()} | COSTS
+    titles = {name: metric.title for name, metric in known.items()} | INTERVALS | COSTS
     rows, shared = ablation(runs)
     groups = over_seeds(runs, shared)
     caption = ", ".join(f"{key}={value}" for key, value in shared.items())
@@ -119,6 +131,7 @@ def report(folder: str | Path) -> Group:
         save(_speed(runs, rows, shared, titles), folder / "speed_against_error.png")
 
     hidden = {name for name, metric in known.items() if not metric.is_brief} | {"num_gaussians"}
+    hidden |= INTERVALS.keys() - {"coverage_90"}
     if not any(row["status"] == "unfinished" for row in rows):
         hidden.add("status")
     varied = [[value for key, value in run.overrides.items() if key not in shared] for run in runs]
