@@ -788,15 +788,19 @@ class Try(NamedTuple):
 
 
 def fitted(prints: Fingerprints, tries: Sequence[Try]) -> Fingerprints:
-    """The likelihood with the least energy score of held-out values, and what it says of them; few labels of one number
-    keep that of ``prints``."""
+    """The likelihood with the least energy score of held-out values, and these values by that of the other folds; few
+    labels of one number keep that of ``prints``."""
     choices = CHOICES
     if sum(len(one.truth) for one in tries) < FEW:
         choices = CHOICES[: len(TEMPERS)] if prints.task.shape else ((prints.degrees, prints.temper),)
-    choice = min(choices, key=lambda choice: sum(one.score(*choice) for one in tries))
-    likelihoods = [torch.stack([log_likelihood(*part, *choice).float() for part in one.squares]) for one in tries]
-    held = tuple(Held(one.prints.candidates, own, one.truth) for one, own in zip(tries, likelihoods, strict=True))
-    return replace(prints, degrees=choice[0], temper=choice[1], held=held)
+    scores = torch.tensor([[one.score(*choice) for choice in choices] for one in tries])
+    degrees, temper = choices[int(scores.sum(0).argmin())]
+    held = []
+    for one, own in zip(tries, scores, strict=True):
+        choice = choices[int((scores.sum(0) - own if len(tries) > 1 else own).argmin())]
+        likelihoods = torch.stack([log_likelihood(*part, *choice).float() for part in one.squares])
+        held.append(Held(one.prints.candidates, likelihoods, one.truth))
+    return replace(prints, degrees=degrees, temper=temper, held=tuple(held))
 
 
 def walk(places: Float[Tensor, "n 3"], step: float) -> Int[Tensor, " k"]:
