@@ -15,13 +15,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.geometry import ExtrapolationWarning, Frame, even_places
 from gaigs.io.files import write_text
-from gaigs.io.tables import read_table, refuse
+from gaigs.io.tables import find_file, read_table, refuse, shortened
 from gaigs.kriging.intervals import fewest
 from gaigs.kriging.links import chance_to_hear, distances, folds_of
 from gaigs.model import Model
@@ -63,8 +64,8 @@ spreads: regions of tracks reach far beyond the likeliest candidates."""
 FARTHEST = 5.0
 """Deviations that a reading may be beyond all predictions without a warning, and half of their range at least."""
 
-CELL = 8
-"""Mean number of candidates in a cell of the map of the posterior."""
+CELLS = 1500
+"""Most cells of the map of a posterior."""
 
 STAYS = 10
 """Most values of a held-out track at each of its places."""
@@ -368,8 +369,9 @@ def locate(
         beyond = torch.maximum(asked - highest, lowest - asked).nan_to_num(0)
         if beyond.max() > max(FARTHEST * prints.deviations.max(), (highest - lowest) / 2):
             unit = getattr(prints.task, "error_unit", prints.task.unit)
-            words = f"readings are up to {beyond.max():.3g} {unit} beyond all predicted ones; check their unit"
-            warnings.warn(words, ExtrapolationWarning, stacklevel=2)
+            words = f"readings are up to {beyond.max():.3g} {unit} beyond all predicted ones"
+            advice = "check their unit, and leave out what was not heard"
+            warnings.warn(f"{words}; {advice}", ExtrapolationWarning, stacklevel=2)
     return posterior(prints, asked, unknown_power, step, level)
 
 
@@ -425,7 +427,7 @@ def run(config: dict, folder: Path) -> None:
         found = call("locate", locate, options, model=prints, value=value)
         folder.mkdir(parents=True, exist_ok=True)
         found.save(folder / "locate.csv")
-        style.save(map_figure(found, places, options["level"]), folder / "locate.png")
+        style.save(map_figure(found, options["level"]), folder / "locate.png")
         print(str(found)[1:-1])
         conclude(prints, found, options["level"], folder)
         return
@@ -477,12 +479,19 @@ def conclude(prints: Fingerprints, found: Location, level: float, folder: Path) 
 def read_value(file: Path, links: Links) -> object:
     """Values for ``locate`` from a file: an array (n, r, *shape) of NumPy or, of RSSI, a table with a column for each
     receiver's name, whose cells are empty where it has not heard a value."""
-    file = file.expanduser()
+    content = "received values" if links.task.is_scalar else "a .npy array of received values"
+    file = find_file(file, content, "locate.value")
     if file.suffix.lower() == ".npy":
-        return np.load(file)
+        try:
+            return np.load(file, allow_pickle=False)
+        except (ValueError, EOFError):
+            raise ValueError(f"{file} must be {content}, and is no array of numbers") from None
     if not links.task.is_scalar:
         raise ValueError(f"locate.value must be a .npy array of labels of each receiver, got {file}")
     table = read_table(file, "a heading with names of receivers, and one value a line")
+    names = [receiver.name for receiver in links.receivers]
+    if others := [name for name in table.names if name not in names]:
+        raise ValueError(f"{file}, line 1: expected names of receivers, {shortened(names)}, got {shortened(others)}")
     bad = np.isinf(table.numbers)
     wrong = {row + 2: table.cell(row, int(bad[row].argmax())) for row in bad.any(1).nonzero()[0].tolist()}
     refuse(file, wrong, "a level [dBm], or an empty cell")
@@ -490,33 +499,33 @@ def read_value(file: Path, links: Links) -> object:
 
 
 def write_table(path: str | Path, columns: Mapping[str, Tensor]) -> None:
-    """Writes columns as a CSV table; metres have four decimals."""
+    """Writes columns as a CSV table, rounded to six decimals."""
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    lines = (",".join(f"{round(x, 4):.11g}" for x in row) for row in rows)
+    lines = (",".join(f"{round(x, 6):.12g}" for x in row) for row in rows)
     write_text(Path(path), "\n".join((",".join(columns), *lines, "")))
 
 
-def map_figure(found: Location, known: Float[Tensor, "k 3"], level: float) -> Figure:
+def map_figure(found: Location, level: float) -> Figure:
     """Where the transmitters are from above: the probability of cells, of a single value also its region."""
-    places, probabilities = found.places[:, :2].double().numpy(), found.probabilities.mean(0).numpy()
-    low, high = np.quantile(places[probabilities > 0], (0.001, 0.999), 0)
-    low, high = np.minimum(low, known[:, :2].numpy().min(0)), np.maximum(high, known[:, :2].numpy().max(0))
-    edges = np.maximum(high - low, 1e-3 * (high - low).max())
-    counts = np.maximum(1, np.round(edges * np.sqrt(len(places) / CELL / edges.prod()))).astype(int)
-    across, up = (np.linspace(start, start + edge, n + 1) for start, edge, n in zip(low, edges, counts, strict=True))
+    places, weights = found.places[:, :2].double().numpy(), found.probabilities.mean(0).double().numpy()
+    low, high = np.quantile(places, (0.001, 0.999), 0)
+    spare = np.maximum(0, 0.15 * (high - low).max() - (high - low)) / 2  # of a corridor
+    low, high = low - spare, high + spare
+    pitch = math.sqrt((high - low).prod() / min(CELLS, len(places) / 8))
+    across, up = (np.arange(start, end + pitch, pitch) for start, end in zip(low, high, strict=True))
     middles = [(lines[1:] + lines[:-1]) / 2 for lines in (across, up)]
-    summed = lambda weights: np.histogram2d(places[:, 0], places[:, 1], (across, up), weights=weights)[0].T
+    counted = lambda weights: np.histogram2d(places[:, 0], places[:, 1], (across, up), weights=weights)[0].T
     with rc_context(style.STYLE):
-        drawn = Figure(figsize=(0.6 * style.PAGE, 0.55 * style.PAGE), layout="compressed")
+        drawn = Figure(figsize=(0.6 * style.PAGE, 0.6 * style.PAGE), layout="compressed")
         axis = drawn.subplots()
-        image = axis.pcolormesh(across, up, 100 * summed(probabilities), cmap="Blues", rasterized=True)
-        drawn.colorbar(image, ax=axis, label="probability of a cell [%]")
-        axis.plot(*known[:, :2].T.numpy(), "o", markersize=1.5, color=style.GREY, label="known places")
+        # Smooth over neighbouring cells: they hold different numbers of candidates.
+        image = axis.pcolormesh(across, up, 100 * gaussian_filter(counted(weights), 1), cmap="Blues", rasterized=True)
+        drawn.colorbar(image, ax=axis, location="bottom", label="probability of a cell [%]")
         axis.plot(*found.mean[:, :2].T.numpy(), "o", markersize=4, color=style.ORANGE, label="mean")
-        if len(found.mean) == 1 and min(counts) > 1:
-            inside = summed(found.region[0].double().numpy()) / np.maximum(1, summed(np.ones(len(places))))
-            axis.contour(*middles, inside, [0.5], colors=style.ORANGE, linewidths=0.8)
-            axis.plot([], [], color=style.ORANGE, lw=0.8, label=f"region of {100 * level:g} %")
+        if len(found.mean) == 1:
+            inside = gaussian_filter((counted(found.region[0].double().numpy()) > 0).astype(float), 1)
+            axis.contour(*middles, inside, [0.3], colors=style.GREY, linewidths=0.8)
+            axis.plot([], [], color=style.GREY, lw=0.8, label=f"region of {100 * level:g} %")
         axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         drawn.legend(loc="outside lower left", ncols=3)
     return drawn
@@ -666,10 +675,14 @@ def as_fingerprints(value: object, prints: Fingerprints, is_track: bool = False)
             raise ValueError("value must have the label of one receiver or more, got none")
         which = as_receivers([*value], prints.receivers)
         parts = as_tensor("value", [*value.values()], "a label, or as many labels, of each receiver")
-        whole = torch.full((count, *parts.shape[1:]), math.nan, dtype=prints.task.dtype)
-        whole[which] = parts.detach().cpu().to(whole)
+        kind = torch.promote_types(parts.dtype, torch.float32)
+        whole = torch.full((count, *parts.shape[1:]), math.nan, dtype=kind)
+        whole[which] = parts.detach().cpu().to(kind)
         value = whole.transpose(0, 1) if parts.ndim == 2 + len(shape) else whole
-    given = as_tensor("value", value, f"labels of {count} receivers").detach().cpu().to(prints.task.dtype)
+    given = as_tensor("value", value, f"labels of {count} receivers").detach().cpu()
+    if given.is_complex() != prints.task.dtype.is_complex and not given.isnan().all():
+        raise ValueError(f"value must have {'complex' if prints.task.dtype.is_complex else 'real'} labels")
+    given = given.to(prints.task.dtype)
     is_single = count == 1 and tuple(given.shape[given.ndim - len(shape) :]) == shape and given.ndim <= 1 + len(shape)
     values = given.reshape(-1, 1, *shape) if is_single else given
     values = values[None] if values.ndim == 1 + len(shape) else values

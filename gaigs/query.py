@@ -44,9 +44,13 @@ def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
 
 
 def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped[Tensor, "k m"]:
-    """At most so many numbers of each label, evenly spread: arrays resolve fewer."""
-    numbers = labels[..., None].flatten(1)
-    return numbers[:, evenly(torch.arange(numbers.shape[1]), most)]
+    """At most so many numbers of each label, evenly spread over its rows and columns: arrays resolve fewer."""
+    numbers, columns = labels[..., None].flatten(1), labels.shape[-1] if labels.ndim > 1 else 1
+    index = evenly(torch.arange(numbers.shape[1]), most)
+    while len((index % columns).unique()) < min(columns, most) / 8:  # a step that divides the columns meets few
+        most -= 1
+        index = evenly(torch.arange(numbers.shape[1]), most)
+    return numbers[:, index]
 
 
 def as_tensor(name: str, values: object, expected: str) -> Tensor:

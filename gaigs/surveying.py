@@ -51,11 +51,11 @@ class SurveyPlan:
         errors: Expected mean absolute error of a label over the region and all receivers, before and after each place,
             in the label's unit (n + 1,); None without a model.
         known: Places that were measured (k, 3) [m].
-        losses: Rise of the mean error if one of them had been left out (k,).
-        superfluous: Known places that together raise the error over the region, or else the box of the training
-            transmitters, by at most 5 % if left out (k,).
+        losses: Rise of ``known_error`` if one of them had been left out (k,).
+        superfluous: Known places that together raise ``known_error`` by at most 5 % if left out (k,).
         unit: Of the errors.
         frame: Place of x and y on a map; None if unknown.
+        known_error: Expected mean error over the region, or else the box of the training transmitters, now.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -70,6 +70,7 @@ class SurveyPlan:
     superfluous: Bool[Tensor, " k"]
     unit: str = ""
     frame: Frame | None = None
+    known_error: float = math.nan
 
     def __repr__(self) -> str:
         return f"<{self}>"
@@ -101,7 +102,7 @@ class SurveyPlan:
             row("measure", place, word)
         known, losses = self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist()
         for place, loss in zip(known, losses, strict=True):
-            row("leave out", place, f"{self.errors[0] + loss:.6g}")
+            row("leave out", place, f"{self.known_error + loss:.6g}")
         write_text(Path(path), table.getvalue())
 
 
@@ -192,7 +193,10 @@ def survey(
         asked = at(points)
         centres = scene.positions(asked) if scene.task.is_scalar else [None] * len(processes)
         processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
-        factor = MEAN if model.calibration is None else model.calibration.mean_error
+        factor, calibration = MEAN, model.calibration
+        if calibration is not None:
+            rms = calibration.sizes.square().mean().sqrt().item()
+            factor = MEAN * rms if scene.task.is_scalar else calibration.mean_error
     posteriors, hears = [posterior(process, asked) for process in processes], heard(processes, asked)
     noises = [process.noise for process in processes]
 
@@ -219,9 +223,10 @@ def survey(
     if model is None:
         return SurveyPlan(places[chosen], None, places[:0], places[:0, 0], torch.zeros(0, dtype=torch.bool))
     box = asked[stated] if region is not None else at(even_places(scene.lower, scene.upper, POINTS, scene.floors))
-    known, losses, superfluous = without(processes, box, factor)
+    known, own, losses, superfluous = without(processes, box, factor)
     unit = getattr(model.scene.task, "error_unit", model.scene.task.unit)
-    return SurveyPlan(places[chosen], torch.tensor(errors), known, losses, superfluous, unit, model.scene.frame)
+    frame = model.scene.frame
+    return SurveyPlan(places[chosen], torch.tensor(errors), known, losses, superfluous, unit, frame, own)
 
 
 def run(config: dict, folder: Path) -> None:
@@ -340,8 +345,8 @@ def mean_of_heard(values: Float[Tensor, "r g"], hears: Float[Tensor, "r g"]) -> 
 
 def without(
     processes: list[Process], asked: Float[Tensor, "g d"], factor: float
-) -> tuple[Float[Tensor, "k 3"], Float[Tensor, " k"], Bool[Tensor, " k"]]:
-    """Known places, the rise of the mean error without each, and those that together raise it by little."""
+) -> tuple[Float[Tensor, "k 3"], float, Float[Tensor, " k"], Bool[Tensor, " k"]]:
+    """Known places, the mean error, its rise without each of them, and those that together raise it by little."""
     rows = [evenly(torch.arange(len(process.places)), COMPARED).to(asked.device) for process in processes]
     measured = [process.places[own, :3] for process, own in zip(processes, rows, strict=True)]
     known = torch.cat(measured).unique(dim=0)
@@ -377,4 +382,4 @@ def without(
         kept[order[:middle]] = False
         fewest, most = (middle, most) if error(kept) <= TOLERATED * before else (fewest, middle)
     superfluous[order[:fewest].cpu()] = True
-    return known.float().cpu(), factor * losses.cpu(), superfluous
+    return known.float().cpu(), factor * before, factor * losses.cpu(), superfluous

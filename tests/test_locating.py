@@ -378,6 +378,9 @@ def test_the_command_locates_the_test_transmitters_of_a_run(tmp_path, capsys):
     values.write_text("west,south\n-50.5,far\n")
     with pytest.raises(ValueError, match=r"line 2: expected a level .* got 'far' in column south"):
         gaigs.run(gaigs.compose(*command, f"locate.value={values}"), tmp_path / "one")
+    values.write_text("west,sooth\n-50.5,-48\n")
+    with pytest.raises(ValueError, match=r"values.csv, line 1: expected names of receivers, west.*, got sooth"):
+        gaigs.run(gaigs.compose(*command, f"locate.value={values}"), tmp_path / "one")
     with pytest.raises(ValueError, match="needs the folder of a finished run"):
         gaigs.run(gaigs.compose("command=locate"), tmp_path / "found")
 

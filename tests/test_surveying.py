@@ -48,7 +48,7 @@ def test_covariances_are_those_given_the_readings():
 
 def test_losses_are_those_of_leaving_a_place_out():
     own, asked = process(noise=1.0), torch.rand(60, 3, dtype=torch.float64) * 4
-    known, losses, superfluous = without([own], asked, MEAN)
+    known, _, losses, superfluous = without([own], asked, MEAN)
     error = lambda rows: MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
     every = error(range(12))
     for place, loss in zip(known, losses, strict=True):
@@ -213,7 +213,7 @@ def test_losses_are_those_of_leaving_all_readings_of_a_place_out():
     own, asked = process(noise=1.0), torch.rand(60, 3, dtype=torch.float64) * 4
     often = torch.tensor([0] * 8 + [1] * 3 + list(range(2, 12)))
     own = replace(own, places=own.places[often], noises=own.noises[often])
-    known, losses, _ = without([own], asked, MEAN)
+    known, _, losses, _ = without([own], asked, MEAN)
     error = lambda rows: MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
     for place, loss in zip(known, losses, strict=True):
         rows = [row for row, there in enumerate(own.places.float()) if not torch.allclose(there[:3], place)]

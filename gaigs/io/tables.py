@@ -45,11 +45,11 @@ def find_folder(root: str | Path) -> Path:
     return root
 
 
-def find_file(file: str | Path, content: str) -> Path:
-    """The file of a data set that is one file; a ``FileNotFoundError`` if it does not exist."""
+def find_file(file: str | Path, content: str, option: str = "the data's file") -> Path:
+    """The file of an option, as of a data set that is one file; a ``FileNotFoundError`` if it does not exist."""
     file = Path(os.path.expanduser(file))
     if not os.path.isfile(file):
-        raise FileNotFoundError(f"{file} must be {content}, and is no file; set the data's file")
+        raise FileNotFoundError(f"{file} must be {content}, and is no file; set {option}")
     return file
 
 

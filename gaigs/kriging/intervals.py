@@ -179,7 +179,8 @@ class Calibration:
 
     @property
     def mean_error(self) -> float:
-        """Mean absolute error over the model's own deviation."""
+        """Mean absolute error over the model's own deviation; of labels of one number, of which few calibrate, a little
+        too large."""
         return torch.trapezoid(self.quantiles, dx=1 / STEPS).mean().item()
 
     def gives(self, level: float) -> bool:
@@ -278,7 +279,8 @@ def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
             sums, level = scores["places"].long().bincount(score - score.mean()), int(name[-2:]) / 100
             links = 1 / len(score) + 1 / scores["calibration_links"].mean().item()
             spread = sums.square().sum().item() / len(score) * len(sums) / max(len(sums) - 1, 1)
-            spread = spread if score.min() < score.max() else level * (1 - level)
+            if score.min() == score.max():
+                spread = level * (1 - level) * len(score) / len(sums)
             numbers[f"{name}_error"] = math.sqrt(spread * links) if len(sums) > 1 else math.nan
     return numbers
 

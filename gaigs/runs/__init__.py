@@ -111,7 +111,7 @@ def configuration_of(folder: str | Path) -> dict:
     """The configuration of a run."""
     path = Path(folder) / "config.yaml"
     if not is_configuration(path):
-        raise FileNotFoundError(f"{folder} holds no run; give the folder with config.yaml, as folder=runs/...")
+        raise FileNotFoundError(f"{folder} holds no run; give the folder with config.yaml, such as runs/room")
     config: Any = OmegaConf.to_container(OmegaConf.load(path))
     return config
 

@@ -187,7 +187,7 @@ def test_readings_of_one_place_count_as_one_where_they_err_together():
     together = (torch.rand(400, generator=generator) < 0.9).repeat_interleave(4)
     assert error(alone) == pytest.approx(0.3 / 40, rel=0.15)
     assert error(together) == pytest.approx(0.3 / 20, rel=0.15)
-    assert error(torch.ones(1600)) == pytest.approx(0.3 / 40)  # no scatter is no certainty
+    assert error(torch.ones(1600)) == pytest.approx(0.3 / 20)  # no scatter is no certainty
 
 
 def test_the_places_of_test_links_are_theirs():

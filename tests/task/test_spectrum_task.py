@@ -20,7 +20,7 @@ def pairs():
     return labels, labels + 0.2 * torch.randn(5, *TASK.shape, generator=generator)
 
 
-@pytest.mark.parametrize("shape", [(90, 360), (128, 512), (256, 256), (361, 181), (9, 8)])
+@pytest.mark.parametrize("shape", [(90, 360), (128, 512), (256, 256), (511, 256), (73, 360), (361, 181), (9, 8)])
 def test_fingerprints_are_of_many_rows_and_columns(shape):
     rows, columns = shape
     row, column = np.divmod(TASK.fingerprint(torch.arange(rows * columns).view(1, *shape))[0].numpy(), columns)
