@@ -264,14 +264,17 @@ def figure(plan: SurveyPlan) -> Figure:
             clip_on=False,
             label="to measure, in this order",
         )
+        numbers: dict[tuple[float, ...], list[str]] = {}
         for number, place in enumerate(plan.places.tolist(), 1):
-            left.annotate(str(number), place[:2], ha="center", va="center", color="white", size=5)
+            numbers.setdefault(tuple(place[:2]), []).append(str(number))
+        for place, words in numbers.items():  # one above the other, for places at several heights
+            left.annotate("\n".join(words), place, ha="center", va="center", color="white", size=5 / len(words) ** 0.5)
         left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         drawn.legend(loc="outside lower left", ncols=3)
         label = f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
         for axis in right:
             axis.plot(plan.errors.numpy(), color=style.BLUE)
-            axis.set(xlabel="new places", ylabel=label, ylim=(0, None))
+            axis.set(xlabel="new places", ylabel=label, ylim=(0, 1.05 * plan.errors.max().item()))
             axis.xaxis.get_major_locator().set_params(integer=True)
             axis.grid()
             axis.set_axisbelow(True)

@@ -58,6 +58,8 @@ def test_values_by_names_of_receivers_are_those_in_their_order():
         )
     with pytest.raises(ValueError, match="receiver must be one of 0 = rx0, 1 = rx1, got 'rx2'"):
         gaigs.locate(prints, {"rx2": -55.0})
+    with pytest.raises(ValueError, match="must have real labels"):
+        gaigs.locate(prints, {"rx1": -55.0 + 1j})
     with pytest.raises(ValueError, match="the label of one receiver or more, got none"):
         gaigs.locate(prints, {})
 
@@ -321,6 +323,7 @@ def test_wrong_values_are_refused(rssi):
         ([100.0, -50.0, -60.0, -70.0], "value of task 'rssi' must be from -200 to 30 dBm, nan where nothing was heard"),
         (np.zeros((0, 4)), "a label of each receiver"),
         ([-50.0, math.inf, -60.0, -70.0], "must be finite"),
+        ([-50.0 + 1j, -50.0, -60.0, -70.0], "must have real labels"),
         ("loud", "value must be labels of 4 receivers"),
     ):
         with pytest.raises(ValueError, match=words):
