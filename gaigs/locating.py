@@ -569,7 +569,7 @@ def candidates(
     """A grid in the box or on separate floors, with links denser about known places.
 
     The density about known places is a sum of normal ones, each on its floor. Places of other folds are most likely
-    under their width, which along an axis is at most the deviation of an even spread over the box.
+    under their width.
     """
     if links is None:
         places = even_places(box[0], box[1], points, floors)
@@ -579,27 +579,24 @@ def candidates(
     edges = (box[1] - box[0]).double()
     edges[2] *= not len(floors)
     extended = edges > 1e-3 * edges.max()
-    volume = edges[extended].prod() * max(1, len(floors))
+    dimensions, volume = int(extended.sum()), edges[extended].prod() * max(1, len(floors))
     floor_of = lambda places: (places[:, 2:] - floors).abs().argmin(1)
 
-    along_axes = lambda width: (edges / math.sqrt(12)).clamp_max(width)
-
     def log_density(asked: Tensor, width: float, own: Tensor | None = None) -> Tensor:
-        scales = along_axes(width)[extended]
-        squared = distances(asked[:, extended] / scales, sites[:, extended] / scales).square_()
+        squared = distances(asked[:, extended], sites[:, extended]).square_()
         if len(floors):
             squared = squared.masked_fill(floor_of(asked)[:, None] != floor_of(sites), math.inf)
         if own is not None:
             squared = squared.masked_fill(own[:, None] == folds, math.inf)
-        size = math.log(1 - ELSEWHERE) - math.log(len(sites)) - (scales * math.sqrt(2 * math.pi)).log().sum()
-        near = torch.logsumexp(squared / -2, 1) + size
+        size = math.log(1 - ELSEWHERE) - math.log(len(sites)) - dimensions * math.log(width * math.sqrt(2 * math.pi))
+        near = torch.logsumexp(squared / (-2 * width**2), 1) + size
         return torch.logaddexp(near, (ELSEWHERE / volume).log())
 
     some = evenly(torch.arange(len(sites)), POINTS // 20)
     widths = torch.logspace(math.log10(links.scene.spacing / 4), math.log10(edges.norm()), 24).tolist()
     width = max(widths, key=lambda width: log_density(sites[some], width, folds[some]).mean().item())
     even, count = even_places(box[0], box[1], max(1, points // 4), floors), points - points // 4
-    noise = along_axes(width) * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    noise = width * extended * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
     places = torch.cat((even, (sites[torch.arange(count) * len(sites) // count] + noise).float()))
     shares = torch.tensor([ELSEWHERE / len(even), (1 - ELSEWHERE) / count]).log()
     density = torch.cat([log_density(part.double(), width) for part in places.split(1024)])
