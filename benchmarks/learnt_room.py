@@ -28,7 +28,7 @@ from gaigs.placement.mirrored.export import facts
 from gaigs.placement.mirrored.materials import materials
 from gaigs.query import Query
 from gaigs.report.table import markdown
-from gaigs.runs import links_of, model_of
+from gaigs.runs import links_of, load
 
 FOLDER = Path("runs/learnt_room")
 
@@ -58,7 +58,7 @@ def trace(file: Path, links: Links, query: Query, order: int) -> Complex[Tensor,
 def main(folder: Path) -> None:
     if not (folder / "metrics.json").is_file():
         gaigs.run(gaigs.compose("+experiment=mirrored_csi"), folder)
-    model, links = model_of(folder), links_of(folder)
+    model, links = load(folder), links_of(folder)
     own = model.trend if isinstance(model, Kriging) else model
     placement, query, carrier = own.placement, links.query[links.split.test], float(links.scene.frequencies[0])
     bounces = int((placement.sequences[placement.kept] >= 0).sum(1).max())

@@ -66,7 +66,7 @@ def test_a_run_prints_what_it_does_and_nothing_else(uninterrupted):
     folder, out, err = uninterrupted
     assert err == ""
     lines = out.splitlines()
-    assert (folder / "gaigs.log").read_text().splitlines() == [*lines[:3], lines[4]]
+    assert (folder / "gaigs.log").read_text().splitlines() == [*lines[:3], *lines[4:6]]
     assert lines[0] == "data: synthetic; split official, validation 0.1, seed 0: 22 train, 2 validation, 6 test"
     assert re.match(r"data: training transmitters within \d\.\d\d x \d\.\d\d x \d\.\d\d m$", lines[1])
     assert lines[2].startswith(
@@ -74,7 +74,8 @@ def test_a_run_prints_what_it_does_and_nothing_else(uninterrupted):
     )
     assert re.match(r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} ssim \d\.\d{3}$", lines[3])
     assert re.match(r"trained 40 steps of 7 places in \d+ s: [\d.]+ steps/s$", lines[4])
-    assert "Test scores" in lines[5]
+    assert lines[5] == "gaigs has no intervals: 2 links calibrate them, and 9 are needed"
+    assert "Test scores" in lines[6]
     assert lines[-1].endswith(str(folder))
     assert all(len(line) <= 80 for line in lines[3:-1])
 
