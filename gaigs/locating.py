@@ -509,7 +509,7 @@ def map_figure(found: Location, level: float) -> Figure:
     """Where the transmitters are from above: the probability of cells, of a single value also its region."""
     places, weights = found.places[:, :2].double().numpy(), found.probabilities.mean(0).double().numpy()
     low, high = np.quantile(places, (0.001, 0.999), 0)
-    spare = np.maximum(0, 0.15 * (high - low).max() - (high - low)) / 2  # of a corridor
+    spare = np.maximum(0, 0.15 * ((high - low).max() or 1.0) - (high - low)) / 2  # of a corridor
     low, high = low - spare, high + spare
     pitch = math.sqrt((high - low).prod() / min(CELLS, len(places) / 8))
     across, up = (np.arange(start, end + pitch, pitch) for start, end in zip(low, high, strict=True))
@@ -524,7 +524,7 @@ def map_figure(found: Location, level: float) -> Figure:
         axis.plot(*found.mean[:, :2].T.numpy(), "o", markersize=4, color=style.ORANGE, label="mean")
         if len(found.mean) == 1:
             inside = gaussian_filter((counted(found.region[0].double().numpy()) > 0).astype(float), 1)
-            axis.contour(*middles, inside, [0.3], colors=style.GREY, linewidths=0.8)
+            axis.contour(*middles, inside, [0.3 * inside.max()], colors=style.GREY, linewidths=0.8)
             axis.plot([], [], color=style.GREY, lw=0.8, label=f"region of {100 * level:g} %")
         axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         drawn.legend(loc="outside lower left", ncols=3)
