@@ -50,7 +50,9 @@ def read(path: str | Path) -> dict:
     check_type("path", path, str | Path)
     path = Path(path)
     if not os.path.isfile(path):  # False for a name that is too long
-        raise FileNotFoundError(f"no checkpoint at {path}; a run writes best.ckpt and last.ckpt into its folder")
+        raise FileNotFoundError(
+            f"no checkpoint at {path}, and no run; a run writes best.ckpt and last.ckpt into its folder"
+        )
     data = path.read_bytes()
     try:
         sealed, digest = data[:-DIGEST], data[-DIGEST:]
