@@ -5,6 +5,7 @@ import csv
 import math
 import os
 import re
+import reprlib
 import sys
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNOR
 
 def quote(value: object) -> str:
     """A value as errors show it: printable and short."""
-    text = repr(value)
+    text = repr(value) if isinstance(value, str) else reprlib.repr(value)  # of few entries: aliases of YAML multiply
     return text if len(text) <= 100 else f"{text[:100]} ..."
 
 
