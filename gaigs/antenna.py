@@ -110,6 +110,13 @@ class Receiver:
     pose: Pose
     array: Array = field(default_factory=Array.single)
 
+    def __post_init__(self) -> None:
+        axes = self.pose.rotation.double()
+        # NaN is no rotation either, nor a mirror, whose determinant is -1.
+        if not ((axes.mT @ axes - torch.eye(3).to(axes)).abs().max() <= 1e-3 and torch.linalg.det(axes) > 0):
+            wanted = "a rotation, whose orthonormal columns are the array's axes"
+            raise ValueError(f"the pose of receiver {self.name!r} must have {wanted}, got {axes.tolist()}")
+
 
 def lacking(receivers: Sequence[Receiver], index: Int[Tensor, " b"], count: int) -> Bool[Tensor, "b e"]:
     """True for each of ``count`` elements that the array of a link's receiver lacks; ``index`` numbers receivers."""
