@@ -2,9 +2,11 @@
 
 import hashlib
 import io
+import itertools
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from zipfile import ZipFile
 
 import torch
 from torch import Tensor, nn
@@ -58,7 +60,13 @@ def read(path: str | Path) -> dict:
         sealed, digest = data[:-DIGEST], data[-DIGEST:]
         if not sealed.endswith(SEAL) or hashlib.sha256(sealed).hexdigest().encode() != digest:
             raise ValueError("another digest")
+        with ZipFile(io.BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > len(data):
+                raise ValueError("compressed, which torch.save never does")
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        # A view can be far larger than the numbers behind it; those of a model are not.
+        if sum(tensor.nbytes for _, tensor in _tensors(content, "")) > 4 * len(data) + 2**26:
+            raise ValueError("larger than the file")
     except Exception as error:  # any error of zip readers and unpicklers; torch's own message advises to run code
         if lacks_memory(error):
             raise
@@ -137,12 +145,19 @@ def add_calibration(path: Path, model: nn.Module) -> None:
 
 
 def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
-    """All tensors in nested mappings and lists, with their places."""
-    if isinstance(value, Tensor):
-        yield name, value
-    elif isinstance(value, dict | list | tuple):
-        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _tensors(item, f"{name} {key}")
+    """All tensors in nested mappings and lists, with their places; a ``ValueError`` if these nest without an end."""
+    parts = [(name, value, 0)]
+    for count in itertools.count():
+        if not parts:
+            return
+        name, value, depth = parts.pop()
+        if depth > 50 or count > 1_000_000:
+            raise ValueError(f"{name:.80} is nested too deeply")
+        if isinstance(value, Tensor):
+            yield name, value
+        elif isinstance(value, dict | list | tuple):
+            entries = value.items() if isinstance(value, dict) else enumerate(value)
+            parts += [(f"{name} {key}", item, depth + 1) for key, item in entries]
 
 
 def _check_finite(name: str, value: object) -> None:
