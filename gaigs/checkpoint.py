@@ -4,8 +4,9 @@ import hashlib
 import io
 import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from zipfile import ZipFile
 
 import torch
@@ -14,7 +15,7 @@ from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 
 from gaigs.io.files import atomic_write
 from gaigs.processes import lacks_memory
-from gaigs.registry import check_type, configuration_of, name_of, registry
+from gaigs.registry import check_type, configuration_of, digests, name_of, only_recorded, registry
 from gaigs.scene import Scene
 
 KEY = "gaigs"
@@ -89,17 +90,22 @@ def save(model: nn.Module, path: str | Path) -> None:
     if not state:
         raise ValueError(f"model {name_of(model)!r} is a look-up without a state; keep its links, and fit it again")
     part = {"version": VERSION, "scene": model.scene.state(), **described(model)}
+    part["plugins"] = digests(part["model"], part["scene"]["task"])
     write({KEY: part, "state_dict": {f"model.{key}": value.cpu() for key, value in state.items()}}, Path(path))
 
 
-def load(path: str | Path) -> nn.Module:
-    """The model of a checkpoint in evaluation mode, on the CPU; errors as of ``gaigs.load``."""
+def load(path: str | Path, trust: bool = False, recorded: Mapping[str, str] = MappingProxyType({})) -> nn.Module:
+    """The model of a checkpoint in evaluation mode, on the CPU; arguments and errors as of ``gaigs.load``.
+
+    ``recorded`` has digests of plug-ins, for a checkpoint from before it had them itself.
+    """
     content = read(path)
     weights, scene = content["state_dict"], content[KEY]["scene"]
     try:
         consume_prefix_in_state_dict_if_present(weights, "model.")
         _check_finite("scene", scene)
-        model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(scene))
+        with only_recorded(None if trust else {**recorded, **content[KEY].get("plugins", {})}):
+            model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(scene))
         unset = {name for name, value in model.state_dict().items() if not value.isfinite().all()}
         model.load_state_dict(weights)
         _check_finite("weights", {name: value for name, value in weights.items() if name not in unset})
@@ -109,7 +115,7 @@ def load(path: str | Path) -> nn.Module:
         if lacks_memory(error):
             raise
         cause = str(error) if isinstance(error, ValueError | ImportError) else f"{type(error).__name__}: {error}"
-        message = f"cannot make the model of {path}: {' '.join(cause.split())}"
+        message = f"cannot make the model of {path}: {cause if cause.count(chr(10)) < 2 else ' '.join(cause.split())}"
         raise (ImportError if isinstance(error, ImportError) else ValueError)(message) from error
     return model.eval()
 

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 HARMLESS = (
     "command", "folder", "survey", "locate", "export", "view", "figures", "save_every", "tensorboard", "threads",
-    "trainer.enable_progress_bar", "trainer.enable_model_summary",
+    "trust", "trainer.enable_progress_bar", "trainer.enable_model_summary",
 )  # fmt: skip
 """Keys that change no result: a run may be resumed with other values."""
 
@@ -41,8 +41,8 @@ KEYS = {
     **dict.fromkeys((*KINDS, "trainer"), dict), **dict.fromkeys(MAY_BE_NULL, dict | None),
     "kriging": bool, "kriging_fallback": dict | None, "baselines": list[dict], "command": str, "seed": int,
     "ensemble": int,
-    "save_every": float, "tensorboard": bool, "threads": int | None, "folder": str | None, "survey": dict,
-    "locate": dict, "export": dict, "view": dict, "figures": dict,
+    "save_every": float, "tensorboard": bool, "threads": int | None, "trust": bool, "folder": str | None,
+    "survey": dict, "locate": dict, "export": dict, "view": dict, "figures": dict,
 }  # fmt: skip
 """Top-level keys and their types."""
 

@@ -20,6 +20,7 @@ import gaigs
 from gaigs import checkpoint, runs
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
+from gaigs.registry import digests
 from gaigs.scene import Scene
 
 OVERRIDES = (
@@ -134,7 +135,14 @@ DEFECTS = {
         lambda content: MODEL(content)["tokenizer"].update(name="fourier"), "unknown tokenizer 'fourier'"
     ),
     "a task that is not installed": (lambda content: SCENE(content)["task"].update(name="odour"), "unknown task"),
-    "a plug-in that cannot be imported": (lambda content: MODEL(content).update(name="broken"), "ZeroDivisionError"),
+    "a plug-in that cannot be imported": (
+        lambda content: content[checkpoint.KEY].update(model={"name": "broken"}, plugins=digests("broken")),
+        "ZeroDivisionError",
+    ),
+    "a plug-in that is not recorded": (
+        lambda content: content[checkpoint.KEY].update(model={"name": "broken"}, plugins={}),
+        r"plugins/broken.py is not the source of model 'broken' that was recorded .*\n.* trust=True in gaigs.load",
+    ),
     "other weights": (lambda content: MODEL(content)["deformation"].update(width=32), "size mismatch for deformation"),
     "a weight too few": (lambda content: WEIGHTS(content).pop(MEANS), "Missing key.*gaussians.means"),
     "a weight that is a word": (lambda content: WEIGHTS(content).update({MEANS: "means"}), "means"),

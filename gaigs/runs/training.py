@@ -30,7 +30,7 @@ from gaigs.model import Model
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
-from gaigs.registry import call, configuration_of, registry
+from gaigs.registry import call, configuration_of, digests, registry
 from gaigs.runs.evaluation import calibrated, is_trained
 from gaigs.runs.folder import ANOTHER, check_same_links, claim, fingerprint
 from gaigs.training.batches import Batches, InOrder
@@ -202,7 +202,7 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
     """
     split = {"name": links.split.name, **links.split.parts()}
     identity = {"version": checkpoint.VERSION, "model": config["model"], "scene": links.scene.state(), "split": split}
-    identity |= {"config": config, "links": fingerprint(links)}
+    identity |= {"config": config, "links": fingerprint(links), "plugins": digests(config, links.scene.state()["task"])}
     context = {"model": model, "loss": loss, "identity": identity, "seed": config["seed"]}
     module = registry("training").build(config["training"], **context)
     last, best = folder / "last.ckpt", folder / "best.ckpt"
