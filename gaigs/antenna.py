@@ -45,7 +45,7 @@ class Array:
 
     @classmethod
     def single(cls) -> "Array":
-        return cls(torch.zeros(1, 3))
+        return cls(torch.zeros(1, 3, dtype=torch.float32))
 
     @classmethod
     def planar(cls, rows: int, columns: int, pitch: float, pattern: str = "isotropic") -> "Array":

@@ -280,7 +280,7 @@ class Grid:
     @classmethod
     def degrees(cls, elevations=range(1, 91), azimuths=range(360)) -> "Grid":
         """A grid of whole degrees; the default is that of the NeRF² spectra, 90 x 360."""
-        as_radians = lambda values: torch.deg2rad(torch.tensor([float(v) for v in values]))
+        as_radians = lambda values: torch.tensor([float(v) for v in values], dtype=torch.float32).deg2rad()
         return cls(as_radians(elevations), as_radians(azimuths))
 
     @classmethod

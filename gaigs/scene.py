@@ -45,10 +45,10 @@ class Scene:
     upper: Float[Tensor, "3"]
     spacing: float
     task: Task
-    frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0))
+    frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
     bandwidth: float | None = None
     frame: Frame | None = None
-    floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0))
+    floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""

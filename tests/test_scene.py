@@ -68,6 +68,13 @@ def test_rows_lie_along_y_and_columns_along_x(rows, columns):
     assert not elements[:, :, 2].any()
 
 
+def test_elements_of_an_array_have_places_in_the_room():
+    receiver = Receiver("door", Pose.from_xyzw([1.0, 2.0, 3.0], [0.0, 0.0, 1.0, 0.0]), Array.planar(2, 2, 1.0))
+    places = receiver.pose.world(receiver.array.elements)
+    assert places.tolist() == [[1.5, 2.5, 3.0], [1.5, 1.5, 3.0], [0.5, 2.5, 3.0], [0.5, 1.5, 3.0]]
+    assert torch.equal(receiver.pose.local(places), receiver.array.elements)
+
+
 def test_elements_hear_as_their_pattern_says():
     directions = Grid.degrees(range(-90, 91, 30), range(0, 360, 60)).vectors().double()
     assert torch.equal(Array.single().gain(directions), torch.ones(7, 6, dtype=torch.float64))

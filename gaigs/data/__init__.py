@@ -111,7 +111,7 @@ class Links:
     frame: Frame | None = None
     uncertainties: Float[Tensor, " r"] | None = None
     noises: Float[Tensor, " n"] | None = None
-    edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
+    edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3, dtype=torch.float32))
     remarks: str = ""
     origin: Mapping = field(default_factory=dict)
 

@@ -23,6 +23,7 @@ from types import MappingProxyType, NoneType, UnionType
 from typing import Any
 
 from gaigs.registry.holders import GIVEN, MISSING, Holder, find_holders, is_plain, sources
+from gaigs.registry.modes import usual_modes
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
@@ -316,7 +317,8 @@ def _noting(kind: str, name: str, component: Any) -> Any:
 
     @functools.wraps(make)
     def noting(self, *args, **kwargs) -> None:
-        make(self, *args, **kwargs)
+        with usual_modes():
+            make(self, *args, **kwargs)
         if type(self) is component:  # a subclass has a name of its own, or none
             bound = signature.bind(self, *args, **kwargs)
             bound.apply_defaults()

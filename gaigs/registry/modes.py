@@ -1,0 +1,33 @@
+"""Global modes of torch, which gaigs leaves to its caller."""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+_switching = threading.Lock()
+_callers: list[Any] = []
+
+
+@contextlib.contextmanager
+def usual_modes() -> Iterator[None]:
+    """Float32 as torch's default dtype, and no inference mode, while gaigs computes; also a decorator.
+
+    All threads share the default dtype: the first one in sets it, the last one out restores the caller's. In between
+    others may change it, as Lightning does for ``trainer.precision=64-true``.
+    """
+    import torch  # slow to import
+
+    with _switching:
+        _callers.append(torch.get_default_dtype())
+        if len(_callers) == 1:
+            torch.set_default_dtype(torch.float32)
+    try:
+        # Where there is no inference mode, leaving it would switch gradients on.
+        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else contextlib.nullcontext():
+            yield
+    finally:
+        with _switching:
+            if len(_callers) == 1:
+                torch.set_default_dtype(_callers[0])
+            _callers.pop()
