@@ -71,9 +71,11 @@ __all__ = [
 def __getattr__(name: str):
     if name not in PLACES:
         raise AttributeError(f"module 'gaigs' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"gaigs.{PLACES[name]}"), name)
+    module = importlib.import_module(f"gaigs.{PLACES[name]}")
+    value = getattr(module, name)
     if inspect.isfunction(value) and name != "register":  # the decorator of ``register`` looks at its caller
         value = usual_modes()(value)
+        setattr(module, name, value)  # where pickle looks for it
     globals()[name] = value
     return value
 

@@ -6,7 +6,6 @@ import itertools
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import MappingProxyType
 from zipfile import ZipFile
 
 import torch
@@ -94,10 +93,10 @@ def save(model: nn.Module, path: str | Path) -> None:
     write({KEY: part, "state_dict": {f"model.{key}": value.cpu() for key, value in state.items()}}, Path(path))
 
 
-def load(path: str | Path, trust: bool = False, recorded: Mapping[str, str] = MappingProxyType({})) -> nn.Module:
-    """The model of a checkpoint in evaluation mode, on the CPU; arguments and errors as of ``gaigs.load``.
+def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Module:
+    """The model of a checkpoint in evaluation mode, on the CPU; errors as of ``gaigs.load``.
 
-    ``recorded`` has digests of plug-ins, for a checkpoint from before it had them itself.
+    ``recorded`` has the digests of plug-ins of a checkpoint that lacks them, of an earlier version.
     """
     content = read(path)
     weights, scene = content["state_dict"], content[KEY]["scene"]
@@ -121,7 +120,7 @@ def load(path: str | Path, trust: bool = False, recorded: Mapping[str, str] = Ma
 
 
 def trained_weights(content: dict) -> dict:
-    """The weights of the training module in a checkpoint, before and after ``exchange_model``."""
+    """The weights of the training module in a checkpoint, before and after ``update``."""
     weights = content["state_dict"]
     if "trained" not in content[KEY]:
         return weights
@@ -135,18 +134,13 @@ def described(model: nn.Module) -> dict:
     return {"model": configuration_of(model), "calibration": calibration, "known_places": model.known_places}
 
 
-def exchange_model(path: Path, model: nn.Module, trained: str) -> None:
-    """Replaces the model of a checkpoint by one of the same scene, whose part ``trained`` is the trained model."""
-    content = read(path)
-    content[KEY] |= {"trained": trained, **described(model)}
-    content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
-    write(content, path)
-
-
-def add_calibration(path: Path, model: nn.Module) -> None:
-    """Adds the calibration of a checkpoint's model."""
+def update(path: Path, model: nn.Module, trained: str | None = None) -> None:
+    """Gives a checkpoint its model's calibration; or another model of the scene, whose part ``trained`` was trained."""
     content = read(path)
     content[KEY] |= described(model)
+    if trained is not None:
+        content[KEY]["trained"] = trained
+        content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
     write(content, path)
 
 

@@ -47,14 +47,11 @@ class Frame:
 
     def __post_init__(self) -> None:
         remedy = "gaigs.data.maps.to_utm converts degrees and feet into metres of UTM, and gives its code"
-        if not (isinstance(self.epsg, Integral) and isinstance(self.x, Real) and isinstance(self.y, Real)):
-            raise ValueError(f"a frame needs an EPSG code and two numbers x, y [m], got {self}\n{remedy}")
-        is_degrees = abs(self.x) <= 180 and abs(self.y) <= 90 and (self.x, self.y) != (0, 0)
-        # Eastings in a zone are 166 to 834 km, and positions within 100 km of the origin.
-        is_outside = is_utm(self.epsg) and not (5e4 <= self.x <= 9.5e5 and -1e5 <= self.y <= 1.01e7)
-        if is_degrees or is_outside or not (math.isfinite(self.x) and math.isfinite(self.y)):
-            where = f"easting and northing [m] in EPSG:{self.epsg}"
-            raise ValueError(f"a frame's origin must be {where}, got ({self.x:g}, {self.y:g})\n{remedy}")
+        is_number = isinstance(self.epsg, Integral) and isinstance(self.x, Real) and isinstance(self.y, Real)
+        if not is_number or not math.isfinite(self.x + self.y) or self._is_elsewhere():
+            raise ValueError(
+                f"a frame needs an EPSG code, and its origin's easting and northing [m], got {self}\n{remedy}"
+            )
         if is_utm(self.epsg) or find_spec("pyproj") is None:
             return
         import pyproj
@@ -65,8 +62,14 @@ class Frame:
             raise ValueError(f"there is no coordinate system EPSG:{self.epsg}\n{remedy}") from None
         units = [axis.unit_name for axis in system.axis_info[:2]]
         if not system.is_projected or units != ["metre", "metre"]:
-            found = f"{system.name} in {units[0] if units else 'no units'}"
-            raise ValueError(f"a frame must be a projected system in metres, got EPSG:{self.epsg}, {found}\n{remedy}")
+            found = f"EPSG:{self.epsg}, {system.name} in {units[0]}"
+            raise ValueError(f"a frame must be a projected system in metres, got {found}\n{remedy}")
+
+    def _is_elsewhere(self) -> bool:
+        """True if the origin is in degrees, or far from its zone of UTM, whose eastings are 166 to 834 km."""
+        if is_utm(self.epsg):
+            return not (5e4 <= self.x <= 9.5e5 and -1e5 <= self.y <= 1.01e7)
+        return abs(self.x) <= 180 and abs(self.y) <= 90 and (self.x, self.y) != (0, 0)
 
 
 def is_utm(epsg: int) -> bool:

@@ -371,7 +371,7 @@ def locate(
             unit = getattr(prints.task, "error_unit", prints.task.unit)
             words = f"readings are up to {beyond.max():.3g} {unit} beyond all predicted ones"
             advice = "check their unit, and leave out what was not heard"
-            warnings.warn(f"{words}; {advice}", ExtrapolationWarning, stacklevel=2)
+            warnings.warn(f"{words}; {advice}", ExtrapolationWarning, stacklevel=3)  # as of a radio map
     return posterior(prints, asked, unknown_power, step, level)
 
 

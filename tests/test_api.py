@@ -3,6 +3,7 @@
 import contextlib
 import doctest
 import inspect
+import pickle
 import re
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from hydra import compose, initialize_config_dir
 import gaigs
 from gaigs import configuration
 from gaigs.algebra import Algebra
+from gaigs.geometry import ExtrapolationWarning
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.model.kriging import Kriging
@@ -290,6 +292,15 @@ def test_links_are_made_in_several_threads_at_once():
     with double_precision(), ThreadPoolExecutor(6) as pool:
         found = [*pool.map(make, range(6))]
     assert all(torch.equal(test, found[0]) for test in found)
+
+
+def test_public_functions_go_to_other_processes_and_warn_at_the_line_that_calls_them():
+    functions = [value for value in (getattr(gaigs, name) for name in PUBLIC) if inspect.isfunction(value)]
+    assert all(pickle.loads(pickle.dumps(function)) is function for function in functions)
+    model = gaigs.train("mean", gaigs.links("synthetic_rssi", transmitters=20))
+    with pytest.warns(ExtrapolationWarning) as warned:
+        gaigs.radio_map(model, pitch=1.0, height=500.0)
+    assert warned[0].filename == __file__
 
 
 def test_test_links_that_a_model_has_learnt_from_are_told(spectra, tmp_path, caplog):

@@ -6,15 +6,14 @@ from collections.abc import Iterator
 from typing import Any
 
 _switching = threading.Lock()
-_callers: list[Any] = []
+_callers: list[Any] = []  # the default dtype that each call found
 
 
 @contextlib.contextmanager
 def usual_modes() -> Iterator[None]:
     """Float32 as torch's default dtype, and no inference mode, while gaigs computes; also a decorator.
 
-    All threads share the default dtype: the first one in sets it, the last one out restores the caller's. In between
-    others may change it, as Lightning does for ``trainer.precision=64-true``.
+    Threads share the default dtype: the first one in sets it, the last one out restores it. Lightning changes it.
     """
     import torch  # slow to import
 
@@ -23,7 +22,7 @@ def usual_modes() -> Iterator[None]:
         if len(_callers) == 1:
             torch.set_default_dtype(torch.float32)
     try:
-        # Where there is no inference mode, leaving it would switch gradients on.
+        # Leaving an inference mode that is none would switch gradients on.
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else contextlib.nullcontext():
             yield
     finally:

@@ -91,7 +91,7 @@ def load(path: str | Path, trust: bool = False) -> Model:
     """
     check_type("path", path, str | Path)
     if not os.path.isdir(path):
-        loaded: Any = checkpoint.load(path, trust)
+        loaded: Any = checkpoint.load(path, trust, {})
         return loaded
     folder, config = Path(path), configuration_of(path)
     recorded, model = stored_software(folder), config["model"]

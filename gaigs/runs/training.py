@@ -160,16 +160,16 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         model, more = with_others(model, loss, links, config, folder)
         model.known_places = places
         kriged, seconds, trained = make_kriged(model), seconds + more, "members.0"
-        checkpoint.exchange_model(best, model, trained)
+        checkpoint.update(best, model, trained)
     model.calibration = calibrated(model, links)
     if kriged is None:
-        checkpoint.add_calibration(best, model)
+        checkpoint.update(best, model)
         return Fitted({name: model}, {name: model}, start, seconds)
     began = time.monotonic()
     validation_model = kriged.to(model.device).krige(links)
     kriging_seconds = time.monotonic() - began
     kriged.calibration, kriged.known_places = calibrated(validation_model, links), places
-    checkpoint.exchange_model(best, kriged, ".".join(filter(None, ("trend", trained))))
+    checkpoint.update(best, kriged, ".".join(filter(None, ("trend", trained))))
     models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged, validation_model))
     return Fitted(models, unseen, start, seconds, kriging_seconds)
 
