@@ -49,9 +49,7 @@ class Frame:
         remedy = "gaigs.data.maps.to_utm converts degrees and feet into metres of UTM, and gives its code"
         is_number = isinstance(self.epsg, Integral) and isinstance(self.x, Real) and isinstance(self.y, Real)
         if not is_number or not math.isfinite(self.x + self.y) or self._is_elsewhere():
-            raise ValueError(
-                f"a frame needs an EPSG code, and its origin's easting and northing [m], got {self}\n{remedy}"
-            )
+            raise ValueError(f"a frame must be an EPSG code with an easting and a northing [m], got {self}\n{remedy}")
         if is_utm(self.epsg) or find_spec("pyproj") is None:
             return
         import pyproj
@@ -66,10 +64,11 @@ class Frame:
             raise ValueError(f"a frame must be a projected system in metres, got {found}\n{remedy}")
 
     def _is_elsewhere(self) -> bool:
-        """True if the origin is in degrees, or far from its zone of UTM, whose eastings are 166 to 834 km."""
+        """True if the origin is in degrees, or beyond all of UTM: Norway has eastings of -80 to 1120 km in zone 33."""
+        is_small = abs(self.x) <= 180 and abs(self.y) <= 90
         if is_utm(self.epsg):
-            return not (5e4 <= self.x <= 9.5e5 and -1e5 <= self.y <= 1.01e7)
-        return abs(self.x) <= 180 and abs(self.y) <= 90 and (self.x, self.y) != (0, 0)
+            return is_small or not (-2e5 <= self.x <= 1.3e6 and -1e5 <= self.y <= 1.01e7)
+        return is_small and (self.x, self.y) != (0, 0)
 
 
 def is_utm(epsg: int) -> bool:

@@ -146,6 +146,7 @@ def test_each_pair_of_elements_has_its_lag(array):
 # --- frames ---
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
@@ -153,6 +154,7 @@ def test_each_pair_of_elements_has_its_lag(array):
             (32632, 11.5, 48.1),
             r"an easting and a northing .*, got Frame\(epsg=32632, x=11.5, y=48.1\)",
         ),
+        ((32632, 0.0, 0.0), "an easting and a northing"),
         ((32632, 5.4e6, 4.5e5), "an easting and a northing"),
         ((32632, math.nan, 5.4e6), "x=nan"),
         (("32632", 4.5e5, 5.4e6), "epsg='32632'"),
@@ -170,9 +172,10 @@ def test_frames_that_are_no_projected_metres_are_refused(frame, message):
         Frame(*frame)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_systems_in_metres_are_taken_and_those_of_utm_without_pyproj(monkeypatch):
     pytest.importorskip("pyproj")
-    for code, x, y in ((25832, 4.5e5, 5.4e6), (27700, 0.0, 0.0), (3857, 1e6, 6e6), (np.int64(32733), 6e4, 9.9e6)):
+    for code, x, y in ((25832, 4.5e5, 5.4e6), (27700, 0.0, 0.0), (3857, 1e6, 6e6), (np.int64(32633), -8e4, 6.9e6)):
         assert Frame(code, x, y).epsg == code
     monkeypatch.setitem(sys.modules, "pyproj", None)
     assert Frame(32632, 4.5e5, 5.4e6) == Frame(32632, 450000.0, 5400000.0)
