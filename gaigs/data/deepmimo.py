@@ -173,7 +173,7 @@ def gather(
 def read_stations(root: str | Path, with_angles: bool) -> tuple[float, list[StationPaths], list[str]]:
     """The carrier of a scenario [Hz], its paths of each base station and set of users, and remarks on them."""
     root = find_folder(root)
-    names = sorted(path.name for path in root.iterdir())
+    names = sorted(path.name for path in (*root.iterdir(), *root.glob("*/*.mat")))  # scenes have a folder each
     old = [name for name in names if re.fullmatch(r"BS\d+_(BS|UE_\d+-\d+)\.mat|.*\.\d+\.(CIR|DoA|DoD)\.mat", name)]
     if old:
         raise ValueError(

@@ -57,14 +57,14 @@ def marks_given(not_heard: float | Sequence[float]) -> list[float]:
 def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
     """The known name of each name: the same, or the only one that differs in case, blanks, ``_``, ``-`` and ``:``."""
     plain = lambda name: re.sub(r"[\s_:-]", "", name.casefold())
-    spelt = Counter(map(plain, names))
+    spelt, alike = Counter(map(plain, names)), Counter(map(plain, known))
+    same, last = {*known}, {plain(name): name for name in known}
     found = {}
     for name in names:
-        alike = [other for other in known if plain(other) == plain(name)]
-        if name in known:
+        if name in same:
             found[name] = name
-        elif len(alike) == 1 == spelt[plain(name)]:
-            found[name] = alike[0]
+        elif alike[plain(name)] == 1 == spelt[plain(name)]:
+            found[name] = last[plain(name)]
     return found
 
 

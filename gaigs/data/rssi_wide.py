@@ -97,8 +97,8 @@ def read(
         not_heard: Values that mean "not heard"; None: those that ``gaigs.data.readings.marks_of`` finds.
         height: Height of all places and gateways without one, and of floor 0 [m].
         storey: Height of a storey [m], for a column ``floor``.
-        epsg: System of the coordinates, e.g. 32632 or 3857; None: WGS 84 for degrees, none for metres. Coordinates of
-            another system than UTM are converted to it, which takes ``gaigs[maps]``.
+        epsg: System of the coordinates, e.g. 32632 or 3857, in whose unit x and y are; None: WGS 84 for degrees, none
+            for metres. Coordinates of another system than UTM are converted to it, which takes ``gaigs[maps]``.
         frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
 
     Raises:
@@ -348,7 +348,7 @@ def _find_gateways(
         else:
             ignored_columns.append(k)
     for k in ignored_columns:
-        for row in np.flatnonzero(np.isinf(table.numbers[:, k])).tolist():
+        for row in np.flatnonzero(np.isinf(table.numbers[:, k]))[:1].tolist():
             levels = tables.numbers_in(table.text(row, k))
             if levels and QUIETEST <= min(levels) <= max(levels) <= WEAK:
                 cell = table.cell(row, k)
