@@ -46,8 +46,8 @@ def metres_of(epsg: int) -> float | None:
 def are_degrees(points: Float[ndarray, "n d"]) -> bool:
     """True if x and y [m] are probably longitude and latitude, in either order.
 
-    They then span less than 0.05, about a hundredth of their distance from the origin or less, and have five decimals
-    or more. A grid in metres has no such decimals.
+    They then span less than 0.3 and less than a hundredth of their distance from the origin, and have five decimals or
+    more. A grid in metres has no such decimals.
     """
     if len(points) < 2:
         return False
@@ -55,7 +55,7 @@ def are_degrees(points: Float[ndarray, "n d"]) -> bool:
     span = np.ptp(points[:, :2], axis=0).max()
     rests = np.abs(points[:, :2] - points[:, :2].round(4))
     is_on_earth = max(x, y) <= 180 and min(x, y) <= 90
-    return bool(is_on_earth and 0 < span < min(0.05, max(x, y) / 100) and (rests > 1e-5).mean() > 0.3)
+    return bool(is_on_earth and 0 < span < min(0.3, max(x, y) / 100) and (rests > 1e-5).mean() > 0.3)
 
 
 def check_metres(

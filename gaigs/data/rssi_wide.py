@@ -400,14 +400,15 @@ def _to_world(
                 f"{table.file}: expected latitudes within 90 degrees in column {names[1]}, got {points[row, 1]:g}; if "
                 "longitudes are there, set data.coordinates; if metres are, name the columns x and y"
             )
+        epsg = 4326
+    if epsg == 4326:
         around = (points[:count, 0] - points[0, 0] + 180) % 360  # longitudes may pass 180 degrees
         spans = np.ptp(around), np.ptp(points[:count, 1])
         if spans[0] > 10 or spans[1] > 1:  # 100 km are 0.9 degrees of latitude
             raise ValueError(
                 f"{table.file}: columns {names[0]} and {names[1]} span {spans[0]:.3g} and {spans[1]:.3g} degrees, "
-                "beyond 100 km; if they are metres, name them x and y"
+                "beyond 100 km; if they are metres, name them x and y, without data.epsg"
             )
-        epsg = 4326
     if epsg is None or is_utm(epsg):
         mend = f"set data.epsg=4326 and data.coordinates=[{names[0]},{names[1]}], longitude first"
         check_metres(f"{table.file}: columns {names[0]} and {names[1]}", points[:count], mend)
