@@ -14,6 +14,7 @@ from torch import Tensor
 from gaigs.antenna import Receiver, lacking
 from gaigs.data.checks import check
 from gaigs.data.gateways import estimate_place
+from gaigs.data.maps import check_metres
 from gaigs.geometry import Frame, Pose
 from gaigs.io.images import GreyImages
 from gaigs.io.tables import shortened
@@ -207,6 +208,8 @@ def divide(links: Links, split: Mapping) -> Links:
         at = [f"at {band.min():.7g} .. {band.max():.7g} GHz" for band in bands]
         parts = replace(parts, name=f"{parts.name}, trained {at[0]}, tested {at[1]}")
     links = replace(links, split=parts)
+    if links.frame is None:
+        check_metres("transmitters", links.query.transmitters.unique(dim=0).double().numpy())
     if isinstance(links.task, Csi):
         check_elements(links)
     if links.uncertainties is not None:
