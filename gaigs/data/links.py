@@ -15,6 +15,7 @@ from torch import Tensor
 from gaigs import configuration
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, divide, load
+from gaigs.data.parts import check_parts
 from gaigs.data.readings import loud_remark, marks_of
 from gaigs.geometry import Frame, Pose
 from gaigs.io.tables import number_places, shortened
@@ -143,6 +144,8 @@ def from_arrays(
     if task.dtype.is_complex and not labels.is_complex():
         raise ValueError(f"labels of task {task.name!r} must be complex, got {labels.dtype}; magnitudes have no phase")
     labels = labels.to(task.dtype)
+    if labels.is_complex():
+        check_parts("labels", labels.numpy())
     count, most, shape = len(places), len(receivers), tuple(task.shape)
     rows = torch.arange(count)
     if tuple(labels.shape) == (count, most, *shape) and index is None:
