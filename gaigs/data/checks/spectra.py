@@ -107,7 +107,7 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
     ]
     axes, *others = groups
     single = [*itertools.chain(*others), *scaling_changes(sample, directions.grid), *order_changes(links, sample)]
-    tries = [
+    tries: list[tuple[list[tuple[Hypothesis, ...]], float, int]] = [
         ([(change,) for change in single], limits.of_others, 1),
         ([(change,) for change in axes], limits.of_axes, 1),
     ]
@@ -308,7 +308,7 @@ def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sa
     systems = equations[threes].flatten(1, 2)  # (draws, 9, 6)
     solutions = torch.linalg.svd(systems).Vh[:, -1]  # (draws, 6)
     solutions = solutions * solutions[:, :1].sgn()
-    changes = []
+    changes: list[Callable[[Sample], Sample]] = []
     for solution in solutions[(solutions[:, :3] > 0).all(1)]:
 
         def change(other: Sample, scales=solution[:3], offsets=solution[3:]) -> Sample:
