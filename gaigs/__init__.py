@@ -152,13 +152,14 @@ def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | Non
                     benchmark.run(folder, overrides, **limits)
             log.info("results: %s", folder)
         case "agreement" | "describe" | "survey" | "locate" | "export" as command:
-            from gaigs import agreement, describing, exporting, locating, surveying
+            from gaigs import agreement, describing, exporting, locating, stages, surveying
 
             modules = {
                 "agreement": agreement, "describe": describing, "survey": surveying, "locate": locating,
                 "export": exporting,
             }  # fmt: skip
-            with processes.limited_threads(config["threads"]):
+            shows = config["trainer"].get("enable_progress_bar", True)
+            with processes.limited_threads(config["threads"]), stages.watched(shown=shows):
                 modules[command].run(config, folder)
         case "view":
             from gaigs import viewing

@@ -42,7 +42,7 @@ MAY_BE_NULL = ("gaussians", "density", "benchmark", "projection", "rasterizer")
 KEYS = {
     **dict.fromkeys((*KINDS, "trainer"), dict), **dict.fromkeys(MAY_BE_NULL, dict | None),
     "kriging": bool, "kriging_fallback": dict | None, "baselines": list[dict], "command": str, "seed": int,
-    "ensemble": int,
+    "ensemble": int, "max_time": str | dict | None,
     "save_every": float, "tensorboard": bool, "threads": int | None, "trust": bool, "folder": str | None,
     "survey": dict, "locate": dict, "export": dict, "view": dict, "figures": dict,
 }  # fmt: skip

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
+from gaigs import stages
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.geometry import ExtrapolationWarning, Frame, even_places
@@ -31,7 +32,7 @@ from gaigs.query import ROUNDING, as_positions, as_receivers, as_tensor, evenly
 from gaigs.registry import call, check_instance, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, load
-from gaigs.runs.evaluation import is_trained, unseen
+from gaigs.runs.evaluation import fold_count, is_trained, unseen
 from gaigs.split import rows_of
 from gaigs.task import Task, check_range
 
@@ -289,7 +290,8 @@ def fingerprints(
     tells = links is None or not torch.isin(*(rows_of(links)[part] for part in (known, tested))).any()
     whole = mapped(model, known)
     tries: list[Any] = []
-    for one, part, others in unseen(model, links) if links is not None else ():
+    unknown = () if links is None else unseen(model, links)
+    for one, part, others in stages.track(unknown, "folds", fold_count(model)):
         one.calibration = model.calibration
         rows = rows_of(links)  # those known links that share a transmission with the part
         asked, truth = received(links, known[torch.isin(rows[known], rows[part])])
@@ -613,7 +615,7 @@ def predicted(
     # A look-up reads its labels once a batch.
     size = 8192 if not task.shape else 64 if is_trained(model) else 512
     with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):  # prior places may be outside
-        for part in places.split(max(1, size // count)):
+        for part in stages.track(places.split(max(1, size // count)), "fingerprints"):
             asked = part[:, None].expand(-1, count, 3), torch.arange(count).expand(len(part), -1)
             if task.shape:
                 value = model.predict(*asked, frequency=frequency, batch_size=size).cpu().flatten(0, 1)

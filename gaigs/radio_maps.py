@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from gaigs import stages
 from gaigs.geometry import ExtrapolationWarning
 from gaigs.io.files import atomic_write
 from gaigs.query import as_receivers
@@ -186,7 +187,8 @@ def radio_map(
             predict(some[:1])  # the first prediction compiles and loads
             start = time.perf_counter()
             predict(some)
-        most = POINTS * SECONDS / (time.perf_counter() - start)  # points
+        # Points in a minute, or in half of the time left: figures follow.
+        most = POINTS * min(SECONDS, stages.left() / 2) / (time.perf_counter() - start)
         while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, FEWEST):
             pitch *= 2
     x, y = _axes(lower, upper, pitch)

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from gaigs.radio_maps import radio_map
 from gaigs.registry import check_type, only_recorded, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store, stored_software, warn_of_changes
+from gaigs.stages import stage
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +38,9 @@ def run(config: dict, folder: Path) -> dict | None:
     Raises:
         TypeError, ValueError, OSError, KeyboardInterrupt: As for ``gaigs.run``.
     """
-    with limited_threads(config["threads"]):
+    from gaigs.training.budget import watched  # slow to import
+
+    with limited_threads(config["threads"]), watched(config) as watch:
         if not is_first():
             logging.getLogger("gaigs").setLevel(logging.WARNING)  # the first process logs for all
             train_and_test(config, folder)
@@ -52,6 +56,8 @@ def run(config: dict, folder: Path) -> dict | None:
                 metrics = read_metrics(finished)
             else:
                 metrics = train_and_test(config, folder)
+                if math.isfinite(watch.limit):
+                    metrics |= {"max_time": watch.limit, "left_out": watch.left_out}
                 if not is_configuration(folder / "config.yaml"):  # loggers make a removed folder again
                     store(config, folder)
                 write_text(finished, json.dumps(metrics, indent=2) + "\n")
@@ -160,8 +166,11 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         return None
     model, is_trained = fitted.models[name], bool(fitted.unseen)
     own = {} if is_trained else {name: registry("model").build(config["model"], scene=scene)}
-    validation = evaluation.validate(fitted.unseen, {**own, **baselines}, links)
-    scores = evaluation.score(fitted.models, baselines, links, folder)
+    # Shares of the run's limit; maps and figures have the rest.
+    with stage(until=0.86):
+        validation = evaluation.validate(fitted.unseen, {**own, **baselines}, links)
+    with stage(until=0.92):
+        scores = evaluation.score(fitted.models, baselines, links, folder)
     metrics = {
         "task": task.name,
         "data": links.remarks,
