@@ -245,12 +245,17 @@ def check_elements(links: Links) -> None:
 def without_constant(links: Links) -> Links:
     """Channels without the subcarriers, and then the links, that have no channel; remarks and a warning count them.
 
-    The same holds for the subcarriers that are held out.
+    The same holds for the subcarriers that are held out. If all subcarriers of the links are so, they stay.
+
+    Raises:
+        ValueError: All subcarriers that are held out are so.
     """
     both, remarks = [], [links.remarks]
     for part in filter(None, (links, links.held_out)):
         constant = constant_subcarriers(part)
-        if constant.any():
+        if constant.all() and part is not links:
+            raise ValueError("all subcarriers to test on have one value in every link; choose another data.band_test")
+        if constant.any() and not constant.all():
             task: Any = part.task
             remarks.append(constant_sentence(constant, task.frequencies).format("and are left out"))
             log.warning("%s", remarks[-1])

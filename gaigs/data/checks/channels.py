@@ -18,18 +18,20 @@ from gaigs.query import evenly
 from gaigs.scene import Scene, direct_waves
 
 
-class Score(NamedTuple):
+class Measure(NamedTuple):
     """A measure of how well geometry explains channels.
 
     Attributes:
         measure: Share from 0 to 1 of a sample.
         least: Smallest share that tells a convention.
+        enough: Share above which the data need no other convention.
         sentence: What the share means, with a place for it.
         meaning: The same in short.
     """
 
     measure: Callable[[Sample], float]
     least: float
+    enough: float
     sentence: str
     meaning: str
 
@@ -55,10 +57,10 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     waves = direct_waves(everywhere, links.query[train], task.frequencies)
     sign = phase_sign(labels, waves, receivers) if is_known else 0
-    coherent = Score(coherence, 0.1, "the direct wave explains {} of the channels", "in the mean over links")
+    coherent = Measure(coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links")
     each = likeness if has_gain else aligned_likeness
-    within = Score(each, 0.3, "the direct wave explains {} of each channel", "of the power within a link")
-    level = Score(level_share, 0.4, "distance explains {} of the levels' variance", "of the variance of levels")
+    within = Measure(each, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link")
+    level = Measure(level_share, 0.4, 0.5, "distance explains {} of the levels' variance", "of the variance of levels")
     for score in (coherent,) * is_known + (within,) * (not sign):
         found = best_convention(few, score)
         if found is not None:
@@ -108,13 +110,13 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
             )
 
 
-def best_convention(sample: Sample, score: Score) -> Finding | None:
+def best_convention(sample: Sample, score: Measure) -> Finding | None:
     """A finding about the conventions by which geometry explains the channels best, if it is clearly better so.
 
     Conventions that explain them equally well are named together.
     """
     read = score.measure(sample)
-    if read > 0.8 or len(sample.labels) < MANY:
+    if read > score.enough or len(sample.labels) < MANY:
         return None
     few, tried = sample.some(64), []
     for one in conventions(few, score.measure):

@@ -29,7 +29,7 @@ def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[
         yield from of_arrays(count)
     if not torch.allclose(sample.rotations, torch.eye(3).to(sample.rotations)):
         yield from of_rotations()
-    yield from of_axes(with_arrays)
+    yield from of_axes(sample, with_arrays)
     yield from of_angles()
     yield from of_units(sample, with_arrays)
     yield from of_receivers(sample, measure)
@@ -73,7 +73,7 @@ def of_rotations() -> Iterator[Hypothesis]:
         yield Hypothesis(name, change, mend)
 
 
-def of_axes(with_arrays: bool) -> Iterator[Hypothesis]:
+def of_axes(sample: Sample, with_arrays: bool) -> Iterator[Hypothesis]:
     """Axes that are exchanged or point the other way."""
     ends: list[tuple[str, ...]] = [("tx",), ("rx",)]
     if with_arrays:
@@ -84,9 +84,12 @@ def of_axes(with_arrays: bool) -> Iterator[Hypothesis]:
         subject = " and ".join(own)
         for name, order in orders.items():
             yield _moved(own, f"{subject} have {name} exchanged", f"[:, {order}]", torch.eye(3)[:, order])
-        for name, order in turns.items():
+        for name, order in turns.items() if len(own) == 1 and own[0] != "elements" else ():
             yield _moved(own, f"{subject} have the order {name}", f"[:, {order}]", torch.eye(3)[:, order])
         for axis, name in enumerate("xyz"):
+            points = torch.cat((sample.transmitters, sample.positions))[:, axis]
+            if own[0] != "elements" and ((points >= 0).all() or (points <= 0).all()):
+                continue  # a wall or floor in the plane of the axes reflects so
             signs = [1, 1, 1]
             signs[axis] = -1
             yield _moved(own, f"{subject} have {name} negated", f" * {signs}", torch.tensor(signs).diag())

@@ -18,7 +18,7 @@ from gaigs.query import evenly
 def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
     """True for each subcarrier at which all links have one value, or none: a guard or null subcarrier.
 
-    An element may have another value than others. If all subcarriers are so, none is named.
+    An element may have another value than others. Fewer than five links tell nothing.
     """
     count = len(links.task.frequencies)
     chosen = torch.arange(count)
@@ -32,7 +32,7 @@ def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
         is_same = ((values == first) | absent[..., None]).all(0).all(0)
         is_faint = (values.abs() <= 1e-6 * strengths).all(0).all(0)  # 0 but for rounding
         chosen = chosen[is_same | is_faint]
-        if len(chosen) in (0, count) or len(index) < 5:
+        if not len(chosen) or len(index) < 5:
             return torch.zeros(count, dtype=torch.bool)
     return torch.zeros(count, dtype=torch.bool).index_fill(0, chosen, True)
 
@@ -46,7 +46,7 @@ def constant_sentence(constant: Bool[Tensor, " s"], frequencies: Float[Tensor, "
 def check_constant_subcarriers(links: Any) -> Iterator[Finding]:
     """A finding about subcarriers that are no channel."""
     constant = constant_subcarriers(links)
-    if constant.any():
+    if constant.any() and not constant.all():
         text = constant_sentence(constant, links.task.frequencies)
         yield Finding("constant subcarriers", text.format("as guard or null subcarriers"), "leave them out")
 
@@ -59,8 +59,10 @@ def order_of_subcarriers(sample: Sample) -> Finding | None:
     order = sample.frequencies.argsort()
     count = len(order)
     values = sample.labels[:, :8, order]
-    if count < 8 or values.shape[:2].numel() < 32:
+    if count < 8 or values.shape[:2].numel() < 64:
         return None
+    powers = values.abs().square().mean((1, 2), keepdim=True)
+    values = values / torch.where(powers > 0, powers, 1).sqrt()
     steps = values.roll(-1, 2) * values.conj()  # (n, e, s), the last from the band's end to its start
     turn = steps.sum((1, 2), keepdim=True).sgn().conj()
     # Where a subcarrier is left out between two, the phase turns twice as far.
