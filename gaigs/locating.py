@@ -371,7 +371,7 @@ def locate(
             unit = getattr(prints.task, "error_unit", prints.task.unit)
             words = f"readings are up to {beyond.max():.3g} {unit} beyond all predicted ones"
             advice = "check their unit, and leave out what was not heard"
-            warnings.warn(f"{words}; {advice}", ExtrapolationWarning, stacklevel=2)
+            warnings.warn(f"{words}; {advice}", ExtrapolationWarning, stacklevel=3)  # as of a radio map
     return posterior(prints, asked, unknown_power, step, level)
 
 
@@ -415,7 +415,8 @@ def run(config: dict, folder: Path) -> None:
     ``locate.png`` and, of a test, ``locate.json`` into a folder."""
     if config["folder"] is None:
         raise ValueError("command=locate needs the folder of a finished run; add folder=runs/...")
-    model, links, options = load(config["folder"]), links_of(config["folder"]), dict(config["locate"])
+    model, links = load(config["folder"], config["trust"]), links_of(config["folder"])
+    options = dict(config["locate"])
     own, value = {name: options.pop(name) for name in ("region", "frequency", "points")}, options.pop("value")
     value = read_value(Path(value), links) if isinstance(value, str) else value
     start = time.perf_counter()

@@ -159,7 +159,7 @@ def radio_map(
         if size > most:
             message = f"{name} puts transmitters {size:.4g} m outside the box of the training transmitters, which with "
             message += f"the receivers is {scene.extent:.3g} m across; is it in m?"
-            warnings.warn(message, ExtrapolationWarning, stacklevel=2)
+            warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # behind the decorator of its public name
     if pitch is not None and not (0 < pitch <= longest and math.prod(((upper - lower) / pitch).tolist()) <= 1e8):
         raise ValueError(
             f"pitch must be above 0, at most {longest:.3g} m, the longer side of the map, and give at most 1e+08 "

@@ -231,7 +231,7 @@ def survey(
 
 def run(config: dict, folder: Path) -> None:
     """Plans a survey, by the model of a finished run if given; writes ``survey.csv`` and ``survey.png``."""
-    model = None if config["folder"] is None else load(config["folder"])
+    model = None if config["folder"] is None else load(config["folder"], config["trust"])
     options = dict(config["survey"])
     if isinstance(options["candidates"], str):
         options["candidates"] = read_points(Path(options["candidates"]), "xyz", "x,y,z [m] of one candidate a line")

@@ -15,6 +15,7 @@ from gaigs.antenna import Receiver, lacking
 from gaigs.data.checks import check
 from gaigs.data.checks.subcarriers import constant_sentence, constant_subcarriers
 from gaigs.data.gateways import estimate_place
+from gaigs.data.maps import check_metres
 from gaigs.geometry import Frame, Pose
 from gaigs.io.images import GreyImages
 from gaigs.io.tables import shortened
@@ -111,7 +112,7 @@ class Links:
     frame: Frame | None = None
     uncertainties: Float[Tensor, " r"] | None = None
     noises: Float[Tensor, " n"] | None = None
-    edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
+    edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3, dtype=torch.float32))
     remarks: str = ""
     origin: Mapping = field(default_factory=dict)
 
@@ -211,6 +212,8 @@ def divide(links: Links, split: Mapping) -> Links:
         at = [f"at {band.min():.7g} .. {band.max():.7g} GHz" for band in bands]
         parts = replace(parts, name=f"{parts.name}, trained {at[0]}, tested {at[1]}")
     links = replace(links, split=parts)
+    if links.frame is None:
+        check_metres("transmitters", links.query.transmitters.unique(dim=0).double().numpy())
     if links.uncertainties is not None:
         links = with_places(only_trained(links))
     remarks, phase = [links.remarks], getattr(links.task, "phase", "known")

@@ -23,6 +23,7 @@ from gaigs.kriging.intervals import Calibration, Estimate
 from gaigs.kriging.kernel import Process
 from gaigs.query import ROUNDING, Batch, Query, as_directions, as_subcarriers
 from gaigs.registry import check_type, registry
+from gaigs.registry.modes import usual_modes
 from gaigs.scene import Scene
 from gaigs.task.csi import Csi
 
@@ -294,6 +295,7 @@ class Model(nn.Module):
         values = map(model._answer, batches)
         return values if chosen is None else (part[..., chosen] for part in values), shape
 
+    @usual_modes()
     @torch.no_grad()
     def _answer(self, batch: Batch) -> Tensor:
         """Values of a batch in evaluation mode; the mode stays as it was."""
@@ -304,6 +306,7 @@ class Model(nn.Module):
         finally:
             self.train(training)
 
+    @usual_modes()
     def _estimate(self, batch: Batch, interval: float) -> Estimate:
         value = self._answer(batch)
         assert self.calibration is not None

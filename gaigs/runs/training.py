@@ -30,7 +30,7 @@ from gaigs.model import Model
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
-from gaigs.registry import call, configuration_of, registry
+from gaigs.registry import call, configuration_of, digests, registry
 from gaigs.runs.evaluation import calibrated, is_trained
 from gaigs.runs.folder import ANOTHER, check_same_links, claim, fingerprint
 from gaigs.training.batches import Batches, InOrder
@@ -160,16 +160,16 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         model, more = with_others(model, loss, links, config, folder)
         model.known_places = places
         kriged, seconds, trained = make_kriged(model), seconds + more, "members.0"
-        checkpoint.exchange_model(best, model, trained)
+        checkpoint.update(best, model, trained)
     model.calibration = calibrated(model, links)
     if kriged is None:
-        checkpoint.add_calibration(best, model)
+        checkpoint.update(best, model)
         return Fitted({name: model}, {name: model}, start, seconds)
     began = time.monotonic()
     validation_model = kriged.to(model.device).krige(links)
     kriging_seconds = time.monotonic() - began
     kriged.calibration, kriged.known_places = calibrated(validation_model, links), places
-    checkpoint.exchange_model(best, kriged, ".".join(filter(None, ("trend", trained))))
+    checkpoint.update(best, kriged, ".".join(filter(None, ("trend", trained))))
     models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged, validation_model))
     return Fitted(models, unseen, start, seconds, kriging_seconds)
 
@@ -202,7 +202,7 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
     """
     split = {"name": links.split.name, **links.split.parts()}
     identity = {"version": checkpoint.VERSION, "model": config["model"], "scene": links.scene.state(), "split": split}
-    identity |= {"config": config, "links": fingerprint(links)}
+    identity |= {"config": config, "links": fingerprint(links), "plugins": digests(config, links.scene.state()["task"])}
     context = {"model": model, "loss": loss, "identity": identity, "seed": config["seed"]}
     module = registry("training").build(config["training"], **context)
     last, best = folder / "last.ckpt", folder / "best.ckpt"

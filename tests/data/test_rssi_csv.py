@@ -78,7 +78,7 @@ def test_the_fixed_end_can_be_chosen(file):
     assert read(file, fixed="rx").remarks == read(file).remarks
     with pytest.raises(ValueError, match="fixed must be tx or rx, or null for the end with fewer places, got 'both'"):
         read(file, fixed="both")
-    with pytest.raises(TypeError, match="'not_heard' must be a finite number, got nan"):
+    with pytest.raises(TypeError, match="'not_heard' must be a finite number or a list, got nan"):
         read(file, not_heard=math.nan)
     file.write_text(f"{BACK.splitlines()[0]}\n1,2,3,4,5,6,-50\n2,2,3,5,5,6,-51\n")
     tie = read(file, split=RANDOM | {"test": 0.5})

@@ -6,15 +6,17 @@ from dataclasses import replace
 from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
 from gaigs.data.checks.hypotheses import Hypothesis, Sample
+from gaigs.data.checks.waves import direct_distances
 from gaigs.geometry import from_spherical, to_spherical
+
+Move = Callable[[Tensor], Tensor]
 
 
 def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
@@ -22,25 +24,26 @@ def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[
 
     The order of receivers is the best one by a measure of the geometry, such as ``coherence``.
     """
-    count = sample.labels.shape[1]
-    with_arrays = any(array.any() for array in sample.elements)
+    ends: list[tuple[str, ...]] = [("tx",), ("rx",), ("tx", "rx")]
     yield from of_subcarriers(sample)
-    if with_arrays:
-        yield from of_arrays(count)
-    if not torch.allclose(sample.rotations, torch.eye(3).to(sample.rotations)):
-        yield from of_rotations()
-    yield from of_axes(sample, with_arrays)
+    if any(array.any() for array in sample.elements):
+        ends = [("tx",), ("rx",), ("elements",), ("tx", "rx"), ("tx", "rx", "elements")]
+        yield from of_arrays(sample)
+    yield from of_axes(sample, ends)
     yield from of_angles()
-    yield from of_units(sample, with_arrays)
+    yield from of_units(ends)
     yield from of_receivers(sample, measure)
 
 
 def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
-    """Orders of subcarriers, and phases that lack a part."""
+    """Orders and units of subcarriers, and phases that lack a part."""
     if len(sample.frequencies) > 1:
         name = "subcarriers are in reversed order, or path coefficients are conjugate"
         mend = "h = h[..., ::-1], or of conjugate coefficients h = h.conj()[..., ::-1]"
-        yield Hypothesis(name, partial(_flipped, axis=2), mend)
+        yield _changing(name, ["labels"], lambda labels: labels.flip(2), mend)
+    for unit, factor in {"kHz": 1e3, "MHz": 1e6}.items():
+        mend = f"frequencies = {factor:g} * frequencies"
+        yield _changing(f"frequencies are in {unit}", ["frequencies"], partial(torch.mul, other=factor), mend)
     is_constant = sample.labels.sgn().mean(0).abs() > 0.9999  # (e, s), the phase of all links
     is_relative = is_constant[:, 0].any() and not is_constant[:, -1].any()
     if is_relative or is_constant.all():
@@ -51,77 +54,67 @@ def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
         yield Hypothesis(name, partial(_with_carrier, at_elements=at_elements), mend)
 
 
-def of_arrays(count: int) -> Iterator[Hypothesis]:
-    """Orders of elements."""
-    yield Hypothesis("elements are in reversed order", partial(_flipped, axis=1), "h = h[:, ::-1]")
+def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
+    """Orders and units of elements, and orientations of arrays."""
+    yield _changing("elements are in reversed order", ["labels"], lambda labels: labels.flip(1), "h = h[:, ::-1]")
+    count = sample.labels.shape[1]
     for rows in range(2, count // 2 + 1):
         if count % rows == 0:
             mend = f"h = h.reshape(len(h), {rows}, {count // rows}, -1).swapaxes(1, 2).reshape(h.shape)"
             name = "elements are in another order of rows and columns"
-            yield Hypothesis(name, partial(_transposed, rows=rows), mend)
+            yield _changing(name, ["labels"], partial(_transposed, rows=rows), mend)
+    wavelength = speed_of_light / sample.frequencies.mean().item()
+    yield _scaled(["elements"], "wavelengths", wavelength)
+    yield _scaled(["elements"], "half wavelengths", wavelength / 2)
+    if torch.allclose(sample.rotations, torch.eye(3).to(sample.rotations)):
+        return
+    for name, move, mend in (
+        ("rotations lead from the world to the array", lambda turns: turns.mT, "rotation = rotation.T"),
+        ("elements have the world's axes", lambda turns: turns.mT @ turns, "rotation = np.eye(3)"),
+        ("quaternions have the order w, x, y, z", partial(_rolled, by=-1), "quaternion = np.roll(quaternion, -1)"),
+        ("quaternions have the order x, y, z, w", partial(_rolled, by=1), "quaternion = np.roll(quaternion, 1)"),
+    ):
+        yield _changing(name, ["rotations"], move, mend)
 
 
-def of_rotations() -> Iterator[Hypothesis]:
-    """Orientations of arrays."""
-    changes = (
-        ("rotations lead from the world to the array", _inverse, "rotation = rotation.T"),
-        ("elements have the world's axes", _upright, "rotation = np.eye(3)"),
-        ("quaternions have the order w, x, y, z", partial(_rolled, places=-1), "quaternion = np.roll(quaternion, -1)"),
-        ("quaternions have the order x, y, z, w", partial(_rolled, places=1), "quaternion = np.roll(quaternion, 1)"),
-    )
-    for name, change, mend in changes:
-        yield Hypothesis(name, change, mend)
-
-
-def of_axes(sample: Sample, with_arrays: bool) -> Iterator[Hypothesis]:
+def of_axes(sample: Sample, ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
     """Axes that are exchanged or point the other way."""
-    ends: list[tuple[str, ...]] = [("tx",), ("rx",)]
-    if with_arrays:
-        ends += [("elements",), ("tx", "rx")]
-    orders = {"x and y": [1, 0, 2], "y and z": [0, 2, 1], "x and z": [2, 1, 0]}
-    turns = {"y, z, x": [2, 0, 1], "z, x, y": [1, 2, 0]}
+    exchanged = {"x and y": [1, 0, 2], "y and z": [0, 2, 1], "x and z": [2, 1, 0]}
+    points = torch.cat((sample.transmitters, sample.positions))
+    # A wall or floor in a plane of the axes reflects as if that axis were negated.
+    has_wall = (points >= 0).all(0) | (points <= 0).all(0)
     for own in ends:
         subject = " and ".join(own)
-        for name, order in orders.items():
-            yield _moved(own, f"{subject} have {name} exchanged", f"[:, {order}]", torch.eye(3)[:, order])
-        for name, order in turns.items() if len(own) == 1 and own[0] != "elements" else ():
-            yield _moved(own, f"{subject} have the order {name}", f"[:, {order}]", torch.eye(3)[:, order])
+        for name, order in exchanged.items():
+            mend = f"[:, {order}]"
+            yield _everywhere(own, f"{subject} have {name} exchanged", mend, torch.eye(3)[:, order])
         for axis, name in enumerate("xyz"):
-            points = torch.cat((sample.transmitters, sample.positions))[:, axis]
-            if own[0] != "elements" and ((points >= 0).all() or (points <= 0).all()):
-                continue  # a wall or floor in the plane of the axes reflects so
             signs = [1, 1, 1]
             signs[axis] = -1
-            yield _moved(own, f"{subject} have {name} negated", f" * {signs}", torch.tensor(signs).diag())
+            if own == ("elements",) or not has_wall[axis]:
+                yield _everywhere(own, f"{subject} have {name} negated", f" * {signs}", torch.tensor(signs).diag())
+    for own in ("tx",), ("rx",):
+        for name, order in {"y, z, x": [2, 0, 1], "z, x, y": [1, 2, 0]}.items():
+            yield _everywhere(own, f"{own[0]} have the order {name}", f"[:, {order}]", torch.eye(3)[:, order])
 
 
 def of_angles() -> Iterator[Hypothesis]:
     """Places computed from angles, about their receiver or the origin."""
-    changes = (
-        ("azimuths clockwise from north", _clockwise, "azimuth = np.pi / 2 - azimuth"),
-        ("elevations taken for polar angles, or the reverse", _tilted, "elevation = np.pi / 2 - elevation"),
-        ("elevations taken for polar angles, or the reverse", _sunk, "elevation = np.pi / 2 - elevation"),
+    polar, other = "elevations taken for polar angles, or the reverse", "elevation = np.pi / 2 - elevation"
+    for name, move, mend in (
+        ("azimuths clockwise from north", lambda points: points[:, [1, 0, 2]], "azimuth = np.pi / 2 - azimuth"),
+        (polar, _tilted, other),
+        (polar, lambda points: -_tilted(points), other),  # below the horizon the azimuth is turned by half a circle
         ("radians taken for degrees", _widened, "angles = np.rad2deg(angles)"),
-    )
-    for name, move, mend in changes:
+    ):
         yield Hypothesis(f"tx are of {name}", partial(_about_receivers, move=move), mend)
-        yield Hypothesis(f"tx are of {name} about the origin", partial(_about_origin, move=move), mend)
+        yield _changing(f"tx are of {name} about the origin", ["transmitters"], move, mend)
 
 
-def of_units(sample: Sample, with_arrays: bool) -> Iterator[Hypothesis]:
-    """Places and elements in other units than metres, frequencies in other units than Hz."""
-    for unit, factor in {"kHz": 1e3, "MHz": 1e6}.items():
-        change = partial(_at_frequencies, factor=factor)
-        yield Hypothesis(f"frequencies are in {unit}", change, f"frequencies = {factor:g} * frequencies")
-    units = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "km": 1e3}
-    ends: list[tuple[str, ...]] = [("tx", "rx"), ("tx",), ("rx",)]
-    if with_arrays:
-        wavelength = speed_of_light / sample.frequencies.mean().item()
-        yield _scaled(("elements",), "wavelengths", wavelength)
-        yield _scaled(("elements",), "half wavelengths", wavelength / 2)
-        ends += [("tx", "rx", "elements"), ("elements",)]
-    for own in ends:
-        for unit, factor in units.items():
+def of_units(ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
+    """Places and elements in other units than metres."""
+    for own in sorted(ends, key=len, reverse=True):
+        for unit, factor in {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "km": 1e3}.items():
             yield _scaled(own, unit, factor)
 
 
@@ -140,85 +133,50 @@ def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator
     for order in orders:
         is_shift = len((order - own).remainder(count).unique()) == 1
         name = "rows of rx are exchanged" + ", as by numbers from 1" * is_shift
-        yield Hypothesis(name, partial(_renumbered, order=order), f"rx = rx[{order.tolist()}]")
+        yield _changing(name, ["receivers"], order.__getitem__, f"rx = rx[{order.tolist()}]")
 
 
-def _moved(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hypothesis:
+def _changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothesis:
+    return Hypothesis(name, partial(_changed, parts=parts, move=move), mend)
+
+
+def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hypothesis:
+    """Points of some ends times a matrix, which ``mend`` writes in numpy."""
+    parts = {"tx": "transmitters", "rx": "positions", "elements": "elements"}
     lines = "; ".join(f"{end} = {end}{mend}" for end in ends)
-    return Hypothesis(name, partial(_mapped, ends=ends, matrix=matrix.double()), lines)
+    return _changing(name, [parts[end] for end in ends], partial(torch.matmul, other=matrix.double()), lines)
 
 
 def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
-    lines = "; ".join(f"{end} = {factor:.4g} * {end}" for end in ends)
-    name = f"{', '.join(ends[:-1])} and {ends[-1]}" if len(ends) > 1 else ends[0]
-    change = partial(_mapped, ends=ends, matrix=factor * torch.eye(3, dtype=torch.float64))
-    return Hypothesis(f"{name} are in {unit}", change, lines)
+    subject = ", ".join(ends[:-1]) + " and " * (len(ends) > 1) + ends[-1]
+    return _everywhere(ends, f"{subject} are in {unit}", f" * {factor:.4g}", factor * torch.eye(3))
 
 
-def _mapped(sample: Sample, ends: Sequence[str], matrix: Float[Tensor, "3 3"]) -> Sample:
-    """The sample with points of some ends times a matrix."""
-    if "tx" in ends:
-        sample = replace(sample, transmitters=sample.transmitters @ matrix)
-    if "rx" in ends:
-        sample = replace(sample, positions=sample.positions @ matrix)
-    if "elements" in ends:
-        sample = replace(sample, elements=tuple(array @ matrix for array in sample.elements))
-    return sample
+def _changed(sample: Sample, parts: Sequence[str], move: Move) -> Sample:
+    values = {name: getattr(sample, name) for name in parts}
+    moved = {name: tuple(map(move, own)) if isinstance(own, tuple) else move(own) for name, own in values.items()}
+    return replace(sample, **moved)
 
 
-def _flipped(sample: Sample, axis: int) -> Sample:
-    return replace(sample, labels=sample.labels.flip(axis))
-
-
-def _transposed(sample: Sample, rows: int) -> Sample:
-    grid = sample.labels.unflatten(1, (rows, -1))  # (n, rows, columns, s)
-    return replace(sample, labels=grid.transpose(1, 2).flatten(1, 2))
-
-
-def _inverse(sample: Sample) -> Sample:
-    return replace(sample, rotations=sample.rotations.mT)
-
-
-def _upright(sample: Sample) -> Sample:
-    return replace(sample, rotations=torch.eye(3).to(sample.rotations).expand_as(sample.rotations))
-
-
-def _rolled(sample: Sample, places: int) -> Sample:
-    """Rotations by quaternions whose four numbers are rolled."""
-    quaternions = torch.from_numpy(Rotation.from_matrix(sample.rotations.numpy()).as_quat()).roll(places, 1)
-    return replace(sample, rotations=torch.from_numpy(Rotation.from_quat(quaternions.numpy()).as_matrix()))
-
-
-def _at_frequencies(sample: Sample, factor: float) -> Sample:
-    return replace(sample, frequencies=factor * sample.frequencies)
-
-
-def _renumbered(sample: Sample, order: Tensor) -> Sample:
-    return replace(sample, receivers=order[sample.receivers])
-
-
-def _about_receivers(sample: Sample, move: Callable[[Tensor], Tensor]) -> Sample:
+def _about_receivers(sample: Sample, move: Move) -> Sample:
     stands = sample.positions[sample.receivers]
     return replace(sample, transmitters=stands + move(sample.transmitters - stands))
 
 
-def _about_origin(sample: Sample, move: Callable[[Tensor], Tensor]) -> Sample:
-    return replace(sample, transmitters=move(sample.transmitters))
+def _transposed(labels: Complex[Tensor, "n e s"], rows: int) -> Complex[Tensor, "n e s"]:
+    return labels.unflatten(1, (rows, -1)).transpose(1, 2).flatten(1, 2)
 
 
-def _clockwise(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    return points[:, [1, 0, 2]]
+def _rolled(rotations: Float[Tensor, "r 3 3"], by: int) -> Float[Tensor, "r 3 3"]:
+    """Rotations of quaternions whose four numbers are rolled."""
+    quaternions = Rotation.from_matrix(rotations.numpy()).as_quat()
+    return torch.from_numpy(Rotation.from_quat(torch.from_numpy(quaternions).roll(by, 1).numpy()).as_matrix())
 
 
 def _tilted(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Points with their angle from the z axis as elevation."""
     azimuths, elevations, distances = to_spherical(points)
     return distances[:, None] * from_spherical(azimuths, math.pi / 2 - elevations)
-
-
-def _sunk(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """The same of points below the horizon, where their azimuth is turned by half a circle."""
-    return -_tilted(points)
 
 
 def _widened(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -228,11 +186,9 @@ def _widened(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
 
 
 def _with_carrier(sample: Sample, at_elements: bool) -> Sample:
-    """Channels times the direct wave's phase at the middle of the band."""
-    places = sample.positions[:, None]  # (r, 1, 3)
-    if at_elements:
-        elements = pad_sequence([*sample.elements], batch_first=True)
-        places = places + torch.einsum("rwa,rea->rew", sample.rotations, elements)
-    distances = (sample.transmitters[:, None] - places[sample.receivers]).norm(dim=-1)  # (n, e)
+    """Channels times the direct wave's phase at the middle of the band, alike at all elements or not."""
+    distances = direct_distances(sample)
+    if not at_elements:
+        distances = distances.mean(1, keepdim=True)
     phases = -2 * math.pi * sample.frequencies.mean() / speed_of_light * distances
     return replace(sample, labels=sample.labels * torch.polar(torch.ones_like(phases), phases)[..., None])

@@ -16,6 +16,7 @@ class Sample:
     """Some links, evenly spread, in the form that hypotheses change.
 
     Attributes:
+        index: Numbers of the links among all.
         transmitters: Positions of the links' transmitters [m].
         receivers: Number of each link's receiver.
         positions: Positions of the receivers [m].
@@ -25,6 +26,7 @@ class Sample:
         labels: One a link, of the task's shape.
     """
 
+    index: Int[Tensor, " n"]
     transmitters: Float[Tensor, "n 3"]
     receivers: Int[Tensor, " n"]
     positions: Float[Tensor, "r 3"]
@@ -41,7 +43,7 @@ class Sample:
 
     def at(self, index: Int[Tensor, " k"]) -> "Sample":
         """Some of the links."""
-        parts = {name: getattr(self, name)[index] for name in ("transmitters", "receivers", "labels")}
+        parts = {name: getattr(self, name)[index] for name in ("index", "transmitters", "receivers", "labels")}
         return replace(self, **parts)
 
     def some(self, most: int) -> "Sample":
@@ -83,6 +85,7 @@ def sample_at(links: Any, index: Int[Tensor, " n"]) -> Sample:
     poses = [receiver.pose for receiver in links.receivers]
     labels = links.labels[index]
     return Sample(
+        index=index,
         transmitters=links.query.transmitters[index].double(),
         receivers=links.query.receivers[index],
         positions=torch.stack([pose.position for pose in poses]).double(),
@@ -91,3 +94,46 @@ def sample_at(links: Any, index: Int[Tensor, " n"]) -> Sample:
         frequencies=getattr(links.task, "frequencies", torch.zeros(0)).double(),
         labels=labels.to(torch.complex128 if labels.is_complex() else torch.float64),
     )
+
+
+def unit_changes() -> list[Hypothesis]:
+    """Units other than metres, of transmitters alone and of receivers alone: of both, directions are the same."""
+    units = {"mm": 1e-3, "cm": 1e-2, "feet": 0.3048, "km": 1e3}
+    changes = []
+    for ends, change in (("transmitters", _with_transmitters), ("receivers", _with_receivers)):
+        for unit, factor in units.items():
+            scale = lambda points, factor=factor: factor * points
+            mend = f"multiply the {ends}' positions by {factor:g}"
+            changes.append(Hypothesis(f"{ends} are in {unit}", change(scale), mend))
+    return changes
+
+
+def axis_changes() -> list[Hypothesis]:
+    """Axes that are exchanged or point the other way, of transmitters, receivers or both."""
+    maps = {
+        "x and y exchanged": ("[:, [1, 0, 2]]", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]),
+        "y and z exchanged": ("[:, [0, 2, 1]]", [[1, 0, 0], [0, 0, 1], [0, 1, 0]]),
+        "x and z exchanged": ("[:, [2, 1, 0]]", [[0, 0, 1], [0, 1, 0], [1, 0, 0]]),
+        "x negated": (" * [-1, 1, 1]", [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+        "y negated": (" * [1, -1, 1]", [[1, 0, 0], [0, -1, 0], [0, 0, 1]]),
+        "z negated": (" * [1, 1, -1]", [[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
+    }
+    ends = {
+        "transmitters": _with_transmitters,
+        "receivers": _with_receivers,
+        "transmitters and receivers": lambda move: lambda own: _with_receivers(move)(_with_transmitters(move)(own)),
+    }
+    changes = []
+    for end, change in ends.items():
+        for name, (mend, matrix) in maps.items():
+            move = lambda points, matrix=matrix: points @ torch.tensor(matrix).to(points)
+            changes.append(Hypothesis(f"{end} have {name}", change(move), f"positions{mend}"))
+    return changes
+
+
+def _with_transmitters(move: Callable[[Tensor], Tensor]) -> Callable[[Sample], Sample]:
+    return lambda own: replace(own, transmitters=move(own.transmitters))
+
+
+def _with_receivers(move: Callable[[Tensor], Tensor]) -> Callable[[Sample], Sample]:
+    return lambda own: replace(own, positions=move(own.positions))

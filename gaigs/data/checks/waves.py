@@ -27,15 +27,18 @@ class Turned(NamedTuple):
         return self.channels * self.waves.conj(), self.channels * self.waves
 
 
+def direct_distances(sample: Sample) -> Float[Tensor, "n e"]:
+    """Distances of each link's transmitter from the elements of its receiver [m]; lacking ones are in its middle."""
+    elements = pad_sequence([*sample.elements], batch_first=True)  # (r, e, 3)
+    places = sample.positions[:, None] + torch.einsum("rwa,rea->rew", sample.rotations, elements)
+    return (sample.transmitters[:, None] - places[sample.receivers]).norm(dim=-1)
+
+
 def turned(sample: Sample, elements: int = 8, subcarriers: int = 6) -> Turned:
-    """Channels and direct phases at some elements and subcarriers, evenly spread, which show the geometry as well."""
-    own = pad_sequence([*sample.elements], batch_first=True)  # (r, e, 3)
-    chosen = evenly(torch.arange(own.shape[1]), elements)
+    """Channels and direct waves at some elements and subcarriers, evenly spread, which show the geometry as well."""
+    chosen = evenly(torch.arange(sample.labels.shape[1]), elements)
     tones = evenly(torch.arange(len(sample.frequencies)), subcarriers)
-    offsets = torch.einsum("rwa,rea->rew", sample.rotations, own[:, chosen])
-    places = (sample.positions[:, None] + offsets)[sample.receivers]  # (n, e, 3)
-    distances = (sample.transmitters[:, None] - places).norm(dim=-1)
-    phases = -2 * math.pi / speed_of_light * distances[..., None] * sample.frequencies[tones]
+    phases = direct_distances(sample)[:, chosen, None] * (-2 * math.pi / speed_of_light * sample.frequencies[tones])
     sizes = torch.tensor([len(array) for array in sample.elements])[sample.receivers]
     channels = sample.labels[:, chosen][..., tones] * (chosen < sizes[:, None])[..., None]
     powers = channels.abs().square().mean((1, 2), keepdim=True)
@@ -81,17 +84,14 @@ def likeness(sample: Sample) -> float:
     """Share of the power that the direct wave explains after the best phase of each link.
 
     Each element and subcarrier may have a phase of its own, the same in all links.
-
-    It is the largest singular value of the still channels, squared, over their power.
     """
     found = []
     for still in turned(sample).still():
-        still = still.flatten(1)  # (n, m)
         explained = 0.0
         for receiver in sample.receivers.unique():
-            own = still[sample.receivers == receiver]
+            own = still[sample.receivers == receiver].flatten(1)  # (k, m)
             common = torch.ones_like(own[0])
-            for _ in range(3):  # the power method; a calibrated array starts at its end
+            for _ in range(3):  # the power method for the first singular vector
                 common = own.mH @ (own @ common)
             explained += ((own @ common).abs().square().sum() / common.abs().square().sum().clamp_min(1e-300)).item()
         found.append(explained / still.numel())
@@ -99,12 +99,10 @@ def likeness(sample: Sample) -> float:
 
 
 def aligned_likeness(sample: Sample) -> float:
-    """Share of the power that a wave explains after the best phase and delay of each link."""
-    parts, found = turned(sample, subcarriers=16), []
-    for still in parts.still():
-        turns = alignment(still, torch.ones_like(still), parts.frequencies)
-        found.append((still * turns).mean((1, 2)).abs().square().mean().item())
-    return max(found)
+    """Share of the power that the direct wave explains after the best phase and delay of each link."""
+    parts = turned(sample, subcarriers=16)
+    kept = [still * alignment(still, torch.ones_like(still), parts.frequencies) for still in parts.still()]
+    return max(still.mean((1, 2)).abs().square().mean().item() for still in kept)
 
 
 def level_share(sample: Sample) -> float:
