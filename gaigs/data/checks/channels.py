@@ -12,7 +12,7 @@ from gaigs.data.checks.conventions import conventions
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.hypotheses import Sample, sample_at
 from gaigs.data.checks.subcarriers import check_constant_subcarriers, order_of_subcarriers
-from gaigs.data.checks.waves import aligned_likeness, coherence, level_share, likeness, spread, without_geometry
+from gaigs.data.checks.waves import aligned_likeness, coherence, has_extent, level_share, likeness, without_geometry
 from gaigs.phases import MANY, phase_sign, strange_parts, unknown_phase
 from gaigs.query import evenly
 from gaigs.scene import Scene, direct_waves
@@ -123,7 +123,7 @@ def best_convention(sample: Sample, score: Measure) -> Finding | None:
         changed = one.change(few)
         share = score.measure(changed)
         # Channels that are alike at all links fit any convention under which distances hardly differ.
-        is_telling = share > max(read, score.least / 2) and spread(changed) > 1
+        is_telling = share > max(read, score.least / 2) and has_extent(changed)
         if is_telling and share > 1.1 * score.measure(without_geometry(changed)) + 0.02:
             tried.append((share, one))
     likely = sorted((share for share, _ in tried), reverse=True)[:8]

@@ -46,10 +46,12 @@ def turned(sample: Sample, elements: int = 8, subcarriers: int = 6) -> Turned:
     return Turned(channels, torch.polar(torch.ones_like(phases), phases), sample.frequencies[tones])
 
 
-def spread(sample: Sample) -> float:
-    """Standard deviation of the direct distances in wavelengths."""
+def has_extent(sample: Sample) -> bool:
+    """True unless distances differ by less than a wavelength, or an array is smaller than a tenth of one."""
+    wavelength = speed_of_light / sample.frequencies.mean()
     distances = (sample.transmitters - sample.positions[sample.receivers]).norm(dim=1)
-    return (distances.std() * sample.frequencies.mean() / speed_of_light).item()
+    extents = [(array.amax(0) - array.amin(0)).norm() for array in sample.elements]
+    return bool(distances.std() > wavelength) and not any(0 < extent < wavelength / 10 for extent in extents)
 
 
 def without_geometry(sample: Sample) -> Sample:
