@@ -41,6 +41,15 @@ class Sample:
         offsets = self.transmitters - self.positions[self.receivers]  # (n, 3)
         return torch.einsum("nw,nwa->na", offsets, self.rotations[self.receivers])
 
+    def at(self, index: Int[Tensor, " k"]) -> "Sample":
+        """Some of the links."""
+        parts = {name: getattr(self, name)[index] for name in ("index", "transmitters", "receivers", "labels")}
+        return replace(self, **parts)
+
+    def some(self, most: int) -> "Sample":
+        """At most so many of the links, evenly spread."""
+        return self.at(evenly(torch.arange(len(self.labels)), most))
+
 
 class Hypothesis(NamedTuple):
     """Another convention: its name, the sample read by it, and what mends the data."""
@@ -68,7 +77,11 @@ def best_fit(sample: Sample, hypotheses: Sequence[Hypothesis], score: Callable[[
 def sample_of(links: Any, most: int) -> Sample:
     """At most ``most`` links, evenly spread over those that are not tested; numbers are float64."""
     known = torch.arange(len(links)) if links.split is None else links.split.known.sort().values
-    index = evenly(known, most)
+    return sample_at(links, evenly(known, most))
+
+
+def sample_at(links: Any, index: Int[Tensor, " n"]) -> Sample:
+    """Links of these numbers; numbers are float64."""
     poses = [receiver.pose for receiver in links.receivers]
     labels = links.labels[index]
     return Sample(
