@@ -1,4 +1,4 @@
-"""Conventions of channels, places and arrays, with what mends data that were written under them."""
+"""Conventions of places, arrays and channels, with what mends data that were written under them."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -55,7 +55,7 @@ def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
 
 
 def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
-    """Orders and units of elements, and orientations of arrays."""
+    """Orders and units of elements, and orientations."""
     yield _changing("elements are in reversed order", ["labels"], lambda labels: labels.flip(1), "h = h[:, ::-1]")
     count = sample.labels.shape[1]
     for rows in range(2, count // 2 + 1):
@@ -66,6 +66,11 @@ def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
     wavelength = speed_of_light / sample.frequencies.mean().item()
     yield _scaled(["elements"], "wavelengths", wavelength)
     yield _scaled(["elements"], "half wavelengths", wavelength / 2)
+    yield from of_orientations(sample)
+
+
+def of_orientations(sample: Sample) -> Iterator[Hypothesis]:
+    """Other readings of the receivers' rotations; none if all look along the world's axes."""
     if torch.allclose(sample.rotations, torch.eye(3).to(sample.rotations)):
         return
     for name, move, mend in (
