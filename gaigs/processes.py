@@ -140,8 +140,11 @@ def is_first() -> bool:
 
 
 @contextlib.contextmanager
-def only_run(folder: Path) -> Iterator[None]:
-    """Locks a run folder, at most until this process ends; writes nothing there."""
+def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
+    """Locks a folder, at most until this process ends; writes nothing there.
+
+    Where another one holds it, it ``waits``, or raises a ``ValueError``.
+    """
     try:
         import fcntl
     except ImportError:  # Windows has no such locks
@@ -150,7 +153,7 @@ def only_run(folder: Path) -> Iterator[None]:
     handle = os.open(folder, os.O_RDONLY)
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
         except BlockingIOError:
             advice = "wait, or choose another folder (hydra.run.dir)"
             raise ValueError(f"another run is at work in {folder}\n{advice}") from None
