@@ -52,6 +52,16 @@ def keep_memory() -> None:
         libc.mallopt(mapped, 2**30) or libc.mallopt(mapped, 2**25)  # older ones take no more
 
 
+def _use_one_thread() -> None:
+    """For a forked process: it lacks the threads that torch has started, and would wait for them for ever."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):  # Windows has no forks
+    os.register_at_fork(after_in_child=_use_one_thread)
+
+
 @contextlib.contextmanager
 def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
     """Limits the threads of torch and PoCL; PoCL keeps the limit of its first use.
