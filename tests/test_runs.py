@@ -328,6 +328,18 @@ def test_a_folder_without_a_checkpoint_is_free(tmp_path):
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["seed"] == 0
 
 
+@pytest.mark.parametrize("name", ["[bold]x", "runs[/red]"])
+def test_the_name_of_a_folder_is_no_markup(name, tmp_path, capsys):
+    runs.run(configure("model=mean"), tmp_path / name)
+    assert capsys.readouterr().out.endswith(f"results: {tmp_path / name}\n")
+
+
+def test_the_name_of_a_split_is_no_markup():
+    task = gaigs.links("synthetic_rssi", transmitters=10, order=0).task
+    scores = {"mean": task.scores(torch.zeros(3), torch.ones(3))}
+    assert "on split folder[/red]." in str(evaluation.Evaluation(task, "folder[/red]", scores, "cpu"))
+
+
 def test_files_that_a_killed_writer_left_are_removed(tmp_path):
     config = configure("trainer.max_steps=1")
     claim(tmp_path, config)
