@@ -18,7 +18,7 @@ def default_device() -> str:
 
 @functools.cache
 def _process() -> int:
-    """The process that uses OpenCL first: its forked children lack the threads of the driver, and would wait for ever."""
+    """The process that uses OpenCL first; a forked child lacks the driver's threads, and would wait for ever."""
     return os.getpid()
 
 
