@@ -6,7 +6,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gaigs.geometry import FAR, WITHIN
+from gaigs.io.files import atomic_write
 
 Rows = Mapping[int, Sequence[str]]
 """Cells of each line of a table, by the line's number from 1."""
@@ -132,6 +133,9 @@ def split_rows(file: Path, lines: Sequence[str], names: Sequence[str], skip: int
     return rows
 
 
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""Beginnings of cells that spreadsheets take for formulas."""
+
 EMPTY = {"", "nan", "na", "n/a", "null", "none", "-inf", "-"}
 """Cells that mean "not heard" in any table."""
 
@@ -155,6 +159,32 @@ class Table(NamedTuple):
         if name not in self.names:
             raise ValueError(f"{self.file}, line 1: expected a column {quote(name)}, got {shortened(self.names)}")
         return self.names.index(name)
+
+
+def write_csv(file: Path, rows: Iterable[Sequence]) -> None:
+    """Writes rows as a CSV table; texts as ``inert`` gives them."""
+    with atomic_write(file) as part, part.open("w", encoding="utf-8", newline="") as opened:
+        writer = csv.writer(opened, lineterminator="\n")
+        writer.writerows([inert(cell) if isinstance(cell, str) else cell for cell in row] for row in rows)
+
+
+def inert(text: str) -> str:
+    """A text that no spreadsheet takes for a formula: before =, +, -, @, a tab or a return it has an apostrophe more.
+
+    Numbers stay as they are.
+    """
+    if not text.lstrip("'").startswith(FORMULA):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
+
+
+def original(text: str) -> str:
+    """The text of which ``inert`` gives this one."""
+    return text[1:] if text.startswith("'") and text.lstrip("'").startswith(FORMULA) else text
 
 
 def read_table(file: Path, content: str) -> Table:
