@@ -158,9 +158,9 @@ class Process:
 
     @property
     def messages(self) -> list[str]:
-        """Messages on stderr, without the lines that Hydra puts around each."""
+        """Messages on stderr, without the line that Hydra puts before that of a sweep."""
         lines = self.says.read_text().splitlines()
-        return [line for line in lines if line and not line.startswith(("Error executing job", "Set the environment"))]
+        return [line for line in lines if line and not line.startswith("Error executing job")]
 
     @property
     def end(self) -> str:

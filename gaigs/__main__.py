@@ -1,30 +1,41 @@
 """The command line: ``python -m gaigs +experiment=spectrum``."""
 
-import logging
-import os
-import signal
 import sys
-import traceback
-from pathlib import Path
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+try:
+    import contextlib
+    import logging
+    import os
+    import shutil
+    import signal
+    import traceback
+    from pathlib import Path
 
-import gaigs
-from gaigs import configuration, processes
-from gaigs.report import at_end
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.errors import CompactHydraException
+    from hydra.types import RunMode
+    from omegaconf import DictConfig, OmegaConf
+
+    import gaigs
+    from gaigs import configuration, processes
+    from gaigs.report import at_end
+except KeyboardInterrupt:
+    print("gaigs: stopped", file=sys.stderr)
+    raise SystemExit(130) from None
 
 log = logging.getLogger("gaigs")
+
+
+class JobError(BaseException):
+    """The error of a job that is no part of a sweep: Hydra would print a line of its own before an ``Exception``."""
 
 
 def run(config: DictConfig) -> float | None:
     """One job: ``gaigs.run`` in Hydra's run folder; returns the validation score for sweepers.
 
-    An error that a user can mend becomes one message, which Hydra prints; ``hydra.verbose=true`` prints the traceback
-    first. A signal ends the process with 128 and the signal's number, as in shells.
+    An error that a user can mend becomes one message; ``hydra.verbose=true`` prints the traceback first. A signal ends
+    the process with 128 and the signal's number, as in shells. Without a result there is no folder.
     """
     settings = HydraConfig.get()
     is_sweep, launcher = settings.mode is RunMode.MULTIRUN, settings.launcher["_target_"].rpartition(".")[2]
@@ -57,13 +68,35 @@ def run(config: DictConfig) -> float | None:
         message = processes.advice(error, folder, goes_on)
         if settings.verbose:
             traceback.print_exc()
-        if is_sweep:
-            # Hydra prints the first failure only: each job writes its own, in one line of its log.
-            log.error("gaigs: %s", " ".join((message or str(error) or repr(error)).split()))
+        if not is_sweep:
+            raise JobError(message) from error
+        # Hydra prints the first failure only: each job writes its own, in one line of its log.
+        log.error("gaigs: %s", " ".join((message or str(error) or repr(error)).split()))
         if message is None:
             raise
         raise CompactHydraException(f"gaigs: {message}") from error
+    finally:
+        if not is_sweep:
+            remove_without_result(folder)
     return None if metrics is None else metrics["validation_score"]
+
+
+def remove_without_result(folder: Path) -> None:
+    """Removes a run folder with nothing but what Hydra and the start of a run write, unless a run is at work there."""
+    begun = {".hydra", "gaigs.log", "config.yaml", "software.json"}
+    with contextlib.suppress(OSError, ValueError), processes.only_run(folder):
+        if {path.name for path in folder.iterdir()} <= begun and not Path.cwd().is_relative_to(folder):
+            shutil.rmtree(folder)
+
+
+def is_output_closed() -> bool:
+    """True if nobody reads the output any more, as behind ``| head``; drops the rest of it."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def compose_and_run() -> None:
@@ -72,12 +105,19 @@ def compose_and_run() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:
         hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
-    except Exception as error:
+    except (Exception, JobError) as error:
+        cause = error.__cause__ if isinstance(error, JobError) else error
+        # A job has no other pipe, and launchers of a sweep have.
+        if isinstance(cause, BrokenPipeError) and (is_output_closed() or not configuration.is_multirun()):
+            raise SystemExit(141) from None
         if full_error == "1":
             raise
-        message = configuration.explain(error) or processes.advice(error, Path.cwd(), "the same command goes on")
+        if isinstance(error, JobError):
+            (message,) = error.args
+        else:
+            message = configuration.explain(error) or processes.advice(error, Path.cwd(), "the same command goes on")
         if message is None:
-            traceback.print_exc()
+            traceback.print_exception(cause)
         else:
             print(f"gaigs: {message}", file=sys.stderr)
         raise SystemExit(1) from None
@@ -94,11 +134,12 @@ def main() -> None:
     def stop(number: int, _) -> None:
         """Jobs in other processes save and end; this one waits for them."""
         signals.append(number)
+        processes.hang_up(number)
         processes.forward_to_children(number)
         if not configuration.is_multirun():
             raise processes.Stopped("stopped", number)
 
-    handler = signal.signal(signal.SIGTERM, stop)
+    handlers = {number: signal.signal(number, stop) for number in processes.STOPPING[1:]}
     try:
         compose_and_run()
         at_end.write()
@@ -110,9 +151,13 @@ def main() -> None:
         print("gaigs: stopped", file=sys.stderr)
         raise SystemExit(128 + getattr(stop, "number", signal.SIGINT)) from None
     finally:
-        signal.signal(signal.SIGTERM, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        is_closed = is_output_closed()
         if signals:
             sys.exit(128 + signals[0])
+        if is_closed:
+            sys.exit(141)  # as of SIGPIPE
 
 
 if __name__ == "__main__":
