@@ -27,10 +27,6 @@ except KeyboardInterrupt:
 log = logging.getLogger("gaigs")
 
 
-class JobError(BaseException):
-    """The error of a job that is no part of a sweep: Hydra would print a line of its own before an ``Exception``."""
-
-
 def run(config: DictConfig) -> float | None:
     """One job: ``gaigs.run`` in Hydra's run folder; returns the validation score for sweepers.
 
@@ -66,10 +62,14 @@ def run(config: DictConfig) -> float | None:
         raise SystemExit(128 + number) from None
     except Exception as error:
         message = processes.advice(error, folder, goes_on)
-        if settings.verbose:
+        if settings.verbose or (message is None and not is_sweep):
             traceback.print_exc()
-        if not is_sweep:
-            raise JobError(message) from error
+        if not is_sweep:  # exits here, as Hydra would print a line of its own first
+            if isinstance(error, BrokenPipeError):
+                raise SystemExit(141) from None
+            if message is not None:
+                print(f"gaigs: {message}", file=sys.stderr)
+            raise SystemExit(1) from None
         # Hydra prints the first failure only: each job writes its own, in one line of its log.
         log.error("gaigs: %s", " ".join((message or str(error) or repr(error)).split()))
         if message is None:
@@ -89,35 +89,20 @@ def remove_without_result(folder: Path) -> None:
             shutil.rmtree(folder)
 
 
-def is_output_closed() -> bool:
-    """True if nobody reads the output any more, as behind ``| head``; drops the rest of it."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False
-
-
 def compose_and_run() -> None:
     """Lets Hydra read the command line and run its jobs; exits with 1 after the message of an error."""
     full_error = os.environ.get("HYDRA_FULL_ERROR", "")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:
         hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
-    except (Exception, JobError) as error:
-        cause = error.__cause__ if isinstance(error, JobError) else error
-        # A job has no other pipe, and launchers of a sweep have.
-        if isinstance(cause, BrokenPipeError) and (is_output_closed() or not configuration.is_multirun()):
-            raise SystemExit(141) from None
+    except Exception as error:
         if full_error == "1":
             raise
-        if isinstance(error, JobError):
-            (message,) = error.args
-        else:
-            message = configuration.explain(error) or processes.advice(error, Path.cwd(), "the same command goes on")
+        if isinstance(error, BrokenPipeError) and not configuration.is_multirun():  # launchers have other pipes
+            raise SystemExit(141) from None
+        message = configuration.explain(error) or processes.advice(error, Path.cwd(), "the same command goes on")
         if message is None:
-            traceback.print_exception(cause)
+            traceback.print_exc()
         else:
             print(f"gaigs: {message}", file=sys.stderr)
         raise SystemExit(1) from None
@@ -153,11 +138,13 @@ def main() -> None:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        is_closed = is_output_closed()
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:  # nobody reads it any more, as behind | head
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            signals.append(13)  # SIGPIPE
         if signals:
             sys.exit(128 + signals[0])
-        if is_closed:
-            sys.exit(141)  # as of SIGPIPE
 
 
 if __name__ == "__main__":

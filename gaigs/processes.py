@@ -29,6 +29,9 @@ THREADS = ("OMP_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 AGAIN = 0.05
 """Delay before an ignored signal is sent again [s]."""
 
+if hasattr(os, "register_at_fork"):  # a forked process lacks the threads of torch, and would wait for them for ever
+    os.register_at_fork(after_in_child=lambda: "torch" in sys.modules and sys.modules["torch"].set_num_threads(1))
+
 received: list[int] = []
 """Signals that have stopped runs of this process: a launcher's worker starts no further run."""
 
@@ -53,16 +56,6 @@ def keep_memory() -> None:
         trim, mapped = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h, in bytes
         libc.mallopt(trim, 2**31 - 1)
         libc.mallopt(mapped, 2**30) or libc.mallopt(mapped, 2**25)  # older ones take no more
-
-
-def _use_one_thread() -> None:
-    """For a forked process: it lacks the threads that torch has started, and would wait for them for ever."""
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(1)
-
-
-if hasattr(os, "register_at_fork"):  # Windows has no forks
-    os.register_at_fork(after_in_child=_use_one_thread)
 
 
 @contextlib.contextmanager

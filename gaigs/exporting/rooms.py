@@ -3,7 +3,6 @@
 import base64
 import cmath
 import hashlib
-import io
 import json
 import math
 import re
@@ -161,13 +160,11 @@ def write_scene(file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comme
             vertices = np.array([*mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"])
             faces = np.array([(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))])
             elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-            stream = io.BytesIO()
-            PlyData(elements, byte_order="<").write(stream)
             # Named by content: a scene that is read meanwhile never has another scene's meshes.
-            digest = hashlib.sha256(stream.getvalue()).hexdigest()[:8]
+            digest = hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest()[:8]
             files.append(folder / f"{mesh.name}-{digest}.ply")
             with atomic_write(files[-1]) as part:
-                part.write_bytes(stream.getvalue())
+                PlyData(elements, byte_order="<").write(str(part))
             shape = ElementTree.SubElement(scene, "shape", type="ply", id=f"mesh-{mesh.name}")
             ElementTree.SubElement(shape, "string", name="filename", value=f"{folder.name}/{files[-1].name}")
             ElementTree.SubElement(shape, "boolean", name="face_normals", value="true")

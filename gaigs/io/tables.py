@@ -133,9 +133,6 @@ def split_rows(file: Path, lines: Sequence[str], names: Sequence[str], skip: int
     return rows
 
 
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""Beginnings of cells that spreadsheets take for formulas."""
-
 EMPTY = {"", "nan", "na", "n/a", "null", "none", "-inf", "-"}
 """Cells that mean "not heard" in any table."""
 
@@ -173,18 +170,13 @@ def inert(text: str) -> str:
 
     Numbers stay as they are.
     """
-    if not text.lstrip("'").startswith(FORMULA):
-        return text
-    try:
-        float(text)
-    except ValueError:
-        return f"'{text}"
-    return text
+    starts = text.lstrip("'").startswith(("=", "+", "-", "@", "\t", "\r"))
+    return f"'{text}" if starts and text != "-inf" and math.isnan(to_number(text)) else text
 
 
 def original(text: str) -> str:
     """The text of which ``inert`` gives this one."""
-    return text[1:] if text.startswith("'") and text.lstrip("'").startswith(FORMULA) else text
+    return text[1:] if text.startswith("'") and inert(text[1:]) == text else text
 
 
 def read_table(file: Path, content: str) -> Table:
