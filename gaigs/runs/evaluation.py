@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Int
 from rich.console import Console, Group
 from rich.jupyter import JupyterMixin
+from rich.markup import escape
 from torch import Tensor
 
 from gaigs import stages
@@ -193,7 +194,7 @@ class Evaluation(JupyterMixin):
 
     def __rich__(self) -> Group:
         facts = {"task": self.task.name, "split": self.split, "device": self.device, "models": self.models}
-        return Group(metrics_table(facts), verdict(facts))
+        return Group(metrics_table(facts), escape(verdict(facts)))
 
     def __str__(self) -> str:
         text = io.StringIO()
