@@ -99,7 +99,9 @@ def remove_without_result(folder: Path) -> None:
     """Removes a run folder with nothing but what Hydra and the start of a run write, unless a run is at work there."""
     begun = {".hydra", "gaigs.log", "config.yaml", "software.json"}
     with contextlib.suppress(OSError, ValueError), processes.only_run(folder):
-        if {path.name for path in folder.iterdir()} <= begun and not Path.cwd().is_relative_to(folder):
+        names = {path.name for path in folder.iterdir()}
+        is_ours = "config.yaml" not in names or "software.json" in names  # a run writes both
+        if names <= begun and is_ours and not Path.cwd().is_relative_to(folder):
             shutil.rmtree(folder)
 
 
