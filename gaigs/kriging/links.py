@@ -56,6 +56,16 @@ def folds_of(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " k"]:
     return (order % FOLDS)[group]
 
 
+def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
+    """Some links with one random reading of each place, receiver and carrier: those of one place err together."""
+    if not len(index):
+        return index
+    _, which = links.query[index].unique(with_receivers=True)
+    order = torch.randperm(len(index), generator=torch.Generator().manual_seed(0))
+    last = order.new_zeros(int(which.max()) + 1).index_copy(0, which[order], order)
+    return index[last.sort().values]
+
+
 def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tensor, "b d"]:
     """Points whose Euclidean distance is the distance of links, d² = |dx|² + (scale d ln f)²; float64.
 
