@@ -14,7 +14,7 @@ from gaigs.data import Links
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters
 from gaigs.kriging.kernel import LIMIT, Process
-from gaigs.kriging.links import PART, coordinates, folds_of, scaled, single_readings, thinned
+from gaigs.kriging.links import PART, coordinates, folds_of, scaled, single_readings, thinned, without_gross_errors
 from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import Model, Prediction, Wrapper, call_optional
@@ -106,6 +106,8 @@ class Kriging(Wrapper):
         If not ``is_final``, only the validation model is fitted, without a word. ``by_paths`` says if strengths of
         paths are kriged, or whole labels; None: ``FEWEST`` validation links or more choose.
         """
+        if self.is_scalar:
+            links = without_gross_errors(links)
         links = thinned(links, LIMIT)
         values, held = predicted(self.trend, links, links.split.known), links.split.validation
         self.fallback.fit(links)
