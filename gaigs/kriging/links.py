@@ -61,9 +61,9 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
 
     Levels fall with the logarithm of the distance to their receiver. A level is left out if its error by this law is
     more than ``size`` standard deviations, and as far from those of the five nearest levels of its receiver: what
-    neighbours share is a part of the room. The line has Cauchy's weights, so few levels do not move it. The deviation
-    is 1.48 times the median error, the larger one of the receiver and of all receivers, 1 dB or more. Fewer than 20
-    known links keep all.
+    neighbours share is a part of the room. So is what more than one in twenty have. The line has Cauchy's weights, so
+    few levels do not move it. The deviation is 1.48 times the median error, the larger one of the receiver and of all
+    receivers, 1 dB or more. Fewer than 20 known links keep all.
 
     Source: Maronna, Martin and Yohai, Robust Statistics, 2006, sections 4.4 and 5.2.
     """
@@ -85,7 +85,8 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
         if len(own) > 5 and len(far):
             apart = distances(query.transmitters[far], query.transmitters[own])
             around = own[apart.masked_fill(far[:, None] == own, math.inf).topk(5, largest=False).indices]
-            kept[far] = (errors[far, None] - errors[around]).abs().amin(1) <= most
+            alone = (errors[far, None] - errors[around]).abs().amin(1) > most
+            kept[far] = ~alone | (alone.sum() > max(1, len(own) // 20))
     parts = links.split.parts()
     train, validation = (parts[name][torch.isin(parts[name], index[kept])] for name in ("train", "validation"))
     return replace(links, split=Split(links.split.name, train, validation, parts["test"], links.split.groups))
