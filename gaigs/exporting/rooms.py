@@ -76,7 +76,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
         return [file]
     chosen = materials(own.placement, own.traced, frequency)
     bsdfs = [itu_bsdf(chosen[plane.number], frequency) for plane in planes] + [*map(sheet_bsdf, sheets)]
-    comments = [f"Materials for {frequency:.7g} Hz."]
+    comments = [f"Materials for {frequency:.7g} Hz.", *map(str, own.scene.flat_axes)]
     if own.scene.task.dtype.is_complex:
         for receiver, gain in zip(own.scene.receivers, traced_gains(own, rest).tolist(), strict=True):
             turned = f"{abs(gain):.4g}, turned by {math.degrees(cmath.phase(gain)):.2f} degrees"
