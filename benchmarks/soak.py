@@ -90,7 +90,7 @@ went on in the same folder, once there was room, folder or memory again. It lost
 
 - it ended with the scores, predictions, weights and loss curves of an undisturbed run, to the bit;
 - checkpoints in between were whole, and no half-written file was left;
-- its message was one sentence.
+- its message was one or two lines.
 
 Undisturbed it took {work:.1f} s of one core, and {seconds:.0f} s on a machine shared by others: {device}.
 
@@ -167,7 +167,7 @@ class Process:
         """How it ended, in words."""
         if self.code < 0:
             return signal.Signals(-self.code).name
-        causes = {"enough memory": "not enough memory", "not be written": "could not be written"}
+        causes = {"out of memory": "not enough memory", "not be written": "could not be written"}
         causes |= {"was removed": "folder was removed", "stopped": "stopped", "not started": "stopped"}
         said = next(
             (name for words, name in causes.items() if any(words in line for line in self.messages)), "no message"
@@ -233,7 +233,8 @@ class Soak:
         """Looks at how a disturbed run has ended."""
         trial = Trial(self.fault, phase, process.end, lost)
         messages = process.messages
-        is_clear = all(line.startswith("gaigs: ") for line in messages) and len(messages) == (process.code > 0)
+        is_clear = (process.code > 0) == bool(messages) and len(messages) <= 2  # cause, and what to do
+        is_clear = is_clear and all(line.startswith("gaigs: ") for line in messages[:1])
         if process.code not in codes or not is_clear or "no message" in process.end:
             trial.wrong.append(f"exit code {process.code}, {' '.join(process.messages)}")
         self.trials.append(trial)
