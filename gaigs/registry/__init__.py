@@ -25,7 +25,7 @@ from gaigs.registry.holders import GIVEN, MISSING, Holder, find_holders, is_plai
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
-    "model", "training", "benchmark",
+    "model", "training",
 )  # fmt: skip
 """Kinds of components; each is a folder of gaigs and of conf."""
 
