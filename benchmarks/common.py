@@ -10,8 +10,7 @@ import logging
 import math
 import statistics
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -53,11 +52,12 @@ def positive(text: str) -> int:
     return int(text)
 
 
-class Benchmark(ABC):
+class Benchmark:
     """Rows of measurements, grouped in cells that are measured one by one.
 
-    Args:
-        options: Of the command line; see ``command_line``.
+    A subclass has three methods. ``cells(device)`` gives the keys of the rows of each cell without
+    "device", cheap cells first. ``measure(cell, device)`` gives the rows: keys, values, and
+    ``status`` where it is unavailable. ``tables(rows)`` gives the page of the measured rows.
 
     Attributes:
         name: Name of its files.
@@ -75,18 +75,6 @@ class Benchmark(ABC):
     def __init__(self, options: argparse.Namespace):
         self.options, self.config = options, gaigs.compose(*options.overrides)
 
-    @abstractmethod
-    def cells(self, device: str) -> Iterable[Sequence[Row]]:
-        """Keys of the rows of each cell without "device", cheap cells first."""
-
-    @abstractmethod
-    def measure(self, cell: Sequence[Row], device: str) -> Iterable[Mapping]:
-        """The rows of a cell: keys, values, and ``status`` where it is unavailable."""
-
-    @abstractmethod
-    def tables(self, rows: Sequence[Row]) -> str:
-        """The page of the measured rows in Markdown."""
-
     def run(self) -> None:
         """Measures the missing rows of the folder, and writes its page.
 
@@ -98,11 +86,8 @@ class Benchmark(ABC):
         log.info("results: %s; with --folder %s the same command goes on", folder, folder)
         processes.keep_memory()
         folder.mkdir(parents=True, exist_ok=True)
-        with (
-            processes.stopping(),
-            processes.limited_threads(self.config["threads"]),
-            processes.only_run(folder),
-        ):
+        threads = processes.limited_threads(self.config["threads"])
+        with processes.stopping(), threads, processes.only_run(folder):
             rows = self._measure_missing(folder / f"{self.name}.csv")
         measured = [row for row in rows if row["status"] == MEASURED]
         causes: dict[str, dict[str, None]] = {}

@@ -13,16 +13,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from common import (
-    UNAVAILABLE,
-    Benchmark,
-    Row,
-    command_line,
-    grouped,
-    median_and_spread,
-    positive,
-    table,
-)  # fmt: skip
+from common import UNAVAILABLE, Benchmark, Row, command_line, grouped, median_and_spread, positive, table
 from scenes import SCENES, Truth, passes
 
 from gaigs.registry import registry
@@ -101,13 +92,10 @@ def main(words: Sequence[str] | None = None) -> None:
     names = [name for name in registry("rasterizer").names() if name != "fastest"]
     precisions = ["float64", "float32", "bfloat16", "float16"]
     parser = command_line(__doc__, takes_overrides=False)
-    add = parser.add_argument
+    add, text = parser.add_argument, "numbers of Gaussians in this scene"
     add("--rasterizers", nargs="+", choices=names, default=names)
-    counts = {"nargs": "*", "type": positive}
-    text = "numbers of Gaussians; one transmitter, one footprint a Gaussian"
-    add("--common", **counts, default=[200, 1000, 5000, 20000, 100000], help=text)
-    text = "numbers of Gaussians; 16 transmitters that deform the Gaussians and attenuate"
-    add("--training", **counts, default=[200, 1000, 5000], help=text)
+    add("--common", nargs="*", type=positive, default=[200, 1000, 5000, 20000, 100000], help=text)
+    add("--training", nargs="*", type=positive, default=[200, 1000, 5000], help=text)
     add("--grids", nargs="+", type=grid, default=[[23, 90], [90, 360]], help="rows x columns of maps")
     add("--precisions", nargs="+", choices=precisions, default=precisions)
     text = "of a pass under half a second, after warm-up; a longer one has three"

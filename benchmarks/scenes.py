@@ -17,7 +17,7 @@ from gaigs.testing.rasterizer import (
     footprints_of,
     rasterize_densely,
     render_with_gradients,
-)  # fmt: skip
+)
 
 
 class DrawnScene(NamedTuple):

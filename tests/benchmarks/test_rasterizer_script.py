@@ -6,7 +6,7 @@ import pytest
 import rasterizer
 import torch
 from common import UNAVAILABLE
-from scenes import SCENES, Truth, passes
+from scenes import SCENES, Truth
 
 from gaigs.registry import registry
 
@@ -67,8 +67,3 @@ def test_many_pairs_are_summed_on_a_coarser_grid():
     assert tuple(coarse.plane.shape) == (10, 20)
     assert coarse.plane.u.equal(scene.plane.u[:, ::3])
     assert Truth(scene).pairs == pytest.approx(Truth(coarse).pairs * 9, rel=0.3)
-
-
-def test_a_turn_times_both_passes():
-    drawn, clock = registry("rasterizer").build({"name": "torch"}), iter((0, 1, 3)).__next__
-    assert passes(drawn, SCENES["training"](3, 8, 8), "cpu", torch.float32, clock)() == (1, 2)

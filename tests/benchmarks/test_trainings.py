@@ -181,17 +181,6 @@ def test_times_to_levels_and_the_best_rows(options, monkeypatch):
     assert "**planes**: `placement.planes` of `model=mirrored`; the default is 10\n" in text
 
 
-def test_of_errors_the_lowest_is_the_best(options, monkeypatch):
-    rows = [
-        row("look-up", "knn", 4.0, 4.0, 1.0, task="rssi"),
-        row("system", "gaigs", 3.0, 3.0, 2.0, "1:5 2:3.5", task="rssi"),
-    ]
-    monkeypatch.setattr(Accuracy, "levels", {"mae_db": [5, 3.2]})
-    text = Accuracy(options).tables(rows)
-    assert "| s to 5 | s to `knn` 4 | s to 3.2 |" in text
-    assert "| **GAI-GS** | 3 | 3 | 2 |  |  | 1 | 2 |  |  | 7 |  |" in text
-
-
 @pytest.mark.parametrize(
     ("task", "scores", "smallest"),
     [
