@@ -17,7 +17,8 @@ import torch
 
 import gaigs
 from gaigs import processes
-from gaigs.io.files import atomic_write, write_text
+from gaigs.io.files import write_text
+from gaigs.io.tables import original, write_csv
 from gaigs.report.table import markdown
 from gaigs.runs.evaluation import device_name
 
@@ -120,10 +121,8 @@ class Benchmark:
             for row in self.measure(cell, device):
                 texts = {column: text_of(row.get(column)) for column in columns}
                 rows[identity(texts)] = texts | {"status": texts["status"] or MEASURED}
-            with atomic_write(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
-                writer = csv.DictWriter(opened, columns)
-                writer.writeheader()
-                writer.writerows(rows.values())
+            lines = [[row[column] for column in columns] for row in rows.values()]
+            write_csv(file, [columns, *lines])
             seconds = time.monotonic() - begin
             longest = max(longest, seconds)
             log.info("%s %d/%d: %.1f s", self.name, number_of_cell + 1, len(left), seconds)
@@ -142,7 +141,7 @@ def read_rows(file: Path, columns: Sequence[str]) -> list[Row]:
             f"{file} must be CSV with the columns {', '.join(columns)}; move it elsewhere, or "
             "choose another folder (--folder DIR)"
         )
-    return rows
+    return [{column: original(text) for column, text in row.items()} for row in rows]
 
 
 def text_of(value: object) -> str:

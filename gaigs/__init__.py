@@ -12,10 +12,12 @@
 """
 
 import importlib
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gaigs.registry.modes import usual_modes
 from gaigs.version import __version__
 
 if TYPE_CHECKING:
@@ -67,7 +69,12 @@ __all__ = [
 def __getattr__(name: str):
     if name not in PLACES:
         raise AttributeError(f"module 'gaigs' has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(f"gaigs.{PLACES[name]}"), name)
+    module = importlib.import_module(f"gaigs.{PLACES[name]}")
+    value = getattr(module, name)
+    if inspect.isfunction(value) and name != "register":  # the decorator of ``register`` looks at its caller
+        value = usual_modes()(value)
+        setattr(module, name, value)  # where pickle looks for it
+    globals()[name] = value
     return value
 
 
@@ -75,6 +82,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *PLACES})
 
 
+@usual_modes()
 def run(configuration: Mapping, folder: str | Path) -> dict | None:
     """Executes the command of a configuration, as ``python -m gaigs`` does; resumes a run that was stopped.
 
@@ -90,7 +98,7 @@ def run(configuration: Mapping, folder: str | Path) -> dict | None:
         TypeError, ValueError: The configuration does not fit the data, or the folder holds another run.
         ImportError: A component needs a package that is not installed.
         OSError: A file cannot be read or written; no partial file is left.
-        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it and SIGTERM within a training.
+        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it, SIGTERM and SIGHUP within a training.
 
     Example:
         >>> configuration = gaigs.compose("model=knn", "data.transmitters=40", "data.order=0", baselines=["mean"])
@@ -130,13 +138,14 @@ def _execute(config: dict, folder: Path) -> dict | None:
 
             return runs.run(config, folder)
         case "agreement" | "describe" | "survey" | "locate" | "export" as command:
-            from gaigs import agreement, describing, exporting, locating, surveying
+            from gaigs import agreement, describing, exporting, locating, stages, surveying
 
             modules = {
                 "agreement": agreement, "describe": describing, "survey": surveying, "locate": locating,
                 "export": exporting,
             }  # fmt: skip
-            with processes.limited_threads(config["threads"]):
+            shows = config["trainer"].get("enable_progress_bar", True)
+            with processes.limited_threads(config["threads"]), stages.watched(shown=shows):
                 modules[command].run(config, folder)
         case "view":
             from gaigs import viewing

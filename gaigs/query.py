@@ -59,7 +59,7 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
         if values.is_meta or values.layout is not torch.strided:
             kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
             raise ValueError(f"{name} must be {expected}, got a {kind} tensor; give a dense tensor with values")
-        return values
+        return values.clone() if values.is_inference() else values  # which a training could not use
     if isinstance(values, list | tuple) and any(isinstance(value, Tensor) for value in values):
         parts = [as_tensor(name, value, expected) for value in values]
         if len({part.shape for part in parts}) == 1:
@@ -264,6 +264,12 @@ class Query:
         """A number for each transmitter's position, the same for the same one."""
         x, y, z = (self.transmitters.detach().cpu().float() + 0.0).contiguous().view(torch.int32).long().unbind(1)
         return (x * 1_000_003 + y) * 1_000_003 + z  # past 64 bits it wraps; + 0.0 makes -0 the same as 0
+
+    @property
+    def votes(self) -> Float[Tensor, " b"]:
+        """1 over the number of links of the same place, receiver and carrier: repeated readings have one vote."""
+        _, which = self.unique(with_receivers=True)
+        return which.bincount().double().reciprocal()[which]
 
     def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
         """The different links, sorted by position, frequency and receiver; and the index of each link among them.

@@ -1,7 +1,9 @@
 """The scene of a model: receivers with their arrays, the box of the training transmitters, the task."""
 
 import functools
+import logging
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex, Float
@@ -15,6 +17,31 @@ from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.task import Task
 from gaigs.task.csi import Csi
+
+log = logging.getLogger(__name__)
+
+
+class FlatAxis(NamedTuple):
+    """A world axis, 0 to 2, along which all transmitters have one coordinate [m], and all receivers' elements one.
+
+    A plane across it and its mirror image half-way between the two reflect paths of the same length. ``is_common`` is
+    true if both stand at the same coordinate.
+    """
+
+    axis: int
+    transmitters: float
+    receivers: float
+    is_common: bool
+
+    def __str__(self) -> str:
+        name = ("x", "y", "height")[self.axis]
+        if self.is_common:
+            return f"{name} not seen: all places at {self.transmitters:.2f} m"
+        both = self.transmitters + self.receivers
+        return (
+            f"{name} seen from either side: places at {self.transmitters:.2f} m, receivers at {self.receivers:.2f} m; "
+            f"a plane across it at h may stand at {both:.2f} m - h"
+        )
 
 
 @dataclass(frozen=True)
@@ -42,10 +69,10 @@ class Scene:
     upper: Float[Tensor, "3"]
     spacing: float
     task: Task
-    frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0))
+    frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
     bandwidth: float | None = None
     frame: Frame | None = None
-    floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0))
+    floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""
@@ -62,6 +89,22 @@ class Scene:
         """Diagonal of this box [m]."""
         lower, upper = self.box
         return (upper - lower).norm().item()
+
+    @functools.cached_property
+    def flat_axes(self) -> list[FlatAxis]:
+        """World axes along which all training transmitters, and all elements, stand within a centimetre."""
+        elements = []
+        for receiver in self.receivers:
+            elements.append(receiver.pose.to(self.lower).world(receiver.array.elements.to(self.lower)))
+        least = 0.01  # [m]; tripods are set up no better
+        transmitters, receivers = torch.stack((self.lower, self.upper)), torch.cat(elements)
+        found = []
+        for axis in range(3):
+            own, other = transmitters[:, axis], receivers[:, axis]
+            if own.max() - own.min() < least and other.max() - other.min() < least:
+                middles = own.mean().item(), other.mean().item()
+                found.append(FlatAxis(axis, *middles, abs(middles[0] - middles[1]) < least))
+        return found
 
     @property
     def height(self) -> float:
@@ -103,7 +146,7 @@ class Scene:
                 name: getattr(self, name)
                 for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors")
             },
-            "frame": self.frame and tuple(self.frame),
+            "frame": self.frame and (int(self.frame.epsg), float(self.frame.x), float(self.frame.y)),
         }
 
     @classmethod
@@ -113,8 +156,12 @@ class Scene:
             Receiver(r["name"], Pose(r["position"], r["rotation"]), Array(r["elements"], r["pattern"]))
             for r in state["receivers"]
         )
-        task, frame = registry("task").build(state["task"]), state.get("frame")
-        return cls(**state | {"receivers": receivers, "task": task, "frame": frame and Frame(*frame)})
+        task, frame = registry("task").build(state["task"]), None
+        try:
+            frame = state.get("frame") and Frame(*state["frame"])
+        except ValueError as error:  # of a checkpoint from before frames were checked
+            log.warning("predictions have no place on a map: %s", error)
+        return cls(**state | {"receivers": receivers, "task": task, "frame": frame})
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:

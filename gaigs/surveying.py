@@ -1,7 +1,5 @@
 """Survey planning: where to measure next, and which measured places could have been left out."""
 
-import csv
-import io
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,8 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from gaigs.geometry import Frame, even_places
-from gaigs.io.files import write_text
-from gaigs.io.tables import read_points
+from gaigs.io.tables import read_points, write_csv
 from gaigs.kriging.kernel import LIMIT, Process, kernel
 from gaigs.kriging.links import chance_to_hear, coordinates, distances
 from gaigs.model import Model, call_optional
@@ -22,6 +19,7 @@ from gaigs.query import Query, as_positions, evenly
 from gaigs.registry import call, check_type
 from gaigs.report import style
 from gaigs.runs import load
+from gaigs.stages import track
 
 POINTS = 1000
 """Approximate number of candidates, and of places at which the error is stated, of a region."""
@@ -90,11 +88,10 @@ class SurveyPlan:
 
         With a ``frame`` it has easting and northing too. Without a model errors are empty.
         """
-        table, frame = io.StringIO(), self.frame
-        rows = csv.writer(table, lineterminator="\n")
-        rows.writerow(["use", "x", "y", "z", *([] if frame is None else ["easting", "northing"]), "mean_error"])
+        frame = self.frame
+        rows = [["use", "x", "y", "z", *([] if frame is None else ["easting", "northing"]), "mean_error"]]
         on_map = lambda x, y, z: () if frame is None else (frame.x + x, frame.y + y)
-        row = lambda use, place, word: rows.writerow([use, *(f"{x:.3f}" for x in (*place, *on_map(*place))), word])
+        row = lambda use, place, word: rows.append([use, *(f"{x:.3f}" for x in (*place, *on_map(*place))), word])
         words = [""] * len(self.places)
         if self.errors is not None:
             words = [f"{error:.6g}" for error in self.errors[1:].tolist()]
@@ -103,7 +100,7 @@ class SurveyPlan:
         known, losses = self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist()
         for place, loss in zip(known, losses, strict=True):
             row("leave out", place, f"{self.known_error + loss:.6g}")
-        write_text(Path(path), table.getvalue())
+        write_csv(Path(path), rows)
 
 
 @torch.no_grad()
@@ -207,7 +204,7 @@ def survey(
 
     chosen, errors = [], [error(posteriors)]
     free = torch.ones(len(places), dtype=torch.bool)
-    for _ in range(min(count, len(places))):
+    for _ in track(range(min(count, len(places))), "places to measure"):
         gains = sum(
             own[: len(places)]
             * (own[stated] @ part[stated, : len(places)].square())
@@ -231,7 +228,7 @@ def survey(
 
 def run(config: dict, folder: Path) -> None:
     """Plans a survey, by the model of a finished run if given; writes ``survey.csv`` and ``survey.png``."""
-    model = None if config["folder"] is None else load(config["folder"])
+    model = None if config["folder"] is None else load(config["folder"], config["trust"])
     options = dict(config["survey"])
     if isinstance(options["candidates"], str):
         options["candidates"] = read_points(Path(options["candidates"]), "xyz", "x,y,z [m] of one candidate a line")
@@ -365,7 +362,8 @@ def without(
         return mean_of_heard(torch.stack(parts), hears)
 
     losses = known.new_zeros(len(known))
-    for process, own, place, variance, likely in zip(processes, rows, which, prior, hears, strict=True):
+    parts = zip(processes, rows, which, prior, hears, strict=True)
+    for process, own, place, variance, likely in track(parts, "places to leave out", len(processes)):
         left, root = process.whitened(asked, own)
         deviations = ((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt()
         weights = torch.linalg.solve_triangular(root.mT, left, upper=True)

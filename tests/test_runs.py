@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -19,16 +20,18 @@ import yaml
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs import configuration, runs
+from gaigs import checkpoint, configuration, runs
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.geometry import Pose
+from gaigs.io.files import atomic_write
 from gaigs.placement.mirrored.channel_search import SLABS, ChannelSearch
 from gaigs.processes import Stopped, stopping
 from gaigs.radio_maps import RadioMap
 from gaigs.registry import registry
 from gaigs.report.curves import read_curves
 from gaigs.runs import evaluation
+from gaigs.runs.folder import claim
 from gaigs.testing import example_links
 from gaigs.training.descent import Descent
 
@@ -326,6 +329,30 @@ def test_a_folder_without_a_checkpoint_is_free(tmp_path):
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["seed"] == 0
 
 
+@pytest.mark.parametrize("name", ["[bold]x", "runs[/red]"])
+def test_the_name_of_a_folder_is_no_markup(name, tmp_path, capsys):
+    runs.run(configure("model=mean"), tmp_path / name)
+    assert capsys.readouterr().out.endswith(f"results: {tmp_path / name}\n")
+
+
+def test_the_name_of_a_split_is_no_markup():
+    task = gaigs.links("synthetic_rssi", transmitters=10, order=0).task
+    scores = {"mean": task.scores(torch.zeros(3), torch.ones(3))}
+    assert "on split folder[/red]." in str(evaluation.Evaluation(task, "folder[/red]", scores, "cpu"))
+
+
+def test_files_that_a_killed_writer_left_are_removed(tmp_path):
+    config = configure("trainer.max_steps=1")
+    claim(tmp_path, config)
+    for place in (tmp_path / "figures", tmp_path / "members" / "1"):
+        place.mkdir(parents=True)
+    for name in ("last.ckpt", "figures/loss.png", "members/1/best.ckpt"):
+        writer = atomic_write(tmp_path / name)
+        writer.__enter__().write_bytes(b"cut")
+        claim(tmp_path, config)
+        assert not [*tmp_path.rglob("*.part*")]
+
+
 @pytest.mark.parametrize("name", ["config.yaml", "predictions.npz", "figures"])
 def test_a_folder_of_something_else_is_left_alone(name, tmp_path):
     (tmp_path / name).write_text("my: own\n")
@@ -535,6 +562,23 @@ class OwnMean(Mean):
 """
 
 
+LEVEL = """
+import gaigs
+import torch
+from gaigs.model import Model, Prediction
+from plugins.other import LEVEL
+
+@gaigs.register("model", "own_level")
+class OwnLevel(Model):
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.level = torch.nn.Parameter(torch.tensor(-50.0))
+
+    def forward(self, batch):
+        return Prediction(self.level * torch.ones(len(batch)), {})
+"""
+
+
 def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch, caplog):
     (tmp_path / "plugins").mkdir()
     own, other = tmp_path / "plugins/own.py", tmp_path / "plugins/other.py"
@@ -562,6 +606,41 @@ def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch, caplog):
     assert not caplog.text
     (tmp_path / "plugins/unrelated.py").write_text("")
     runs.folder.claim(folder, config)
+
+
+@pytest.mark.parametrize("name", ["own_mean", "own_level"])
+def test_a_plug_in_is_imported_if_it_is_the_recorded_one_or_trusted(name, tmp_path, monkeypatch, caplog):
+    """A look-up by the digests of its folder; a trained model by those of its checkpoint, or of an old one's folder."""
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins/other.py").write_text("LEVEL = 1")
+    (tmp_path / f"plugins/{name}.py").write_text(PLUGIN if name == "own_mean" else LEVEL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    monkeypatch.setattr(registry("model"), "_registered", registry("model")._registered.copy())
+    words = "data=synthetic_rssi", "data.transmitters=30", "trainer.max_steps=1", "trainer.enable_progress_bar=false"
+    config = gaigs.compose(f"model={name}", *words, baselines=[])
+    runs.run(config, tmp_path / "run")
+    loaded = [tmp_path / "run"]
+    if name == "own_level":
+        loaded.append(tmp_path / "saved.ckpt")
+        gaigs.load(tmp_path / "run").save(loaded[-1])
+        gaigs.load(tmp_path / "run/best.ckpt")
+        content = checkpoint.read(tmp_path / "run/best.ckpt")
+        del content[checkpoint.KEY]["plugins"]
+        checkpoint.write(content, tmp_path / "run/best.ckpt")
+        with pytest.raises(ValueError, match="that was recorded with the model"):
+            gaigs.load(tmp_path / "run/best.ckpt")
+    for path in loaded:
+        gaigs.load(path)
+    (tmp_path / "plugins/other.py").write_text("LEVEL = 2")
+    for path in loaded:
+        with pytest.raises(ValueError, match=rf"plugins/{name}.py is not the source .*\n.*trust=True in gaigs.load"):
+            gaigs.load(path)
+        gaigs.load(path, trust=True).predict([[1.0, 2.0, 1.5]])
+    with pytest.raises(ValueError, match="is not the source"):
+        gaigs.run(gaigs.compose("command=survey", folder=str(tmp_path / "run")), tmp_path / "survey")
+    for module in [module for module in sys.modules if module.partition(".")[0] == "plugins"]:
+        del sys.modules[module]
 
 
 @pytest.mark.parametrize(

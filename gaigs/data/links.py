@@ -233,8 +233,9 @@ def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
     if rows.dtype == torch.bool and rows.shape == (count,):
         rows = rows.nonzero()[:, 0]
     is_whole = not (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool)
-    numbers = rows.long()
+    numbers, given = rows.long(), reprlib.repr(values)
     if not (is_whole and rows.ndim == 1 and len(rows) and ((numbers >= 0) & (numbers < count)).all()):
-        given = reprlib.repr(values)
         raise ValueError(f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got {given}")
-    return numbers.unique()
+    if len(numbers.unique()) < len(numbers):
+        raise ValueError(f"{name} must hold each row once, got {given}; a mask must be boolean, of True and False")
+    return numbers.sort().values

@@ -6,10 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-
-def is_utm(epsg: int) -> bool:
-    """True for the codes of UTM on WGS 84."""
-    return 1 <= epsg % 100 <= 60 and epsg // 100 in (326, 327)
+from gaigs.geometry import is_utm
 
 
 def find_pyproj() -> Any:

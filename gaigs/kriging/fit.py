@@ -12,9 +12,10 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.kriging.kernel import Process, kernel, kriging_weights
-from gaigs.kriging.links import PART, coordinates, distances, known_links, scale_bounds, scaled
+from gaigs.kriging.links import PART, coordinates, distances, known_links, scale_bounds, scaled, single_readings
 from gaigs.query import Query, evenly
 from gaigs.scene import Scene
+from gaigs.stages import end_in_time
 
 
 class Hyperparameters(NamedTuple):
@@ -111,13 +112,15 @@ def fit_hyperparameters(
         axes = [low + (high - low) * np.array([1, 3, 5]) / 6 for low, high in bounds]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(bounds))
         start = min(grid, key=lambda point: value(torch.from_numpy(point)).item())
-        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-6})
+        options: dict = {"options": {"ftol": 1e-6}, "callback": end_in_time}
+        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, **options)
         best, least = found.x, float(found.fun)
     return Hyperparameters(*np.exp(best).tolist()), least
 
 
 FEWEST = 10
-"""Fewest validation links that choose hyperparameters, or whether paths are kriged: fewer ones overfit."""
+"""Fewest validation links that choose hyperparameters, or whether paths are kriged, repeated readings as one: fewer
+ones overfit."""
 
 AROUND = 64
 """Training links that predict each held-out link while hyperparameters are fitted."""
@@ -137,7 +140,7 @@ def hold_out(
     out one by one, each with all that share its place.
     """
     split, query = links.split, links.query
-    validation = split.validation if len(split.validation) >= FEWEST else split.validation[:0]
+    validation = split.validation if len(single_readings(links, split.validation)) >= FEWEST else split.validation[:0]
     receiver = query.receivers[known[0]]
     train, held = (part[query.receivers[part] == receiver] for part in (split.train, validation))
     train = train if len(train) else known

@@ -23,7 +23,9 @@ from gaigs.kriging.intervals import Calibration, Estimate
 from gaigs.kriging.kernel import Process
 from gaigs.query import ROUNDING, Batch, Query, as_directions, as_subcarriers
 from gaigs.registry import check_type, registry
+from gaigs.registry.modes import usual_modes
 from gaigs.scene import Scene
+from gaigs.stages import track
 from gaigs.task.csi import Csi
 
 NUMBERS, MOST = 2**17, 1024
@@ -284,7 +286,9 @@ class Model(nn.Module):
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
         query, directions = query.to(self.device), None if directions is None else directions.to(self.device)
-        batches = (Batch(part, directions) for part in query.parts(batch_size))
+        count = math.ceil(len(query) / batch_size)
+        parts = track(query.parts(batch_size), "predictions", count, is_fixed=True)
+        batches = (Batch(part, directions) for part in parts)
         if interval is not None:
             if messages or model is not self:
                 raise ValueError("intervals are those of the labels' own subcarriers; leave frequencies out")
@@ -294,6 +298,7 @@ class Model(nn.Module):
         values = map(model._answer, batches)
         return values if chosen is None else (part[..., chosen] for part in values), shape
 
+    @usual_modes()
     @torch.no_grad()
     def _answer(self, batch: Batch) -> Tensor:
         """Values of a batch in evaluation mode; the mode stays as it was."""
@@ -304,6 +309,7 @@ class Model(nn.Module):
         finally:
             self.train(training)
 
+    @usual_modes()
     def _estimate(self, batch: Batch, interval: float) -> Estimate:
         value = self._answer(batch)
         assert self.calibration is not None

@@ -10,12 +10,22 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
 from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
-from gaigs.kriging.links import PART, at_directions, coordinates, distances, folds_of, known_links, thinned
+from gaigs.kriging.links import (
+    PART,
+    at_directions,
+    coordinates,
+    distances,
+    folds_of,
+    known_links,
+    thinned,
+    without_gross_errors,
+)
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import Model, Prediction, build_trend
 from gaigs.query import Batch, Query, evenly, thin_labels
 from gaigs.registry import name_of, register
 from gaigs.scene import Scene
+from gaigs.stages import stage
 from gaigs.task.csi import Csi
 
 NEIGHBOURS = 300
@@ -77,6 +87,8 @@ class GaussianProcess(Model):
 
     @torch.no_grad()
     def _fit(self, links: Links, chooses: bool) -> None:
+        if self.scalar:
+            links = without_gross_errors(links)
         self.links, self.known = links, known_links(links)
         for trend in self.trends if chooses else (self.trend,):
             trend.fit(links)
@@ -108,10 +120,11 @@ class GaussianProcess(Model):
         query, process = links.query[index], self.scalar[0]
         left = lambda trend: (links.labels[index] - trend(Batch(query)).value).double()
         known, folds = (coordinates(self.scene, query, 1.0), query.receivers), folds_of(links, index)
-        if chooses:
-            self.chosen = process.fit(*known, [left(trend) for trend in self.trends], folds)
-        else:
-            process.refit(*known, left(self.trend), folds)
+        with stage("gaussian_process", len(self.trends) + 4 if chooses else 1):
+            if chooses:
+                self.chosen = process.fit(*known, [left(trend) for trend in self.trends], folds)
+            else:
+                process.refit(*known, left(self.trend), folds)
         process.solve(*known, left(self.trend))
 
     @property

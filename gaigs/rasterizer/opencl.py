@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gaigs.projection import Plane, Splats
 from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
-from gaigs.rasterizer.devices import cause_of, find_fault, name_of, open_queue
+from gaigs.rasterizer.devices import cause_of, find_fault, is_forked, name_of, open_queue
 from gaigs.registry import register
 
 ROWS, COLUMNS = 16, 8
@@ -60,10 +60,10 @@ class OpenCLRasterizer:
     def takes(
         self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
     ) -> bool:
-        """True if dtypes, devices and counts suit."""
+        """True if dtypes, devices and counts suit, and OpenCL works in this process."""
         floats = splats.means2d, splats.factors, splats.depths, signal, opacities, attenuations, plane.u, plane.v
         suits = (x is None or (x.dtype == torch.float32 and x.device.type == "cpu") for x in floats)
-        return all(suits) and signal.shape[2] >= 1 and signal.shape[1] < SPLATS
+        return not is_forked() and all(suits) and signal.shape[2] >= 1 and signal.shape[1] < SPLATS
 
     def __call__(
         self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
@@ -215,8 +215,8 @@ class _Render:
     def forward(self, differentiate):
         """The map and the transmittance; to ``differentiate``, checkpoints for the way back are kept."""
         sizes = self.sizes
-        image = torch.empty(sizes.transmitters, self.channels, sizes.height, sizes.width)
-        left = torch.empty(sizes.transmitters, sizes.height, sizes.width)
+        image = torch.empty(sizes.transmitters, self.channels, sizes.height, sizes.width, dtype=torch.float32)
+        left = torch.empty(sizes.transmitters, sizes.height, sizes.width, dtype=torch.float32)
         outputs = self._share(image), self._share(left)
         ends, checkpoints, bounds = self._empty(sizes.groups * self.tiles), None, None
         if differentiate:
@@ -235,7 +235,7 @@ class _Render:
         partials = self._empty(self.groups_per_list * sizes.entries * self.partials)
         self._run("backward", sizes.groups * self.tiles, *self.scene, *self.path, *images, partials)
         shapes = (n, 2), (sizes.sets, n, 3), (b, n, self.channels), (b, n), (b, n) if self.attenuates else None
-        gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
+        gradients = [None if shape is None else torch.empty(shape, dtype=torch.float32) for shape in shapes]
         outputs = [self._share(gradient) for gradient in gradients]
         *_, entries, geometry, appearance = self.scene
         inverse = self.order, self.bounds, self.path[0], entries, geometry, appearance

@@ -1,6 +1,7 @@
 """Checks of places, walls and arrays: other units, other frames, receivers in twos."""
 
 import itertools
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,7 +11,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 
 from gaigs.data.checks.finding import Finding
-from gaigs.query import evenly
+from gaigs.query import Query, evenly
 
 
 def check_places(links: Any) -> Iterator[Finding]:
@@ -23,32 +24,50 @@ def check_places(links: Any) -> Iterator[Finding]:
             f"{len(receivers)} receivers have {len(links)} links: models are learnt for each",
             "give a fixed receiver one place for all its links",
         )
-    sites = links.query.transmitters.unique(dim=0)
+    sites = sites_of(links.query)
     given = _given(links)
     stands = _stands(links)
     near = (torch.cdist(sites.double(), stands[given].double()) < 0.01).any(1)
     if len(sites) > 1 and near.any():
         text = f"{int(near.sum())} places are where a receiver stands"
         yield Finding("places at a receiver", text)
+    if links.task.is_scalar:  # antennas of one mast may share their place; levels show whether they do
+        return
     for a, b in itertools.combinations(given, 2):
-        if (stands[a] - stands[b]).norm() < 0.01:
+        turned = (receivers[a].pose.rotation - receivers[b].pose.rotation).norm()
+        if (stands[a] - stands[b]).norm() < 0.01 and turned < 0.01:
             text = f"{receivers[a].name} and {receivers[b].name} stand at one place"
             yield Finding("receivers at one place", text)
 
 
 def check_extent(links: Any) -> Iterator[Finding]:
     """Findings about an unusual extent of the places, and receivers far from all of them."""
-    sites = links.query.transmitters.unique(dim=0)
+    sites = sites_of(links.query)
     given = _given(links)
-    span = (sites.amax(0) - sites.amin(0)).max().item()
-    if links.frame is None and not 0.3 <= span <= 1000.0:  # usual extents of a measured room [m]
-        yield Finding("unit of places", f"places span {span:.3g} m", "are they in mm, cm or km?")
+    extent = sites.amax(0) - sites.amin(0)
+    span = extent.max().item()
+    across = extent[:2].max().item()
+    x, y = sites[:, :2].mean(0).tolist()
+    is_global = abs(x) <= 180 and abs(y) <= 90 and math.hypot(x, y) > 30 * across > 0
+    if links.frame is None and is_global and across < 0.3:
+        text = f"x and y of places span {across:.2g} m around ({x:.7g}, {y:.7g})"
+        yield Finding("unit of places", text, "are they degrees? convert them to metres, as data=rssi_wide does")
+    elif links.frame is None and span < 0.3:  # less than a table
+        yield Finding("unit of places", f"places span {span:.3g} m", "are they in km or degrees?")
     if len(sites) > 1 and given:
         stands = _stands(links)[given]
         closest = torch.cdist(sites.double(), stands.double()).min().item()
         if closest > 10 * max(span, 1e-6):
             text = f"receivers are {closest:.3g} m from all places, which span {span:.3g} m"
             yield Finding("receivers far away", text, "are units and origin alike?")
+
+
+def sites_of(query: Query) -> Float[Tensor, "k 3"]:
+    """The different places of transmitters."""
+    _, which = query.place_keys.unique(return_inverse=True)
+    sites = query.transmitters.new_zeros((int(which.max()) + 1, 3))
+    sites[which] = query.transmitters
+    return sites
 
 
 def check_arrays(links: Any) -> Iterator[Finding]:
