@@ -18,8 +18,8 @@ from pathlib import Path
 
 import torch
 from limits import WAYS, Ceiling, compositor
+from scenes import SCENES, Truth, passes
 
-from gaigs.benchmark.scenes import SCENES, Truth, passes
 from gaigs.io.files import write_text
 from gaigs.registry import registry
 from gaigs.report.table import markdown

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import pyopencl as cl
 import torch
+from scenes import DrawnScene, common, passes
 
-from gaigs.benchmark.scenes import DrawnScene, common, passes
 from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST, opencl
 from gaigs.registry import registry
 from gaigs.report.table import markdown

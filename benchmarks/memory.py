@@ -13,8 +13,8 @@ import re
 from pathlib import Path
 
 import torch
+from scenes import common, passes
 
-from gaigs.benchmark.scenes import common, passes
 from gaigs.registry import registry
 from gaigs.report.table import markdown
 

@@ -13,8 +13,7 @@
 
 import importlib
 import inspect
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,7 +43,6 @@ if TYPE_CHECKING:
     from gaigs.task import Metric
     from gaigs.viewing import View, view
 
-log = logging.getLogger(__name__)
 
 PLACES = {
     "links": "data.links", "train": "runs.training", "evaluate": "runs.evaluation", "load": "runs",
@@ -85,13 +83,12 @@ def __dir__() -> list[str]:
 
 
 @usual_modes()
-def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = ()) -> dict | None:
+def run(configuration: Mapping, folder: str | Path) -> dict | None:
     """Executes the command of a configuration, as ``python -m gaigs`` does; resumes a run that was stopped.
 
     Args:
         configuration: The result of ``gaigs.compose``.
         folder: Gets the results; with ``command=train`` the run folder of docs/start.md.
-        overrides: With ``command=benchmark``: further command-line words of each of its trainings.
 
     Returns:
         With ``command=train`` the contents of ``metrics.json``, or None in all but the first of several processes.
@@ -128,10 +125,10 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
         return None
     configurations.check(config)
     with call("figures", figure_formats, config["figures"]):
-        return _execute(config, folder, overrides)
+        return _execute(config, folder)
 
 
-def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | None:
+def _execute(config: dict, folder: Path) -> dict | None:
     """Executes the command of a checked configuration."""
     from gaigs import processes
 
@@ -140,17 +137,6 @@ def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | Non
             from gaigs import runs
 
             return runs.run(config, folder)
-        case "benchmark":
-            from gaigs.registry import registry
-
-            limits = {key: config["benchmark"].get(key) for key in ("minutes", "device")}
-            options = {key: value for key, value in config["benchmark"].items() if key not in limits}
-            with processes.limited_threads(config["threads"]):
-                benchmark = registry("benchmark").build(options)
-                folder.mkdir(parents=True, exist_ok=True)
-                with processes.only_run(folder):
-                    benchmark.run(folder, overrides, **limits)
-            log.info("results: %s", folder)
         case "agreement" | "describe" | "survey" | "locate" | "export" as command:
             from gaigs import agreement, describing, exporting, locating, stages, surveying
 
@@ -167,6 +153,6 @@ def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | Non
             with processes.limited_threads(config["threads"]):
                 viewing.run(config)
         case unknown:
-            known = "train, benchmark, agreement, describe, survey, locate, export, view or devices"
+            known = "train, agreement, describe, survey, locate, export, view or devices"
             raise ValueError(f"command must be {known}, got {unknown!r}")
     return None

@@ -40,7 +40,6 @@ def run(config: DictConfig) -> float | None:
     if command in ("agreement", "describe", "survey", "locate", "export", "view"):
         goes_on = "the same command starts anew"
     words = OmegaConf.to_container(settings.overrides.task)
-    overrides = [word for word in words if not word.lstrip("+~").startswith(("command=", "benchmark=", "benchmark."))]
     jobs = settings.launcher.get("n_jobs", 1) if is_sweep else 1
     processes.keep_memory()
     try:
@@ -49,7 +48,7 @@ def run(config: DictConfig) -> float | None:
             plain = {"command": command} if command == "devices" else configuration.resolve(config)
             note_task(words, plain)
             with processes.limited_threads(None, jobs):
-                metrics = gaigs.run(plain, folder, overrides)
+                metrics = gaigs.run(plain, folder)
     except KeyboardInterrupt as stop:
         message = f"gaigs: {str(stop) or 'stopped'}; {goes_on}"
         number = getattr(stop, "number", signal.SIGINT)

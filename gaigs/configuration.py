@@ -36,7 +36,7 @@ HARMLESS = (
 )  # fmt: skip
 """Keys that change no result: a run may be resumed with other values."""
 
-MAY_BE_NULL = ("gaussians", "density", "benchmark", "projection", "rasterizer")
+MAY_BE_NULL = ("gaussians", "density", "projection", "rasterizer")
 """Optional parts."""
 
 KEYS = {
@@ -54,7 +54,7 @@ CHOSEN = (*KINDS, "gaussians", "density", "trainer")
 READ_BY_LINKS = ("data", "split", "task")
 """Keys that ``gaigs.links`` reads."""
 
-CONSTRUCTED = tuple(kind for kind in KINDS if kind not in ("task", "training", "benchmark"))
+CONSTRUCTED = tuple(kind for kind in KINDS if kind not in ("task", "training"))
 """Kinds whose components need no configuration file: the options are read from their constructors."""
 
 
@@ -150,12 +150,7 @@ def check(config: dict) -> None:
         raise ValueError(f"the configuration needs the key {missing[0]!r}; conf/config.yaml has them all")
     for key, annotation in KEYS.items():
         check_type(key, config.get(key), annotation)
-    benchmark = config.get("benchmark")
-    if (benchmark is not None) != (config["command"] == "benchmark"):
-        if benchmark is None:
-            raise ValueError("command=benchmark needs a benchmark; add benchmark=accuracy, budgets, rasterizer or step")
-        raise ValueError(f"benchmark={benchmark.get('name')} needs command=benchmark")
-    for kind in KINDS[: KINDS.index("benchmark")]:
+    for kind in KINDS:
         if config.get(kind) is not None:
             check_type(f"{kind}.name", config[kind].get("name"), str)
     task = {"name": str, "trend": dict | None, "baselines": list[dict | str]}
@@ -330,7 +325,7 @@ def explain(error: Exception) -> str | None:
             has = [str(name) for name in cause.parent_node]
             part = f"{place} {cause.parent_node['name']!r}" if "name" in has else place or "the configuration"
             plain: Any = OmegaConf.to_container(cause.parent_node)
-            parts = () if place else plain.keys() - {"hydra", "survey", "locate", "export", "view", "benchmark"}
+            parts = () if place else plain.keys() - {"hydra", "survey", "locate", "export", "view"}
             inner = sorted(full for full in _options(plain, parts) if full.rpartition(".")[2] == word)
             if inner and word != "name":
                 return f"{part} has no key {word!r}; did you mean {' or '.join(inner)}?"

@@ -27,7 +27,7 @@ from gaigs.registry.modes import usual_modes
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
-    "model", "training", "benchmark",
+    "model", "training",
 )  # fmt: skip
 """Kinds of components; each is a folder of gaigs and of conf."""
 

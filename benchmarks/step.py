@@ -1,4 +1,11 @@
-"""A training step: the time of its parts, and of the whole of it."""
+"""The time of a training step and of its parts.
+
+    python benchmarks/step.py
+    python benchmarks/step.py rasterizer=torch --repeats 50
+
+Overrides are those of a run. The training has no density control, validation, logs or checkpoints.
+Parts follow each other without gaps.
+"""
 
 import warnings
 from collections import Counter, defaultdict
@@ -6,12 +13,12 @@ from collections.abc import Iterator, Sequence
 
 import lightning
 import torch
+from common import Benchmark, Row, command_line, grouped, median_and_spread, now, positive, table
 from lightning.pytorch.callbacks import Callback
 from torch.autograd.graph import register_multi_grad_hook
 
-from gaigs.benchmark import Benchmark, Context, Row, grouped, median_and_spread, now, table
 from gaigs.data import load
-from gaigs.registry import register, registry
+from gaigs.registry import registry
 from gaigs.runs.training import count_gaussians, make_trainer
 from gaigs.training.batches import Batches
 from gaigs.training.budget import make_budget
@@ -30,30 +37,19 @@ Every other step is divided; the last line shows the undivided steps. A spread i
 """
 
 
-@register("benchmark", "step")
-class StepBenchmark(Benchmark):
-    """Trains the configuration of the command line, and divides every other step into its parts.
-
-    The training has no density control, validation, logs or checkpoints. Parts follow each other without gaps.
-
-    Args:
-        repeats: Divided steps, and as many undivided ones.
-    """
+class Step(Benchmark):
+    """Trains the configuration of the command line, and divides every other step into its parts."""
 
     name = "step"
     keys = ("device", "overrides", "part")
     values = ("ms", "spread_ms", "share", "repeats", "rasterizer", "gaussians", "places")
 
-    def __init__(self, repeats: int = 30):
-        if repeats < 1:
-            raise ValueError(f"benchmark.repeats must be at least 1, got {repeats}")
-        self.repeats = repeats
+    def cells(self, device: str) -> Iterator[list[Row]]:
+        overrides = " ".join(self.options.overrides)
+        yield [{"overrides": overrides, "part": part} for part in PARTS]
 
-    def cells(self, context: Context) -> Iterator[list[Row]]:
-        yield [{"overrides": " ".join(context.overrides), "part": part} for part in PARTS]
-
-    def measure(self, cell: Sequence[Row], context: Context) -> Iterator[dict]:
-        times, sizes = train(context.compose(), self.repeats, context.device)
+    def measure(self, cell: Sequence[Row], device: str) -> Iterator[dict]:
+        times, sizes = train(self.config, self.options.repeats, device)
         whole, _ = median_and_spread(times["whole step"])
         for row in cell:
             seconds = times[row["part"]] or [0.0]
@@ -64,7 +60,7 @@ class StepBenchmark(Benchmark):
     def tables(self, rows: Sequence[Row]) -> str:
         parts = [INTRODUCTION]
         for (overrides, device), own in grouped(rows, "overrides", "device").items():
-            command = f"python -m gaigs command=benchmark benchmark=step {overrides}".rstrip()
+            command = f"python benchmarks/step.py {overrides}".rstrip()
             about = "{rasterizer}, {gaussians} Gaussians, {places} places a step, medians of {repeats} steps"
             columns = {"part": "part", "ms": "ms", "spread": "spread_ms", "share": "share"}
             parts.append(f"```\n{command}\n```\n\n{device}; {about.format(**own[0])}:\n\n{table(own, columns)}")
@@ -147,7 +143,7 @@ def train(config: dict, repeats: int, device: str) -> tuple[dict[str, list[float
     """Seconds of each step by part; and the rasterizer, the number of Gaussians and that of places a step."""
     if not config["model"].get("rasterizer") or "deformation" not in config["model"]:
         raise ValueError(
-            f"benchmark=step needs a model with a deformation and a rasterizer, got model={config['model']['name']}; "
+            f"a step needs a model with a deformation and a rasterizer, got model={config['model']['name']}; "
             "take model=gaigs, or for mirrored Gaussians add rasterizer=fastest projection=mercator"
         )
     lightning.seed_everything(config["seed"], verbose=False)
@@ -167,3 +163,14 @@ def train(config: dict, repeats: int, device: str) -> tuple[dict[str, list[float
         trainer.fit(module, Batches(links, links.split.train, module.batch_size, config["seed"], steps))
     sizes = {"gaussians": count_gaussians(model), "places": module.batch_size}
     return watch.times, sizes | {"rasterizer": rasterizer.used}
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    parser = command_line(__doc__)
+    text = "divided steps, and as many undivided ones"
+    parser.add_argument("--repeats", type=positive, default=30, help=text)
+    Step(parser.parse_intermixed_args(words)).run()
+
+
+if __name__ == "__main__":
+    main()

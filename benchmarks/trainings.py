@@ -1,8 +1,8 @@
-"""Benchmarks whose rows are whole runs, each in a folder of its own."""
+"""Benchmarks whose rows are whole runs, each in a folder of its own: ``accuracy.py``, ``budgets.py``."""
 
+import argparse
 import gc
 import json
-import logging
 import math
 import re
 import shlex
@@ -10,99 +10,132 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import common
+import yaml
+from common import UNAVAILABLE, Benchmark, Row, grouped, log
 from omegaconf import OmegaConf
 
-from gaigs import runs
-from gaigs.benchmark import UNAVAILABLE, Benchmark, Context, Row, grouped
+import gaigs
 from gaigs.configuration import run_folder
 from gaigs.data import load
 from gaigs.processes import lacks_memory
-from gaigs.registry import check_type
+from gaigs.registry import listed
 from gaigs.report.curves import read_validations
 from gaigs.report.runs import train_seconds
 from gaigs.report.systems import COSTS
 from gaigs.report.table import monitor_names, task_class
 
-log = logging.getLogger(__name__)
+
+class Axis(NamedTuple):
+    """Runs that differ in one key.
+
+    Attributes:
+        of: Overrides of the reference.
+        key: The key.
+        values: Its values; None: multiples of a default of whole numbers; none: no such runs.
+    """
+
+    of: list[str]
+    key: str
+    values: list | None = None
+
+
+def command_line(doc: str) -> argparse.ArgumentParser:
+    """The options of benchmarks of runs."""
+    parser = common.command_line(doc)
+    text = "values of an axis instead of its own; [] leaves it out"
+    add = parser.add_argument
+    add("--values", action="append", type=values_of_axis, default=[], metavar="AXIS=[...]", help=text)
+    return parser
+
+
+def values_of_axis(text: str) -> tuple[str, list]:
+    """Name and values of an axis, as a type of ``argparse``."""
+    name, _, value = text.partition("=")
+    found = yaml.safe_load(value)
+    if not isinstance(found, list):
+        raise ValueError
+    return name, found
 
 
 class Trainings(Benchmark):
     """Rows are runs that differ from a reference in one key.
 
-    Args:
-        trainer: Options of ``trainer`` for each run; the command line has precedence.
-        axes: By name: ``key``, its ``values``, and the reference ``of``, a list of overrides.
-        factors: Values of an axis without ``values``, in multiples of a default of whole numbers.
+    Attributes:
+        trainer: Overrides of ``trainer`` for each run; the command line has precedence.
+        axes: Axes by name.
+        scene: Overrides of the command line but those of ``trainer``.
     """
 
     keys = ("device", "scene", "trainer", "of", "key", "default", "axis", "value")
     values = ("task", "split", "seed", "steps", "validation", "test", "compared", *COSTS, "curve")
+    trainer: tuple[str, ...] = ()
+    axes: dict[str, Axis]
 
-    def __init__(self, trainer: dict, axes: dict[str, dict], factors: Sequence[float] = ()):
-        self.trainer, self.axes, self.factors = trainer, axes, factors
-        for name, axis in axes.items():
-            if axis.keys() | {"values"} != {"key", "of", "values"}:
-                raise ValueError(f"benchmark.axes.{name} must have key, of and values, got {', '.join(axis)}")
-            for part, kind in (("key", str), ("of", list[str]), ("values", list | None)):
-                check_type(f"benchmark.axes.{name}.{part}", axis.get(part), kind)
+    def __init__(self, options: argparse.Namespace):
+        super().__init__(options)
+        key_of = lambda word: word.lstrip("+~").partition("=")[0]
+        given = {key_of(word): word for word in options.overrides}
+        own = {key: word for key, word in given.items() if key.startswith("trainer.")}
+        self.scene = [word for word in options.overrides if key_of(word) not in own]
+        self.trainer = tuple(({key_of(word): word for word in self.trainer} | own).values())
+        self.axes = dict(self.axes)
+        for name, values in options.values:
+            if name not in self.axes:
+                raise ValueError(f"--values: no axis {name!r}; there are: {listed([*self.axes])}")
+            self.axes[name] = self.axes[name]._replace(values=values)
 
-    def reference(self, context: Context) -> dict:
-        """The configuration of the command line; raises an error for one without validation links."""
-        config = context.compose()
+    def check_links(self) -> None:
+        """Raises an error for data without validation links."""
+        config = self.config
         split = load(config["data"], config["split"], config["task"]["name"]).split
         if not len(split.validation):
             raise ValueError(f"split {split.name} must have validation links; set split.validation above 0")
-        return config
 
-    def options(self, context: Context) -> list[str]:
-        """Overrides of the trainer, without those of the command line."""
-        given = {word.lstrip("+~").partition("=")[0] for word in context.overrides}
-        options = {f"trainer.{key}": value for key, value in self.trainer.items()}
-        return [f"{key}={written(value)}" for key, value in options.items() if key not in given]
-
-    def compose(self, context: Context, overrides: Sequence[str]) -> dict:
+    def compose(self, device: str, overrides: Sequence[str]) -> dict:
         """The configuration of a run; look-ups are runs of their own, so it has no baselines."""
-        return context.compose(
-            *self.options(context), f"trainer.accelerator={context.device}", "baselines=[]", *overrides
-        )
+        words = (*self.scene, *self.trainer, f"trainer.accelerator={device}", "baselines=[]")
+        return gaigs.compose(*words, *overrides)
 
-    def cell(self, context: Context, of: Sequence[str], **keys: str) -> list[Row]:
+    def cell(self, of: Sequence[str], **keys: str) -> list[Row]:
         """The cell of one run."""
-        common = {"scene": " ".join(context.overrides), "trainer": " ".join(self.options(context))}
-        return [common | {"of": shlex.join(of), "default": ""} | keys]
+        row = {"scene": " ".join(self.scene), "trainer": " ".join(self.trainer)}
+        return [row | {"of": shlex.join(of), "default": ""} | keys]
 
-    def cells_of_axes(self, context: Context) -> Iterator[list[Row]]:
+    def cells_of_axes(self, device: str) -> Iterator[list[Row]]:
         """Cells of each axis whose key the reference has."""
         for name, axis in self.axes.items():
+            if axis.values == []:
+                continue
             try:
-                default = OmegaConf.select(OmegaConf.create(self.compose(context, axis["of"])), axis["key"])
+                config = OmegaConf.create(self.compose(device, axis.of))
             except ValueError as error:
-                raise ValueError(f"benchmark.axes.{name} (~benchmark.axes.{name} leaves it out): {error}") from error
+                raise ValueError(f"axis {name} (--values {name}=[] leaves it out): {error}") from error
+            default = OmegaConf.select(config, axis.key)
             if default is None:
-                log.info("%s: %s is left out: this configuration has no %s", self.name, name, axis["key"])
+                log.info("%s is left out: this configuration has no %s", name, axis.key)
                 continue
             if OmegaConf.is_config(default):
                 default = [*default] if OmegaConf.is_list(default) else default.get("name")
-            values = axis.get("values") or multiples(default, self.factors)
+            values = axis.values or multiples(default, self.options.factors)
             if not values:
-                raise ValueError(f"benchmark.axes.{name} needs values, a list for {axis['key']}")
+                raise ValueError(f"axis {name} needs values, a list for {axis.key}")
             for value in values if default in values else [*values, default]:
-                keys = {"axis": name, "key": axis["key"], "value": written(value), "default": written(default)}
-                yield self.cell(context, axis["of"], **keys)
+                keys = {"key": axis.key, "value": written(value), "default": written(default)}
+                yield self.cell(axis.of, axis=name, **keys)
 
-    def measure(self, cell: Sequence[Row], context: Context) -> Iterable[dict]:
+    def measure(self, cell: Sequence[Row], device: str) -> Iterable[dict]:
         """Trains and tests, or reads the run that has ended in its folder."""
         (row,) = cell
         words = overrides_of(row)
         places = row["device"], f"{row['scene']} {row['trainer']}".strip(), ",".join(words)
-        folder = context.folder.joinpath(self.name, *map(run_folder, places))
+        folder = self.options.folder.joinpath(self.name, *map(run_folder, places))
         log.info("%s: %s %s", self.name, row["axis"], " ".join(words))
         try:
-            metrics = runs.run(self.compose(context, words), folder)
+            metrics = gaigs.run(self.compose(device, words), folder)
         except Exception as error:  # of whatever system; the next one goes on
             if lacks_memory(error) or (isinstance(error, OSError) and not isinstance(error, FileNotFoundError)):
                 raise
-            log.debug("", exc_info=True)  # shown by hydra.verbose=true
             text = f"{type(error).__name__}: {' '.join(str(error).removeprefix('gaigs: ').split())}"
             log.error("%s: %s", " ".join(words), text)
             return [row | {"status": UNAVAILABLE + text}]
@@ -138,7 +171,7 @@ def sections(name: str, rows: Sequence[Row]) -> Iterator[tuple[str, Score, list[
     for (scene, trainer, device, task, split), own in groups.items():
         scene = re.sub(r"=[/~.]\S*/", "=", scene)  # a page shows the last part of a path
         title = ", ".join(filter(None, (task, scene, f"split {split}")))
-        command = f"python -m gaigs command=benchmark benchmark={name} {scene}".rstrip()
+        command = " ".join(filter(None, (f"python benchmarks/{name}.py", scene, trainer)))
         conditions = "; ".join(filter(None, (device, trainer)))
         yield f"## {title}\n\n{conditions}\n\n```\n{command}\n```\n", Score.of(task), own
 

@@ -1,10 +1,19 @@
-"""Seconds of training to reach a score, and the error and time of a prediction, of all systems."""
+"""Seconds of training to reach a score, and the error and time of a prediction, of all systems.
+
+    python benchmarks/accuracy.py
+    python benchmarks/accuracy.py data=synthetic_rssi trainer.max_time=00:00:00:40 --systems gaigs mirrored
+
+Trains every system, and the values of some axes, for the same time; look-ups stand beside them.
+Overrides are those of each run.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import ClassVar
 
-from gaigs.benchmark import Context, Row, grouped, number, table
-from gaigs.benchmark.trainings import Score, Trainings, sections, written
-from gaigs.registry import register, registry
+from common import Row, grouped, number, table
+from trainings import Axis, Score, Trainings, command_line, sections, written
+
+from gaigs.registry import registry
 from gaigs.report.systems import read_published
 from gaigs.report.table import monitor_names, task_class
 
@@ -19,32 +28,42 @@ accurate and faster in a prediction than those in bold. Steps are those to the l
 """
 
 
-@register("benchmark", "accuracy")
 class Accuracy(Trainings):
-    """Trains every system, and the values of some axes, for the same time; look-ups stand beside them.
-
-    Args:
-        trainer, axes: See ``Trainings``.
-        levels: Validation scores, by name of the score, to which the time is measured beside those of the look-ups.
-        systems: Models; None: all installed ones with a published name, see ``conf/published.yaml``.
-    """
+    """Rows of look-ups, of systems, and of values of the axes."""
 
     name = "accuracy"
+    trainer = (
+        "trainer.max_steps=-1",
+        "trainer.max_time=00:00:01:00",
+        "trainer.val_check_interval=00:00:00:03",
+    )
+    axes: ClassVar = {
+        "placement": Axis(["model=gaigs"], "model", ["gaigs", "mirrored"]),  # free, mirrored
+        "kriging": Axis(["model=mirrored"], "kriging", [False, True]),
+        "tokenizer": Axis(["model=gaigs"], "tokenizer", ["euclidean", "ga", "multiview"]),
+        "anchors": Axis(["model=gaigs"], "tokenizer.ga.anchors", [1, 4, 16, 64]),
+        "Gaussians": Axis(["model=gaigs"], "gaussians.count", [30, 100, 300, 1000]),
+        "planes": Axis(["model=mirrored"], "placement.planes", [6, 10, 20]),
+    }
+    levels: ClassVar = {  # of validation scores, beside those of the look-ups
+        "ssim": [0.6, 0.7, 0.8, 0.9, 0.95],
+        "mae_db": [8, 6, 5, 4, 3],
+        "sinad_db": [4, 6, 8, 10],
+    }
 
-    def __init__(
-        self, trainer: dict, axes: dict[str, dict], levels: dict[str, list[float]], systems: list[str] | None = None
-    ):
-        super().__init__(trainer, axes)
-        self.levels, self.systems = levels, systems
-
-    def cells(self, context: Context) -> Iterator[list[Row]]:
-        for config in self.reference(context)["baselines"]:
-            options = [f"++model.{key}={written(value)}" for key, value in config.items() if key != "name"]
-            yield self.cell(context, options, axis=LOOK_UPS, key="model", value=config["name"])
-        known, published = registry("model").names(), read_published()["names"]
-        for name in [name for name in published if name in known] if self.systems is None else self.systems:
-            yield self.cell(context, (), axis=SYSTEMS, key="model", value=name)
-        yield from self.cells_of_axes(context)
+    def cells(self, device: str) -> Iterator[list[Row]]:
+        self.check_links()
+        for config in self.config["baselines"]:
+            options = {key: value for key, value in config.items() if key != "name"}
+            of = [f"++model.{key}={written(value)}" for key, value in options.items()]
+            yield self.cell(of, axis=LOOK_UPS, key="model", value=config["name"])
+        systems = self.options.systems
+        if systems is None:
+            known = registry("model").names()
+            systems = [name for name in read_published()["names"] if name in known]
+        for name in systems:
+            yield self.cell((), axis=SYSTEMS, key="model", value=name)
+        yield from self.cells_of_axes(device)
 
     def tables(self, rows: Sequence[Row]) -> str:
         parts = [INTRODUCTION]
@@ -88,3 +107,15 @@ def _table(rows: Sequence[Row], levels: Mapping[str, float], score: Score) -> st
             found[title] = next((time for time, value in curve if score.loss(value) <= score.loss(level)), "")
         lines.append(row | found)
     return table(lines, columns)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    parser = command_line(__doc__)
+    text = "models; by default all that are installed and have a published name"
+    known = registry("model").names()
+    parser.add_argument("--systems", nargs="+", choices=known, metavar="MODEL", help=text)
+    Accuracy(parser.parse_intermixed_args(words)).run()
+
+
+if __name__ == "__main__":
+    main()

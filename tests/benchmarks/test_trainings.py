@@ -1,45 +1,38 @@
 """Benchmarks of whole trainings: one of a tiny system end to end, all others of trainings that are made up."""
 
-import copy
 import csv
-import functools
 
+import accuracy
+import budgets
 import pytest
-
-from gaigs import configuration, runs
-from gaigs.benchmark import Context
-from gaigs.benchmark.accuracy import Accuracy
-from gaigs.benchmark.budgets import Budgets, smallest_within
-from gaigs.benchmark.trainings import COSTS, Score, multiples, overrides_of, results, written
+from accuracy import Accuracy
+from budgets import Budgets, smallest_within
+from trainings import COSTS, Axis, Score, command_line, multiples, overrides_of, results, written
 
 TINY = (
     "data.transmitters=20", "data.order=0", "tokenizer=euclidean", "rasterizer=torch", "gaussians.count=10",
     "training.batch_size=8", "training.thinning.stride=8", "trainer.max_steps=2", "trainer.val_check_interval=1",
     "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "baselines=[{name: mean}]",
 )  # fmt: skip
-GAUSSIANS = {"Gaussians": {"of": ["model=gaigs"], "key": "gaussians.count"}}
-LOSSES = {"ratio": 0.005, "dB": 0.05}
+NO_AXES = [f"--values={name}=[]" for name in Accuracy.axes]
 
 
-def accuracy(axes=None, systems=("gaigs",), **options):
-    return Accuracy({"max_time": "00:00:01:00"}, axes or {}, {"ssim": [0.01, 0.99]}, [*systems], **options)
+def run_accuracy(folder, *words, systems=("gaigs",)):
+    accuracy.main([*TINY, *words, *NO_AXES, "--folder", str(folder), "--systems", *systems])
 
 
-def budgets(axes=GAUSSIANS, factors=(0.5, 1, 2), tolerance=LOSSES):
-    return Budgets({}, axes, [*factors], tolerance)
+def run_budgets(folder, *words):
+    budgets.main([*TINY, *words, "--folder", str(folder), "--factors", "0.5", "1", "2"])
+
+
+@pytest.fixture
+def options(tmp_path):
+    return command_line("").parse_args(["--folder", str(tmp_path)])
 
 
 def read(folder, name="accuracy"):
     with open(folder / f"{name}.csv", newline="") as file:
         return {(row["axis"], row["value"]): row for row in csv.DictReader(file)}
-
-
-compose = functools.cache(configuration.compose)
-
-
-@pytest.fixture(autouse=True)
-def composed_once(monkeypatch):
-    monkeypatch.setattr(configuration, "compose", lambda *overrides: copy.deepcopy(compose(*overrides)))
 
 
 @pytest.fixture
@@ -60,23 +53,21 @@ def fake(monkeypatch):
             metrics = dict.fromkeys(COSTS, 1.0) | {"task": "spectrum", "split": "official", "seed": config["seed"]}
             return metrics | {"models": {"own": scores}, "validation": {"own": scores}}
 
-        monkeypatch.setattr(runs, "run", run)
+        monkeypatch.setattr("gaigs.run", run)
         return trained
 
     return install
 
 
 def test_a_system_is_trained_once_and_its_run_is_read_again(tmp_path, monkeypatch):
-    accuracy(systems=["gaigs", "friis"]).run(tmp_path, TINY)
+    run_accuracy(tmp_path, systems=["gaigs", "friis"])
     rows = read(tmp_path)
     assert [*rows] == [("look-up", "mean"), ("system", "gaigs"), ("system", "friis")]
     own = rows["system", "gaigs"]
-    assert (own["status"], own["task"], own["steps"], rows["look-up", "mean"]["curve"]) == (
-        "measured",
-        "spectrum",
-        "2",
-        "",
-    )
+    assert (own["status"], own["task"], own["steps"]) == ("measured", "spectrum", "2")
+    assert "trainer.max_steps=2 trainer.max_time=00:00:01:00 trainer.val_check_interval=1 " in own["trainer"]
+    assert own["scene"] == " ".join(word for word in TINY if not word.startswith("trainer."))
+    assert rows["look-up", "mean"]["curve"] == ""
     times = [float(point.partition(":")[0]) for point in own["curve"].split()]
     assert len(times) == 2
     assert times[0] <= times[1] <= float(own["train_seconds"]) + 0.1
@@ -84,16 +75,16 @@ def test_a_system_is_trained_once_and_its_run_is_read_again(tmp_path, monkeypatc
     page = (tmp_path / "accuracy.md").read_text()
     assert "- system, friis: unavailable: " in page
     assert "GAI-GS" in page
-    monkeypatch.setattr(runs, "train_and_test", None)  # no other training
+    monkeypatch.setattr("gaigs.runs.train_and_test", None)  # no other training
     (tmp_path / "accuracy.csv").unlink()
-    accuracy().run(tmp_path, TINY)
+    run_accuracy(tmp_path)
     assert read(tmp_path)["system", "gaigs"] == own
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError("division by zero"), FileNotFoundError("no weights")], ids=repr)
+@pytest.mark.parametrize("error", [ZeroDivisionError("by zero"), FileNotFoundError("no weights")], ids=repr)
 def test_a_defect_stops_no_other_system(tmp_path, fake, error):
     trained = fake(error)
-    accuracy().run(tmp_path, TINY)
+    run_accuracy(tmp_path)
     assert trained == ["mean", "gaigs"]
     assert {row["status"] for row in read(tmp_path).values()} == {f"unavailable: {type(error).__name__}: {error}"}
 
@@ -102,46 +93,23 @@ def test_a_defect_stops_no_other_system(tmp_path, fake, error):
 def test_a_full_disk_and_a_lack_of_memory_end_it(tmp_path, fake, error):
     fake(error)
     with pytest.raises(type(error)):
-        accuracy().run(tmp_path, TINY)
+        run_accuracy(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("axis", "error", "message"),
+    ("words", "message"),
     [
-        ({"key": "seed"}, ValueError, "benchmark.axes.a must have key, of and values, got key"),
-        ({"key": "seed", "of": [], "values": 3}, TypeError, "benchmark.axes.a.values must be"),
-        ({"key": "tokenizer", "of": []}, ValueError, "benchmark.axes.a needs values"),
-        ({"key": "seed", "of": ["modl=gaigs"]}, ValueError, "~benchmark.axes.a leaves it out"),
-        ({"key": "seed", "of": [], "values": ["ga"]}, ValueError, "'ga'"),
-        ({"key": "data.name", "of": [], "values": [1]}, ValueError, "'synthetic'"),
+        (["--values=seed=[1]"], "--values: no axis 'seed'; there are: seeds_gaigs, "),
+        (["--values=seeds_gaigs=[ga]"], "'ga'"),
+        (["split.validation=0"], "must have validation links; set split.validation"),
+        ([], r"axis seeds_mirrored \(--values seeds_mirrored=\[\] leaves it out\): .*'gaussians'"),
     ],
 )
-def test_bad_axes_end_it_before_any_training(axis, error, message, tmp_path, fake):
+def test_bad_words_end_it_before_any_training(words, message, tmp_path, fake):
     trained = fake()
-    with pytest.raises(error, match=message):
-        budgets({"a": axis}).run(tmp_path, TINY)
+    with pytest.raises(ValueError, match=message):
+        run_budgets(tmp_path, *words)
     assert not trained
-
-
-@pytest.mark.parametrize(
-    ("make", "overrides", "error", "message"),
-    [
-        (accuracy, ("data=nerf2_spectrum", "data.root=/none"), FileNotFoundError, "/none"),
-        (accuracy, (*TINY[:2], "task=rssi"), ValueError, "of task 'spectrum'"),
-        (accuracy, (*TINY, "split.validation=0"), ValueError, "must have validation links; set split.validation"),
-        (lambda: budgets(tolerance={"dB": 1.0}), TINY, ValueError, "benchmark.tolerance needs the unit 'ratio'"),
-    ],
-)
-def test_bad_data_and_tolerances_end_it_before_any_training(make, overrides, error, message, tmp_path, fake):
-    trained = fake()
-    with pytest.raises(error, match=message):
-        make().run(tmp_path, overrides)
-    assert not trained
-
-
-def test_the_command_line_has_precedence():
-    assert accuracy().options(Context(None)) == ["trainer.max_time=00:00:01:00"]
-    assert accuracy().options(Context(None, ("trainer.max_time=00:00:00:05",))) == []
 
 
 def test_values_in_the_syntax_of_hydra():
@@ -191,14 +159,15 @@ def values(scores, task="spectrum", axis="Gaussians", key="gaussians.count", def
     return [row(axis, value, score, "", 3.0, **more) for value, score in scores.items()]
 
 
-def test_times_to_levels_and_the_best_rows():
+def test_times_to_levels_and_the_best_rows(options, monkeypatch):
     rows = [
         row("look-up", "knn", 0.7, 0.72, 1.0),
         row("system", "nerf2", 0.6, 0.55, 9.0, "1.5:0.5 3.0:0.6 8.0:0.55"),
         row("system", "gaigs", 0.9, 0.85, 8.0, "1.5:0.3 4.5:0.75 9.5:0.9"),
         row("planes", "6", 0.8, 0.79, 2.0, "2:0.5 5:0.8", key="placement.planes", default="10", of="model=mirrored"),
     ]
-    text = Accuracy({}, {}, {"ssim": [0.6, 0.95], "mae_db": [3]}).tables(rows)
+    monkeypatch.setattr(Accuracy, "levels", {"ssim": [0.6, 0.95], "mae_db": [3]})
+    text = Accuracy(options).tables(rows)
     assert (
         "| validation | inference [ms] | rendering [ms] | training [s] | s to 0.6 | s to `knn` 0.700 | s to 0.95 |"
         in text
@@ -210,16 +179,6 @@ def test_times_to_levels_and_the_best_rows():
         "| NeRF² | 0.550 | 0.550 | 0.600 | 9 |  |  | 3 |  |  |  | 7 |  |",
     ]
     assert "**planes**: `placement.planes` of `model=mirrored`; the default is 10\n" in text
-
-
-def test_of_errors_the_lowest_is_the_best():
-    rows = [
-        row("look-up", "knn", 4.0, 4.0, 1.0, task="rssi"),
-        row("system", "gaigs", 3.0, 3.0, 2.0, "1:5 2:3.5", task="rssi"),
-    ]
-    text = Accuracy({}, {}, {"mae_db": [5, 3.2]}).tables(rows)
-    assert "| s to 5 | s to `knn` 4 | s to 3.2 |" in text
-    assert "| **GAI-GS** | 3 | 3 | 2 |  |  | 1 | 2 |  |  | 7 |  |" in text
 
 
 @pytest.mark.parametrize(
@@ -236,12 +195,12 @@ def test_the_smallest_within_the_tolerance_is_taken(task, scores, smallest):
     score = Score.of(task)
     rows = values(scores, task)
     rows[0]["test"] = "0.99"  # test links have no say
-    assert smallest_within(rows, LOSSES[score.unit or "ratio"], score)["value"] == smallest
+    assert smallest_within(rows, Budgets.tolerance[score.unit or "ratio"], score)["value"] == smallest
 
 
-def test_budgets_show_scatter_and_the_smallest_value():
+def test_budgets_show_scatter_and_the_smallest_value(options):
     seeds = values({"0": 0.9, "1": 0.904, "2": 0.893}, axis="seeds", key="seed", default="0")
-    text = budgets().tables([*seeds, *values({"600": 0.903, "300": 0.9, "75": 0.89})])
+    text = Budgets(options).tables([*seeds, *values({"600": 0.903, "300": 0.9, "75": 0.89})])
     assert "Seeds 0, 1, 2 score 0.900, 0.904, 0.893: they scatter by 0.0110, beyond the tolerance." in text
     assert "| part | key | mean SSIM of the validation links by value | smallest within 0.005 | default now |" in text
     assert (
@@ -249,21 +208,22 @@ def test_budgets_show_scatter_and_the_smallest_value():
     )
 
 
-def test_sections_have_their_unit_conditions_and_command():
+def test_sections_have_their_unit_conditions_and_command(options):
     rows = values(
         {"60": 4.0, "90": 3.5}, "rssi", default="30", scene="data.root=/a/b/flat seed=1", trainer="trainer.x=1"
     )
-    text = budgets().tables(rows + values({"300": 0.9}))
+    text = Budgets(options).tables(rows + values({"300": 0.9}))
     assert "## rssi, data.root=flat seed=1, split official\n\ncpu; trainer.x=1\n" in text
-    assert "benchmark=budgets data.root=flat seed=1\n" in text
+    assert "python benchmarks/budgets.py data.root=flat seed=1 trainer.x=1\n" in text
     assert "smallest within 0.05 dB" in text
     assert "| **90**, the largest tried | 30 | 3, not measured |" in text
 
 
-def test_values_of_axes_are_trained_and_axes_without_a_key_left_out(tmp_path, fake):
+def test_values_of_axes_are_trained_and_axes_without_a_key_left_out(tmp_path, fake, monkeypatch):
     trained = fake(lambda config: config["model"]["gaussians"]["count"] / 100)
-    axes = GAUSSIANS | {"grid": {"of": [], "key": "pooling.grid"}}
-    budgets(axes).run(tmp_path, TINY)
+    axes = {"Gaussians": Axis(["model=gaigs"], "gaussians.count"), "grid": Axis([], "pooling.grid")}
+    monkeypatch.setattr(Budgets, "axes", axes)
+    run_budgets(tmp_path)
     assert len(trained) == 3
     text = (tmp_path / "budgets.md").read_text()
     assert (

@@ -1,13 +1,19 @@
-"""The smallest sizes that cost no accuracy on given data: one key at a time, by validation scores alone."""
+"""The smallest sizes that cost no accuracy on given data: one key at a time, by validation scores.
+
+    python benchmarks/budgets.py
+    python benchmarks/budgets.py +experiment=rssi trainer.max_steps=300 --values paths=[0,1,2]
+
+Trains each value of each axis, and marks the smallest that suffices. Overrides are those of each run.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import ClassVar
 
 import yaml
+from common import Row, grouped, number
+from trainings import Axis, Score, Trainings, command_line, sections
 
-from gaigs.benchmark import Context, Row, grouped, number
-from gaigs.benchmark.trainings import Score, Trainings, sections
-from gaigs.registry import register
 from gaigs.report.table import markdown
 
 INTRODUCTION = """# Budgets
@@ -19,27 +25,29 @@ may be better still. Times are of one run each.
 """
 
 
-@register("benchmark", "budgets")
 class Budgets(Trainings):
-    """Trains each value of each axis, and marks the smallest that suffices.
-
-    Args:
-        trainer, factors: See ``Trainings``.
-        axes: See ``Trainings``. One with the key ``seed`` shows how much scores scatter.
-        tolerance: Largest loss against the best validation score, by unit: ``dB``, or ``ratio`` for none.
-    """
+    """Rows of values of the axes; an axis of seeds shows how much scores scatter."""
 
     name = "budgets"
+    axes: ClassVar = {
+        "seeds_gaigs": Axis(["model=gaigs"], "seed", [0, 1, 2]),
+        "Gaussians": Axis(["model=gaigs"], "gaussians.count"),
+        "anchors": Axis(["model=gaigs"], "tokenizer.ga.anchors"),
+        "width": Axis(["model=gaigs"], "deformation.width"),
+        "grid": Axis(["model=gaigs"], "pooling.grid"),
+        "seeds_mirrored": Axis(["model=mirrored", "kriging=false"], "seed", [0, 1, 2]),
+        "planes": Axis(["model=mirrored", "kriging=false"], "placement.planes", [6, 8, 10, 14, 20]),
+        "paths": Axis(["model=mirrored", "kriging=false"], "placement.order", [0, 1, 2, 3]),
+        "obstacles": Axis(["model=mirrored", "kriging=false"], "placement.obstacles"),
+    }
+    tolerance: ClassVar = {"ratio": 0.005, "dB": 0.05}  # below the best validation score, by its unit
 
-    def __init__(self, trainer: dict, axes: dict[str, dict], factors: list[float], tolerance: dict[str, float]):
-        super().__init__(trainer, axes, factors)
-        self.tolerance = tolerance
-
-    def cells(self, context: Context) -> Iterator[list[Row]]:
-        unit = Score.of(self.reference(context)["task"]["name"]).unit or "ratio"
+    def cells(self, device: str) -> Iterator[list[Row]]:
+        self.check_links()
+        unit = Score.of(self.config["task"]["name"]).unit or "ratio"
         if unit not in self.tolerance:
-            raise ValueError(f"benchmark.tolerance needs the unit {unit!r}, got {', '.join(self.tolerance)}")
-        for cell in self.cells_of_axes(context):
+            raise ValueError(f"Budgets.tolerance in {__file__} needs the unit {unit!r}")
+        for cell in self.cells_of_axes(device):
             size(cell[0]["value"]), size(cell[0]["default"])  # raises before any training
             yield cell
 
@@ -94,3 +102,14 @@ def _scatter(rows: Sequence[Row], tolerance: float, unit: str) -> str:
     seeds, texts = (", ".join(parts) for parts in ([r["value"] for r in rows], [number(r["validation"]) for r in rows]))
     side = "within" if spread <= tolerance else "beyond"
     return f"Seeds {seeds} score {texts}: they scatter by {number(spread)}{unit}, {side} the tolerance."
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    parser = command_line(__doc__)
+    text = "values of an axis without values, in multiples of its default"
+    parser.add_argument("--factors", nargs="+", type=float, default=[0.125, 0.25, 0.5, 1, 2], help=text)
+    Budgets(parser.parse_intermixed_args(words)).run()
+
+
+if __name__ == "__main__":
+    main()

@@ -3,8 +3,7 @@
 import csv
 
 import pytest
-
-from gaigs.benchmark.step import PARTS, StepBenchmark
+import step
 
 BRIEF = (
     "data.transmitters=12", "data.order=0", "gaussians.count=10", "training.batch_size=3", "training.thinning.stride=8",
@@ -14,27 +13,19 @@ BRIEF = (
 
 def test_a_step_is_divided(tmp_path):
     overrides = (*BRIEF, "trainer.max_steps=-1", "trainer.max_time=00:00:00:00")
-    StepBenchmark(repeats=2).run(tmp_path, overrides)
+    step.main([*overrides, "--repeats", "2", "--devices", "cpu", "--folder", str(tmp_path)])
     with open(tmp_path / "step.csv", newline="") as file:
         rows = {row["part"]: row for row in csv.DictReader(file)}
-    assert tuple(rows) == PARTS
+    assert tuple(rows) == step.PARTS
     whole = rows["whole step"]
     assert whole | {"repeats": "2", "gaussians": "10", "places": "3", "share": "1", "rasterizer": "torch"} == whole
     assert all(float(row["ms"]) > 0 for row in rows.values())
     page = (tmp_path / "step.md").read_text()
-    assert f"python -m gaigs command=benchmark benchmark=step {' '.join(overrides)}\n" in page
+    assert f"python benchmarks/step.py {' '.join(overrides)}\n" in page
     assert "| backward: rasterizer |" in page
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["model=mean"], "benchmark=step needs a model with a deformation and a rasterizer, got model=mean"),
-        ([*BRIEF[:2], "task=rssi"], r"labels of data 'synthetic' are of task 'spectrum'.*; add task=rssi|add task="),
-        ([*BRIEF, "+trainer.limit_train_batches=0"], "trainer.limit_train_batches must be left out"),
-        ([*BRIEF, "trainer.max_epochs=0"], "trainer.max_epochs must be -1"),
-    ],
-)
-def test_runs_that_do_not_suit(overrides, message, tmp_path):
+def test_a_model_without_its_parts_is_refused(tmp_path):
+    message = "a step needs a model with a deformation and a rasterizer, got model=mean"
     with pytest.raises(ValueError, match=message):
-        StepBenchmark(1).run(tmp_path, overrides)
+        step.main(["model=mean", "--folder", str(tmp_path)])

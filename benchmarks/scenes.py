@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+from common import now
 from torch import Tensor
 
-from gaigs.benchmark import now
 from gaigs.projection import Plane, Splats
 from gaigs.rasterizer import ALPHA_MIN
 from gaigs.testing.rasterizer import (
@@ -17,7 +17,7 @@ from gaigs.testing.rasterizer import (
     footprints_of,
     rasterize_densely,
     render_with_gradients,
-)  # fmt: skip
+)
 
 
 class DrawnScene(NamedTuple):

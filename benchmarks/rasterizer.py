@@ -1,4 +1,10 @@
-"""Rasterizers: time of both passes, and error against a dense float64 sum."""
+"""Times of both passes of each rasterizer, and its errors against a dense float64 sum.
+
+    python benchmarks/rasterizer.py
+    python benchmarks/rasterizer.py --common 1000 5000 --training --grids 90x360 --precisions float32
+
+A rasterizer that cannot draw a scene is listed with the reason.
+"""
 
 import itertools
 import statistics
@@ -7,10 +13,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
+from common import UNAVAILABLE, Benchmark, Row, command_line, grouped, median_and_spread, positive, table
+from scenes import SCENES, Truth, passes
 
-from gaigs.benchmark import UNAVAILABLE, Benchmark, Context, Row, grouped, median_and_spread, table
-from gaigs.benchmark.scenes import SCENES, Truth, passes
-from gaigs.registry import register, registry
+from gaigs.registry import registry
 
 INTRODUCTION = """# Rasterizers
 
@@ -23,56 +29,26 @@ value; inputs are rounded to each precision, which is part of it.
 """
 
 
-@register("benchmark", "rasterizer")
-class RasterizerBenchmark(Benchmark):
-    """Rasterizers x scenes x Gaussians x grids x precisions.
-
-    Args:
-        common, training: Numbers of Gaussians in the scene of that name; an empty list leaves it out.
-        grids: Rows and columns of maps, in pairs.
-        precisions: Precisions of the tensors.
-        rasterizers: Names; None: all registered ones but ``fastest``, which is one of the others.
-        repeats: Repeats of a pass shorter than half a second; a longer one has at most three.
-    """
+class Rasterizers(Benchmark):
+    """Rasterizers x scenes x Gaussians x grids x precisions."""
 
     name = "rasterizer"
     keys = ("device", "scene", "gaussians", "grid", "rasterizer", "precision")
     values = ("pairs", "forward_ms", "forward_spread_ms", "backward_ms", "backward_spread_ms", "repeats", "times")
     values += ("error", "gradient_error")
 
-    def __init__(
-        self,
-        common: list[int],
-        training: list[int],
-        grids: list[list[int]],
-        precisions: list[str],
-        rasterizers: list[str] | None = None,
-        repeats: int = 20,
-    ):
-        known = registry("rasterizer").names()
-        self.rasterizers = [name for name in known if name != "fastest"] if rasterizers is None else rasterizers
-        self.scenes = {"common": common, "training": training}
-        allowed = "float64", "float32", "bfloat16", "float16"
-        if unknown := {*precisions} - {*allowed}:
-            raise ValueError(f"benchmark.precisions must be among {', '.join(allowed)}, got {', '.join(unknown)}")
-        if min([*common, *training, 1]) < 1 or any(len(grid) != 2 or min(grid) < 1 for grid in grids):
-            raise ValueError("benchmark.common, training and grids must be numbers of at least 1, and grids pairs")
-        if repeats < 1:
-            raise ValueError(f"benchmark.repeats must be at least 1, got {repeats}")
-        self.grids, self.precisions, self.repeats = grids, precisions, repeats
-
-    def cells(self, context: Context) -> Iterator[list[Row]]:
-        sizes = [
-            (n * rows * columns * (16 if scene == "training" else 1), scene, n, rows, columns)
-            for scene, counts in self.scenes.items()
-            for n, (rows, columns) in itertools.product(counts, self.grids)
-        ]
+    def cells(self, device: str) -> Iterator[list[Row]]:
+        options, sizes = self.options, []
+        for scene, counts in (("common", options.common), ("training", options.training)):
+            transmitters = 16 if scene == "training" else 1
+            for n, (rows, columns) in itertools.product(counts, options.grids):
+                sizes.append((n * rows * columns * transmitters, scene, n, rows, columns))
         for _, scene, n, rows, columns in sorted(sizes):
             own = {"scene": scene, "gaussians": str(n), "grid": f"{rows} x {columns}"}
-            kinds = itertools.product(self.rasterizers, self.precisions)
+            kinds = itertools.product(options.rasterizers, options.precisions)
             yield [own | {"rasterizer": name, "precision": precision} for name, precision in kinds]
 
-    def measure(self, cell: Sequence[Row], context: Context) -> list[dict]:
+    def measure(self, cell: Sequence[Row], device: str) -> list[dict]:
         first = cell[0]
         scene = SCENES[first["scene"]](int(first["gaussians"]), *map(int, first["grid"].split(" x ")))
         truth = Truth(scene)
@@ -81,11 +57,11 @@ class RasterizerBenchmark(Benchmark):
         for (name, precision), row in rows.items():
             try:
                 rasterizer, dtype = registry("rasterizer").build({"name": name}), getattr(torch, precision)
-                row |= truth.errors(rasterizer, context.device, dtype) | {"pairs": truth.pairs}
-                turns[name, precision] = passes(rasterizer, scene, context.device, dtype)
+                row |= truth.errors(rasterizer, device, dtype) | {"pairs": truth.pairs}
+                turns[name, precision] = passes(rasterizer, scene, device, dtype)
             except (AttributeError, TypeError, ValueError, RuntimeError, ImportError) as error:
                 row["status"] = UNAVAILABLE + " ".join(str(error).split())
-        for number_of_turn in range(self.repeats + 1):  # the first one is for warm-up
+        for number_of_turn in range(self.options.repeats + 1):  # the first one is for warm-up
             for kind, turn in turns.items():
                 if number_of_turn < 4 or max(times[kind][0]) < 0.5:
                     times[kind].append(turn())
@@ -104,3 +80,28 @@ class RasterizerBenchmark(Benchmark):
         shown = {key.replace("_", " "): key for key in (*self.keys[2:], *self.values)}
         titles = (f"## {', '.join(place)}\n\n{table(sorted(own, key=size), shown)}" for place, own in groups)
         return "\n".join([INTRODUCTION, *titles])
+
+
+def grid(text: str) -> list[int]:
+    """Rows and columns from "90x360"."""
+    rows, columns = text.split("x")
+    return [positive(rows), positive(columns)]
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    names = [name for name in registry("rasterizer").names() if name != "fastest"]
+    precisions = ["float64", "float32", "bfloat16", "float16"]
+    parser = command_line(__doc__, takes_overrides=False)
+    add, text = parser.add_argument, "numbers of Gaussians in this scene"
+    add("--rasterizers", nargs="+", choices=names, default=names)
+    add("--common", nargs="*", type=positive, default=[200, 1000, 5000, 20000, 100000], help=text)
+    add("--training", nargs="*", type=positive, default=[200, 1000, 5000], help=text)
+    add("--grids", nargs="+", type=grid, default=[[23, 90], [90, 360]], help="rows x columns of maps")
+    add("--precisions", nargs="+", choices=precisions, default=precisions)
+    text = "of a pass under half a second, after warm-up; a longer one has three"
+    add("--repeats", type=positive, default=20, help=text)
+    Rasterizers(parser.parse_args(words)).run()
+
+
+if __name__ == "__main__":
+    main()
