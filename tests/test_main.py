@@ -269,9 +269,11 @@ def test_a_folder_of_another_run_or_of_other_files_stays(run, tmp_path):
         assert code == 1
         assert "another run is at work in" in err
         assert (tmp_path / "run" / "gaigs.log").exists()
-    (tmp_path / "run" / "notes.txt").write_text("mine")
-    assert run("command=devices", *HERE)[0] in (0, 1)
-    assert (tmp_path / "run" / "notes.txt").read_text() == "mine"
+    (tmp_path / "run" / "software.json").unlink(missing_ok=True)
+    for name in ("config.yaml", "notes.txt"):
+        (tmp_path / "run" / name).write_text("mine: 1")
+        assert run("command=devices", *HERE)[0] in (0, 1)
+        assert (tmp_path / "run" / name).read_text() == "mine: 1"
 
 
 def test_output_that_nobody_reads_is_no_error(tmp_path):
