@@ -4,7 +4,7 @@
 >>> links = gaigs.links("synthetic")  # any registered reader
 >>> model = gaigs.train("mirrored", links, max_steps=300)  # any registered model
 >>> print(gaigs.evaluate(model, links))  # beside the task's baselines
->>> spectra = model.predict([[1.0, 2.0, 1.5]])  # positions [m]
+>>> spectra = model.predict([[1.0, 2.0, 1.5]])  # positions [m] -> (places, receivers, rows, columns)
 >>> model.save("room.ckpt")
 >>> model = gaigs.load("room.ckpt")
 

@@ -218,16 +218,17 @@ class Query:
 
         Args:
             positions: Positions (..., 3) [m], anything that becomes a float tensor; or a whole query.
-            receiver: Name or index of the receiver, or an index for each position.
+            receiver: Name or index of the receiver, or of that of each position; None: all receivers.
             frequency: Carrier, one for all or one for each position [Hz]; None is the known one.
             names: Names of the scene's receivers.
             known: Different carriers of the training links, ascending [Hz]; empty if unknown.
 
         Returns:
-            The links in the order of ``positions.reshape(-1, 3)``, and the leading axes of the positions.
+            The links in the order of ``positions.reshape(-1, 3)``, and their axes: the leading ones of the positions,
+            and a last one of all receivers if none is given.
         """
         if isinstance(positions, Query):
-            if frequency is not None or not isinstance(receiver, int) or receiver:
+            if frequency is not None or receiver is not None:
                 raise ValueError("a query has its own receivers and frequencies; leave receiver and frequency out")
             receiver, frequency, positions = positions.receivers, positions.frequencies, positions.transmitters
         points = as_positions("transmitters", positions)
@@ -237,12 +238,19 @@ class Query:
             if values.ndim and values.shape != shape:
                 expected = f"one, or one for each of the {tuple(shape)} positions"
                 raise ValueError(f"{name} must be {expected}, got {tuple(values.shape)}")
-            return values.expand(shape).reshape(-1)
+            return values.expand(shape)
 
-        points = points.reshape(-1, 3)
-        receivers = spread("receivers", as_receivers(receiver, names)).to(points.device)
+        if receiver is not None:
+            receivers = spread("receivers", as_receivers(receiver, names)).to(points.device)
         frequencies = as_frequencies(frequency, known.cpu().float())
-        return cls(points, receivers, None if frequencies is None else spread("frequencies", frequencies)), shape
+        frequencies = None if frequencies is None else spread("frequencies", frequencies)
+        if receiver is None:
+            shape = (*shape, len(names))
+            points = points[..., None, :].expand(*shape, 3)
+            receivers = torch.arange(len(names), device=points.device).expand(shape)
+            frequencies = None if frequencies is None else frequencies[..., None].expand(shape)
+        frequencies = None if frequencies is None else frequencies.reshape(-1)
+        return cls(points.reshape(-1, 3), receivers.reshape(-1), frequencies), shape
 
     def __len__(self) -> int:
         return len(self.transmitters)

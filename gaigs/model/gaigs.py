@@ -60,8 +60,8 @@ class GaussianSplatting(Model):
         >>> links = gaigs.links("synthetic", transmitters=20, order=0)
         >>> tokenizer = EuclideanTokenizer(links.scene, width=32)
         >>> model = GaussianSplatting(links.scene, tokenizer=tokenizer, rasterizer="torch", gaussians={"count": 50})
-        >>> model.predict([[1.0, 2.0, 1.5]]).shape
-        torch.Size([1, 90, 360])
+        >>> model.predict([[1.0, 2.0, 1.5]]).shape  # places, receivers, rows, columns
+        torch.Size([1, 1, 90, 360])
     """
 
     name = "gaigs"

@@ -67,8 +67,8 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
     Example:
         >>> links = gaigs.links("synthetic", transmitters=40, order=0)
         >>> model = gaigs.train("gaigs", links, max_steps=1, count=20, enable_progress_bar=False)
-        >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape
-        torch.Size([2, 90, 360])
+        >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape  # places, receivers, rows, columns
+        torch.Size([2, 1, 90, 360])
     """
     if not isinstance(model, str | Model) or not isinstance(links, Links):
         raise TypeError(f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}")

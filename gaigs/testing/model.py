@@ -55,7 +55,9 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
     """Predictions for a query, the same positions, grids of them and single directions."""
     task, places, receiver = links.task, query.transmitters, int(query.receivers[0])
     frequency = None if query.frequencies is None else float(query.frequencies[0])
-    predict = lambda places, **options: model.predict(places, receiver, frequency, **options)
+    # A receiver for each place: where arrays have different numbers of elements, values are padded as those of a query.
+    heard = lambda places: torch.full(places.shape[:-1], receiver)
+    predict = lambda places, **options: model.predict(places, heard(places), frequency, **options)
     values = model.train().predict(query)
     require(model.training, "predict must leave the model in the mode it was in")
     require_tensor("predictions", values, (len(places), *task.shape), task.dtype)
@@ -65,6 +67,9 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
     require(tuple(predict(places[:0]).shape) == (0, *task.shape), "no transmitters must give no predictions")
     grid = predict(places.expand(2, *places.shape))
     require_close(grid, values.expand(2, *values.shape), 1e-4, "a grid of positions must give a grid of predictions")
+    every = model.predict(places, frequency=frequency)
+    shaped = len(every) if isinstance(every, dict) else every.shape[1]
+    require(shaped == len(links.receivers), "positions without a receiver must give the values of all receivers")
     if task.directions is not None:
         rays = task.directions.flatten()[3::7]
         rule = "predict must give the directions of its argument"
