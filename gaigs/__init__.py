@@ -158,6 +158,10 @@ def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | Non
             with processes.limited_threads(config["threads"]):
                 viewing.run(config)
         case unknown:
-            known = "train, benchmark, agreement, describe, survey, locate, export, view or devices"
-            raise ValueError(f"command must be {known}, got {unknown!r}")
+            from gaigs.registry import suggest
+
+            if unknown == "report":
+                raise ValueError("there is no command 'report'; python -m gaigs.report FOLDER makes its tables")
+            known = "train", "benchmark", "agreement", "describe", "survey", "locate", "export", "view", "devices"
+            raise ValueError(f"command must be one of {', '.join(known)}, got {suggest(unknown, known)}")
     return None

@@ -5,7 +5,7 @@ import itertools
 import math
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, overload
@@ -21,8 +21,9 @@ from gaigs.gaussians import Gaussians
 from gaigs.geometry import Directions, ExtrapolationWarning
 from gaigs.kriging.intervals import Calibration, Estimate
 from gaigs.kriging.kernel import Process
+from gaigs.kriging.links import PART
 from gaigs.query import ROUNDING, Batch, Query, as_directions, as_receivers, as_subcarriers
-from gaigs.registry import check_type, registry
+from gaigs.registry import check_type, name_of, registry
 from gaigs.scene import Scene
 from gaigs.task.csi import Csi
 
@@ -45,8 +46,8 @@ class Prediction(NamedTuple):
 class Model(nn.Module):
     """The contract of kind ``model``: ``forward`` takes a ``Batch`` and gives a ``Prediction``.
 
-    A model with parameters is trained; its state dict has all that ``predict`` needs. A model without parameters is a
-    look-up: it learns in ``fit`` only, and is not stored. A model may also have the methods of ``OptionalMethods``.
+    The state dict has all that ``predict`` needs. A model with parameters is trained. One without is a look-up: it
+    learns in ``fit`` only, see ``LookUp``. A model may also have the methods of ``OptionalMethods``.
 
     Args:
         scene: Receivers and task.
@@ -98,7 +99,7 @@ class Model(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """The device of the model's tensors; the CPU for a look-up, which has none."""
+        """The device of the model's tensors; the CPU for a look-up without."""
         tensors = itertools.chain(self.parameters(), self.buffers())
         return next((tensor.device for tensor in tensors), torch.device("cpu"))
 
@@ -117,7 +118,7 @@ class Model(nn.Module):
         """Writes the model into one file, which ``gaigs.load`` reads anywhere, without the data.
 
         Raises:
-            ValueError: The model is a look-up, whose links are its whole state; or a part has no registered name.
+            ValueError: The model has no state, such as a look-up before its fit; or a part has no registered name.
             OSError: The file cannot be written; an earlier file stays as it was.
 
         Example:
@@ -401,6 +402,46 @@ class OptionalMethods(Protocol):
 def call_optional(model: Model, method: str, *arguments: object) -> Any:
     """Result of a model's method of ``OptionalMethods``; None if the model has no such method."""
     return getattr(model, method)(*arguments) if hasattr(model, method) else None
+
+
+class LookUp(Model):
+    """Base of a model that keeps its known links: they are its state, with the attributes of the names ``learnt``.
+
+    It answers on the processor.
+
+    Attributes:
+        links: Links, or a batch of the known ones; None before the fit.
+        known: Numbers of each receiver's known links.
+        learnt: Names of attributes with plain values that ``fit`` sets.
+    """
+
+    links: Links | Batch | None = None
+    known: Sequence[Tensor] = ()
+    learnt: tuple[str, ...] = ()
+
+    def _apply(self, *_: Any) -> "LookUp":
+        return self
+
+    def get_extra_state(self) -> dict:
+        """Known links and ``learnt``; labels in bytes if all are 255ths from 0 to 1, as of 8-bit images."""
+        if self.links is None:
+            raise ValueError(f"model {name_of(self)!r} has no links to save; fit it first")
+        index, labels = torch.cat([*self.known]), []
+        for part in index.split(PART):
+            values = self.links.labels[part]
+            levels = (255 * values.real).round().clamp(0, 255).to(torch.uint8)
+            labels.append(levels if (levels / 255 == values).all() else values)
+        learnt = {name: getattr(self, name) for name in self.learnt}
+        return {"query": vars(self.links.query[index]), "labels": labels, **learnt}
+
+    def set_extra_state(self, state: dict) -> None:
+        """Takes the state of a fitted look-up."""
+        labels = [part / 255 if part.dtype == torch.uint8 else part for part in state["labels"]]
+        self.links = Batch(Query(**state["query"]), None, torch.cat(labels))
+        receivers = self.links.query.receivers
+        self.known = [(receivers == number).nonzero()[:, 0] for number in range(len(self.scene.receivers))]
+        for name in self.learnt:
+            setattr(self, name, state[name])
 
 
 class Wrapper(Model):

@@ -65,8 +65,7 @@ def run(config: dict, folder: Path) -> dict | None:
 def load(path: str | Path) -> Model:
     """The model of a checkpoint or of a finished run, ready to predict.
 
-    A checkpoint needs neither data nor Hydra. The folder of a run with a look-up needs the data, to which it is fitted
-    anew.
+    It needs neither data nor Hydra.
 
     Args:
         path: ``best.ckpt`` or ``last.ckpt`` of a run, a file of ``Model.save``, or the folder of a run.
@@ -92,19 +91,15 @@ def load(path: str | Path) -> Model:
         return loaded
     folder, config = Path(path), configuration_of(path)
     warn_of_changes(folder, config["model"])
-    if (folder / "best.ckpt").is_file():
-        trained: Any = checkpoint.load(folder / "best.ckpt")
-        if config["kriging"] and not hasattr(trained, "krige"):
-            raise ValueError(f"the run in {folder} is not finished: it lacks its kriging\nstart it again, it goes on")
-        return trained
-    from gaigs.runs.training import fit
-
-    links = links_of(folder)
-    built = registry("model").build(config["model"], scene=links.scene)
-    if [*built.parameters()]:
-        raise FileNotFoundError(f"{folder} has no best.ckpt: the run is not finished; start it again")
-    fitted = fit(built, registry("loss").build(config["loss"], task=links.task), links, config, folder)
-    return fitted.models[config["model"]["name"]]
+    if not (folder / "best.ckpt").is_file():
+        raise FileNotFoundError(
+            f"{folder} has no best.ckpt: the run is not finished, or one of a look-up by gaigs 0.3\n"
+            "start it again, a finished one in another folder"
+        )
+    model: Any = checkpoint.load(folder / "best.ckpt")
+    if config["kriging"] and not hasattr(model, "krige"):
+        raise ValueError(f"the run in {folder} is not finished: it lacks its kriging\nstart it again, it goes on")
+    return model
 
 
 def configuration_of(folder: str | Path) -> dict:
@@ -152,7 +147,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     fitted = fit(None, loss, links, config, folder)
     if fitted is None:
         return None
-    model, is_trained = fitted.models[name], bool(fitted.unseen)
+    model, is_trained, best = fitted.models[name], bool(fitted.unseen), folder / "best.ckpt"
     own = {} if is_trained else {name: registry("model").build(config["model"], scene=scene)}
     validation = evaluation.validate(fitted.unseen, {**own, **baselines}, links)
     scores = evaluation.score(fitted.models, baselines, links, folder)
@@ -169,7 +164,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "num_gaussians": count_gaussians(model),
         "num_gaussians_start": fitted.start,
         "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
-        "checkpoint_bytes": (folder / "best.ckpt").stat().st_size if is_trained else None,
+        "checkpoint_bytes": best.stat().st_size if best.is_file() else None,
         "models": {name: evaluation.summary(task, values) for name, values in scores.items()},
         "validation": {name: evaluation.summary(task, values) for name, values in validation.items()},
         "validation_score": validation[name][task.monitor].mean().item() if validation else None,

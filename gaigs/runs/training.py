@@ -151,6 +151,8 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     searched, start = time.monotonic() - began, count_gaussians(model)
     if not is_trained(model):
         model.calibration = calibrated(model, links)
+        if is_first() and model.state_dict():
+            checkpoint.save(model, folder / "best.ckpt")
         return Fitted({name: model}, {}, start)
     model, seconds = descend(model, loss, links, config, folder, searched)
     if not is_first():

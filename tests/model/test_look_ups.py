@@ -122,6 +122,21 @@ def test_each_direction_gets_the_nearest_row_and_column(build):
     assert torch.equal(found, whole[:, [0, 1, 11]][:, :, [0, 0, 35, 0]])
 
 
+# --- state ---
+
+
+@pytest.mark.parametrize(("most", "dtype"), [(255, torch.uint8), (256, torch.float32)])
+def test_images_of_eight_bits_are_stored_in_bytes(most, dtype):
+    links = example_links()
+    links = replace(links, labels=torch.randint(most + 1, links.labels.shape).float() / most)
+    model, twin = (KNearestNeighbours(links.scene, 3) for _ in range(2))
+    model.fit(links)
+    state = model.state_dict()
+    assert {part.dtype for part in state["_extra_state"]["labels"]} == {dtype}
+    twin.load_state_dict(state)
+    assert torch.equal(twin.predict(links.query), model.predict(links.query))
+
+
 # --- several carriers ---
 
 
