@@ -244,9 +244,9 @@ def resolve(config: DictConfig) -> dict:
         if key in words and config.model.name in ("kriging", "ensemble"):
             message = f"model {config.model.name!r} is made from trained models; set {words[key]}, with any model"
             raise ValueError(message) from None
-        given = {"edge": "1.0, the edge of a cube [m]", "length": "50, the samples of a run", "train": "100 places"}
-        given |= {"root": "/path/to/folder", "file": "/path/to/file"}
-        example = given.get(key.rpartition(".")[2], "...")
+        examples = {"split.edge": "1.0, the edge of a cube [m]", "split.length": "50, the samples of a run"}
+        examples |= {"split.train": "100 places", "data.root": "/path/to/folder", "data.file": "/path/to/file"}
+        example = examples.get(key, "...")
         raise ValueError(f"{key} must be given, as it has no default; add {key}={example}") from None
     except OmegaConfBaseException as error:
         raise ValueError(f"the configuration is not complete: {' '.join(str(error).split())}") from error
@@ -329,11 +329,10 @@ def nearest(word: str, config: Mapping) -> str:
 def wrong_flag() -> str | None:
     """The message for a flag on the command line that Hydra does not have; None if it has all."""
     _, unknown = get_args_parser().parse_known_args()
-    flag = next((word.partition("=")[0] for word in unknown if word.startswith("-")), None)
-    if flag is None:
-        return None
-    near = nearest(flag.lstrip("-").replace("-", "_"), composed([], {})) or "trainer.max_steps"
-    return f"there is no flag {flag}; options have no dashes, such as {near}=..."
+    for flag in (word.partition("=")[0] for word in unknown if word.startswith("-")):
+        near = nearest(flag.lstrip("-").replace("-", "_"), composed([], {})) or "trainer.max_steps"
+        return f"there is no flag {flag}; options have no dashes, such as {near}=..."
+    return None
 
 
 def explain(error: Exception) -> str | None:

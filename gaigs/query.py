@@ -238,19 +238,17 @@ class Query:
             if values.ndim and values.shape != shape:
                 expected = f"one, or one for each of the {tuple(shape)} positions"
                 raise ValueError(f"{name} must be {expected}, got {tuple(values.shape)}")
-            return values.expand(shape)
+            return values.expand(shape).reshape(-1)
 
-        if receiver is not None:
-            receivers = spread("receivers", as_receivers(receiver, names)).to(points.device)
+        points = points.reshape(-1, 3)
+        receivers = spread("receivers", as_receivers(0 if receiver is None else receiver, names)).to(points.device)
         frequencies = as_frequencies(frequency, known.cpu().float())
-        frequencies = None if frequencies is None else spread("frequencies", frequencies)
-        if receiver is None:
-            shape = (*shape, len(names))
-            points = points[..., None, :].expand(*shape, 3)
-            receivers = torch.arange(len(names), device=points.device).expand(shape)
-            frequencies = None if frequencies is None else frequencies[..., None].expand(shape)
-        frequencies = None if frequencies is None else frequencies.reshape(-1)
-        return cls(points.reshape(-1, 3), receivers.reshape(-1), frequencies), shape
+        query = cls(points, receivers, None if frequencies is None else spread("frequencies", frequencies))
+        if receiver is not None:
+            return query, shape
+        query = query[torch.arange(len(points)).repeat_interleave(len(names))]
+        query.receivers = torch.arange(len(names), device=points.device).repeat(len(points))
+        return query, (*shape, len(names))
 
     def __len__(self) -> int:
         return len(self.transmitters)

@@ -209,17 +209,14 @@ class Model(nn.Module):
             >>> low.shape, bool((low < high).all())
             (torch.Size([4]), True)
         """
-        if interval is not None:
-            check_type("interval", interval, float)
-            if not 0 < interval < 1:
-                raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
-            if self.calibration is None:
-                raise ValueError(
-                    "the model has no intervals: no held-out links have measured its errors\n"
-                    "train it with split.validation above 0, on two places, runs or blocks or more, without "
-                    "data.band_train"
-                )
-            interval = float(interval)
+        check_type("interval", interval, float | None)
+        if interval is not None and not 0 < interval < 1:
+            raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
+        if interval is not None and self.calibration is None:
+            raise ValueError(
+                "the model has no intervals: no held-out links have measured its errors\n"
+                "train it with split.validation above 0, on two places, runs or blocks or more, without data.band_train"
+            )
         parts, shape = self._values(transmitters, receiver, frequency, batch_size, directions, frequencies, interval)
         heard = transmitters.receivers if isinstance(transmitters, Query) else receiver
         if interval is None:
@@ -322,7 +319,7 @@ class Model(nn.Module):
         if interval is not None:
             if messages or model is not self:
                 raise ValueError("intervals are those of the labels' own subcarriers; leave frequencies out")
-            estimates = (self._estimate(batch, interval) for batch in batches)
+            estimates = (self._estimate(batch, float(interval)) for batch in batches)
             pick = lambda part: part if part is None or part.ndim < 3 or chosen is None else part[..., chosen]
             return (Estimate(*map(pick, estimate)) for estimate in estimates), shape
         values = map(model._answer, batches)
