@@ -245,7 +245,11 @@ def resolve(config: DictConfig) -> dict:
             message = f"model {config.model.name!r} is made from trained models; set {words[key]}, with any model"
             raise ValueError(message) from None
         examples = {"split.edge": "1.0, the edge of a cube [m]", "split.length": "50, the samples of a run"}
-        examples |= {"split.train": "100 places", "data.root": "/path/to/folder", "data.file": "/path/to/file"}
+        examples |= {
+            "split.train": "100, the training places",
+            "data.root": "/path/to/folder",
+            "data.file": "/path/to/file",
+        }
         example = examples.get(key, "...")
         raise ValueError(f"{key} must be given, as it has no default; add {key}={example}") from None
     except OmegaConfBaseException as error:
