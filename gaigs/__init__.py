@@ -12,11 +12,13 @@
 """
 
 import importlib
+import inspect
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gaigs.registry.modes import usual_modes
 from gaigs.version import __version__
 
 if TYPE_CHECKING:
@@ -69,7 +71,12 @@ __all__ = [
 def __getattr__(name: str):
     if name not in PLACES:
         raise AttributeError(f"module 'gaigs' has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(f"gaigs.{PLACES[name]}"), name)
+    module = importlib.import_module(f"gaigs.{PLACES[name]}")
+    value = getattr(module, name)
+    if inspect.isfunction(value) and name != "register":  # the decorator of ``register`` looks at its caller
+        value = usual_modes()(value)
+        setattr(module, name, value)  # where pickle looks for it
+    globals()[name] = value
     return value
 
 
@@ -77,6 +84,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *PLACES})
 
 
+@usual_modes()
 def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = ()) -> dict | None:
     """Executes the command of a configuration, as ``python -m gaigs`` does; resumes a run that was stopped.
 
@@ -144,13 +152,14 @@ def _execute(config: dict, folder: Path, overrides: Sequence[str]) -> dict | Non
                     benchmark.run(folder, overrides, **limits)
             log.info("results: %s", folder)
         case "agreement" | "describe" | "survey" | "locate" | "export" as command:
-            from gaigs import agreement, describing, exporting, locating, surveying
+            from gaigs import agreement, describing, exporting, locating, stages, surveying
 
             modules = {
                 "agreement": agreement, "describe": describing, "survey": surveying, "locate": locating,
                 "export": exporting,
             }  # fmt: skip
-            with processes.limited_threads(config["threads"]):
+            shows = config["trainer"].get("enable_progress_bar", True)
+            with processes.limited_threads(config["threads"]), stages.watched(shown=shows):
                 modules[command].run(config, folder)
         case "view":
             from gaigs import viewing

@@ -40,6 +40,7 @@ def run(config: DictConfig) -> float | None:
         # A process of joblib runs several jobs.
         with processes.stopping(waits=is_sweep and launcher == "JoblibLauncher"):
             plain = {"command": command} if command == "devices" else configuration.resolve(config)
+            note_task(words, plain)
             with processes.limited_threads(None, jobs):
                 metrics = gaigs.run(plain, folder, overrides)
     except KeyboardInterrupt as stop:
@@ -64,6 +65,19 @@ def run(config: DictConfig) -> float | None:
             raise
         raise CompactHydraException(f"gaigs: {message}") from error
     return None if metrics is None else metrics["validation_score"]
+
+
+def note_task(words: list[str], config: dict) -> None:
+    """A line of the log if the experiment is for another task than the data, which decide."""
+    parts = [config.get(key) for key in ("task", "data")]
+    if not all(isinstance(part, dict) and "name" in part for part in parts):
+        return  # the check of the configuration says what is wrong
+    task, data = (part["name"] for part in parts)
+    for word in words:
+        key, _, name = word.partition("=")
+        others = {*name.split("_")} & {"spectrum", "rssi", "csi"} - {task}
+        if key == "+experiment" and others:
+            log.warning("+experiment=%s is for task %s; labels of data=%s are of %s", name, min(others), data, task)
 
 
 def compose_and_run() -> None:

@@ -45,7 +45,7 @@ class Array:
 
     @classmethod
     def single(cls) -> "Array":
-        return cls(torch.zeros(1, 3))
+        return cls(torch.zeros(1, 3, dtype=torch.float32))
 
     @classmethod
     def planar(cls, rows: int, columns: int, pitch: float, pattern: str = "isotropic") -> "Array":
@@ -109,6 +109,13 @@ class Receiver:
     name: str
     pose: Pose
     array: Array = field(default_factory=Array.single)
+
+    def __post_init__(self) -> None:
+        axes = self.pose.rotation.double()
+        # NaN is no rotation either, nor a mirror, whose determinant is -1.
+        if not ((axes.mT @ axes - torch.eye(3).to(axes)).abs().max() <= 1e-3 and torch.linalg.det(axes) > 0):
+            wanted = "a rotation, whose orthonormal columns are the array's axes"
+            raise ValueError(f"the pose of receiver {self.name!r} must have {wanted}, got {axes.tolist()}")
 
 
 def lacking(receivers: Sequence[Receiver], index: Int[Tensor, " b"], count: int) -> Bool[Tensor, "b e"]:

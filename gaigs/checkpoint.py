@@ -2,9 +2,11 @@
 
 import hashlib
 import io
+import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from zipfile import ZipFile
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +14,7 @@ from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 
 from gaigs.io.files import atomic_write
 from gaigs.processes import lacks_memory
-from gaigs.registry import check_type, configuration_of, name_of, registry
+from gaigs.registry import check_type, configuration_of, digests, name_of, only_recorded, registry
 from gaigs.scene import Scene
 
 KEY = "gaigs"
@@ -58,7 +60,13 @@ def read(path: str | Path) -> dict:
         sealed, digest = data[:-DIGEST], data[-DIGEST:]
         if not sealed.endswith(SEAL) or hashlib.sha256(sealed).hexdigest().encode() != digest:
             raise ValueError("another digest")
+        with ZipFile(io.BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > len(data):
+                raise ValueError("compressed, which torch.save never does")
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        # A view can be far larger than the numbers behind it; those of a model are not.
+        if sum(tensor.nbytes for _, tensor in _tensors(content, "")) > 4 * len(data) + 2**26:
+            raise ValueError("larger than the file")
     except Exception as error:  # any error of zip readers and unpicklers; torch's own message advises to run code
         if lacks_memory(error):
             raise
@@ -81,18 +89,23 @@ def save(model: nn.Module, path: str | Path) -> None:
     if not state:
         raise ValueError(f"model {name_of(model)!r} has no state: keep what it learns in buffers, or use model.LookUp")
     part = {"version": VERSION, "scene": model.scene.state(), **described(model)}
+    part["plugins"] = digests(part["model"], part["scene"]["task"])
     weights = {f"model.{key}": value.cpu() if isinstance(value, Tensor) else value for key, value in state.items()}
     write({KEY: part, "state_dict": weights}, Path(path))
 
 
-def load(path: str | Path) -> nn.Module:
-    """The model of a checkpoint in evaluation mode, on the CPU; errors as of ``gaigs.load``."""
+def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Module:
+    """The model of a checkpoint in evaluation mode, on the CPU; errors as of ``gaigs.load``.
+
+    ``recorded`` has the digests of plug-ins of a checkpoint that lacks them, of an earlier version.
+    """
     content = read(path)
     weights, scene = content["state_dict"], content[KEY]["scene"]
     try:
         consume_prefix_in_state_dict_if_present(weights, "model.")
         _check_finite("scene", scene)
-        model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(scene))
+        with only_recorded(None if trust else {**recorded, **content[KEY].get("plugins", {})}):
+            model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(scene))
         fresh = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         unset = {name for name, value in fresh.items() if not value.isfinite().all()}
         model.load_state_dict(weights)
@@ -103,13 +116,13 @@ def load(path: str | Path) -> nn.Module:
         if lacks_memory(error):
             raise
         cause = str(error) if isinstance(error, ValueError | ImportError) else f"{type(error).__name__}: {error}"
-        message = f"cannot make the model of {path}: {' '.join(cause.split())}"
+        message = f"cannot make the model of {path}: {cause if cause.count(chr(10)) < 2 else ' '.join(cause.split())}"
         raise (ImportError if isinstance(error, ImportError) else ValueError)(message) from error
     return model.eval()
 
 
 def trained_weights(content: dict) -> dict:
-    """The weights of the training module in a checkpoint, before and after ``exchange_model``."""
+    """The weights of the training module in a checkpoint, before and after ``update``."""
     weights = content["state_dict"]
     if "trained" not in content[KEY]:
         return weights
@@ -123,28 +136,30 @@ def described(model: nn.Module) -> dict:
     return {"model": configuration_of(model), "calibration": calibration, "known_places": model.known_places}
 
 
-def exchange_model(path: Path, model: nn.Module, trained: str) -> None:
-    """Replaces the model of a checkpoint by one of the same scene, whose part ``trained`` is the trained model."""
-    content = read(path)
-    content[KEY] |= {"trained": trained, **described(model)}
-    content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
-    write(content, path)
-
-
-def add_calibration(path: Path, model: nn.Module) -> None:
-    """Adds the calibration of a checkpoint's model."""
+def update(path: Path, model: nn.Module, trained: str | None = None) -> None:
+    """Gives a checkpoint its model's calibration; or another model of the scene, whose part ``trained`` was trained."""
     content = read(path)
     content[KEY] |= described(model)
+    if trained is not None:
+        content[KEY]["trained"] = trained
+        content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
     write(content, path)
 
 
 def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
-    """All tensors in nested mappings and lists, with their places."""
-    if isinstance(value, Tensor):
-        yield name, value
-    elif isinstance(value, dict | list | tuple):
-        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _tensors(item, f"{name} {key}")
+    """All tensors in nested mappings and lists, with their places; a ``ValueError`` if these nest without an end."""
+    parts = [(name, value, 0)]
+    for count in itertools.count():
+        if not parts:
+            return
+        name, value, depth = parts.pop()
+        if depth > 50 or count > 1_000_000:
+            raise ValueError(f"{name:.80} is nested too deeply")
+        if isinstance(value, Tensor):
+            yield name, value
+        elif isinstance(value, dict | list | tuple):
+            entries = value.items() if isinstance(value, dict) else enumerate(value)
+            parts += [(f"{name} {key}", item, depth + 1) for key, item in entries]
 
 
 def _check_finite(name: str, value: object) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import logging
 import sys
+import threading
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import metadata
@@ -28,10 +29,11 @@ from gaigs.registry import KINDS, check_type, listed, registry, similar, storabl
 from gaigs.registry.holders import plugin_packages
 
 log = logging.getLogger(__name__)
+composing = threading.RLock()  # Hydra composes one configuration at a time
 
 HARMLESS = (
     "command", "folder", "survey", "locate", "export", "view", "figures", "save_every", "tensorboard", "threads",
-    "trainer.enable_progress_bar", "trainer.enable_model_summary",
+    "trust", "trainer.enable_progress_bar", "trainer.enable_model_summary",
 )  # fmt: skip
 """Keys that change no result: a run may be resumed with other values."""
 
@@ -41,9 +43,9 @@ MAY_BE_NULL = ("gaussians", "density", "benchmark", "projection", "rasterizer")
 KEYS = {
     **dict.fromkeys((*KINDS, "trainer"), dict), **dict.fromkeys(MAY_BE_NULL, dict | None),
     "kriging": bool, "kriging_fallback": dict | None, "baselines": list[dict], "command": str, "seed": int,
-    "ensemble": int,
-    "save_every": float, "tensorboard": bool, "threads": int | None, "folder": str | None, "survey": dict,
-    "locate": dict, "export": dict, "view": dict, "figures": dict,
+    "ensemble": int, "max_time": str | dict | None,
+    "save_every": float, "tensorboard": bool, "threads": int | None, "trust": bool, "folder": str | None,
+    "survey": dict, "locate": dict, "export": dict, "view": dict, "figures": dict,
 }  # fmt: skip
 """Top-level keys and their types."""
 
@@ -195,23 +197,24 @@ def compose(*overrides: str, **options) -> dict:
 def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str] = ()) -> dict:
     """Like ``compose``; with sections, options are looked up in these sections only."""
     choices, values = _choices(options)
-    running = GlobalHydra.instance()
-    before = running.hydra
-    paths = [] if before is None else running.config_loader().get_search_path().get_path()
-    try:
-        with contextlib.ExitStack() as stack:
-            # Within a run of the command line Hydra allows no second instance.
-            if not any(str(conf_dir()) in str(element.path) for element in paths):
-                running.clear()
-                stack.enter_context(initialize_config_dir(str(conf_dir()), version_base="1.3"))
-            config = hydra.compose("config", [*overrides, *choices])
-    except Exception as error:
-        message = explain(error)
-        if message is None:
-            raise
-        raise ValueError(message) from None
-    finally:
-        GlobalHydra.instance().hydra = before
+    with composing:
+        running = GlobalHydra.instance()
+        before = running.hydra
+        paths = [] if before is None else running.config_loader().get_search_path().get_path()
+        try:
+            with contextlib.ExitStack() as stack:
+                # Within a run of the command line Hydra allows no second instance.
+                if not any(str(conf_dir()) in str(element.path) for element in paths):
+                    running.clear()
+                    stack.enter_context(initialize_config_dir(str(conf_dir()), version_base="1.3"))
+                config = hydra.compose("config", [*overrides, *choices])
+        except Exception as error:
+            message = explain(error)
+            if message is None:
+                raise
+            raise ValueError(message) from None
+        finally:
+            GlobalHydra.instance().hydra = before
     for key, value in values.items():
         is_new = key.startswith("+") or key in CHOSEN  # a part's constructor knows its keys
         path = _path(config, key, sections)

@@ -1,8 +1,6 @@
 """A first look at links: what was read, what was left out, and what is suspicious."""
 
-import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,25 +12,17 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from gaigs.antenna import lacking
-from gaigs.data import Links, load, phase_doubts
-from gaigs.data.doubts import doubts, places_doubts
-from gaigs.data.readings import marks_of
+from gaigs.data import Links, load
+from gaigs.data.checks import Finding, check
 from gaigs.io.files import write_text
-from gaigs.io.tables import shortened
-from gaigs.kriging.links import distances
 from gaigs.query import evenly
 from gaigs.registry import check_instance
 from gaigs.report import style
 from gaigs.task.csi import Csi
-from gaigs.task.rssi import Rssi
 from gaigs.task.scalar import with_unit
-from gaigs.task.spectrum import Spectrum
 
 LINKS, RECEIVERS = 2000, 12
 """Most links whose spectra or channels are read, evenly spread, and most receivers that the text lists."""
-
-BETTER = 0.85
-"""Ratio of the errors about the law of distance below which other coordinates of the receivers are named."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +31,7 @@ class Description:
 
     Attributes:
         read: Sentences on the links, places, labels and receivers, and what the reader left out.
-        suspicious: Sentences on what is probably wrong.
+        findings: What is probably wrong, and what mends it.
 
     Example:
         >>> print(gaigs.describe(gaigs.links("synthetic_rssi", transmitters=60)))
@@ -51,10 +41,17 @@ class Description:
     """
 
     read: tuple[str, ...]
-    suspicious: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def suspicious(self) -> tuple[str, ...]:
+        """The findings as sentences."""
+        return tuple(map(str, self.findings))
 
     def __str__(self) -> str:
-        found = ["suspicious:", *(f"  {one}" for one in self.suspicious)] if self.suspicious else ["nothing suspicious"]
+        found = ["nothing suspicious"]
+        if self.findings:
+            found = ["suspicious:", *(f"  {sentence}" for sentence in self.suspicious)]
         return "\n".join((*self.read, *found))
 
 
@@ -84,9 +81,12 @@ def describe(links: Links) -> Description:
     ]
     if links.split is not None:
         read.append(f"split {links.split.name}: " + ", ".join(f"{len(p)} {n}" for n, p in links.split.parts().items()))
-    suspicious, remarks = tuple(suspicions(links, sites)), links.remarks
-    for doubt in suspicious:  # which a split has told, too
-        remarks = remarks.replace(doubt, "")
+    if repeated := _repeats(links):
+        read.append(f"{repeated} links repeat place and receiver of another")
+    findings = tuple(check(links))
+    remarks = links.remarks
+    for finding in findings:  # a split has them among its remarks
+        remarks = remarks.replace(str(finding), "")
     read += filter(None, remarks.split("; "))
     if count > 1:
         read.append(f"{'receiver':20} {'links':>6} {'median':>7}  position [m]")
@@ -100,7 +100,7 @@ def describe(links: Links) -> Description:
             read.append(f"{receiver.name[:20]:20} {numbers[k]:6} {median}  {place}{about}")
         if count > RECEIVERS:
             read.append(f"... and {count - RECEIVERS} more receivers with fewer links")
-    return Description(tuple(read), suspicious)
+    return Description(tuple(read), findings)
 
 
 def _read(links: Links) -> Int[Tensor, " k"]:
@@ -131,87 +131,14 @@ def levels(links: Links, index: Tensor) -> Float[Tensor, " k"]:
     return torch.cat(found)
 
 
-def suspicions(links: Links, sites: Float[Tensor, "n 3"]) -> Iterator[str]:
-    """Sentences on what is probably wrong, of any task first."""
-    query, receivers = links.query, links.receivers
-    stands = torch.stack([receiver.pose.position for receiver in receivers])
-    given = torch.ones(len(receivers), dtype=torch.bool) if links.uncertainties is None else links.uncertainties == 0
-    if links.split is None:
-        yield from places_doubts(links)
-    else:
-        yield from [*doubts(links), *phase_doubts(links)]
-    if len(receivers) > 10 and len(links) < 1.5 * len(receivers):
-        each = "models are learnt for each, so a fixed one must have one place"
-        yield f"{len(receivers)} receivers have {len(links)} links: {each}"
-    near = (distances(sites.double(), stands[given].double()) < 0.01).any(1)
-    if len(sites) > 1 and near.any():
-        yield f"{int(near.sum())} places are where a receiver stands"
-    for a, b in itertools.combinations(given.nonzero()[:, 0].tolist(), 2):
-        if (stands[a] - stands[b]).norm() < 0.01:
-            yield f"{receivers[a].name} and {receivers[b].name} stand at one place"
-    parts = [query.transmitters, query.receivers[:, None].float()]
-    keys = torch.cat(parts if query.frequencies is None else [*parts, query.frequencies[:, None]], 1)
-    if repeated := len(keys) - len(keys.unique(dim=0)):
-        yield f"{repeated} links repeat place and receiver of another"
-    if isinstance(links.task, Rssi):
-        yield from suspicions_of_levels(links, stands, given)
-    if links.task.is_scalar or (isinstance(links.task, Spectrum) and links.split is not None):  # its doubts have told
-        return
-    labels = [links.labels[part].reshape(len(part), -1) for part in evenly(torch.arange(len(links)), 256).split(64)]
-    if constant := sum(int(((own - own[:, :1]).abs().amax(1) == 0).sum()) for own in labels if own.shape[1] > 1):
-        yield f"{constant} of {sum(map(len, labels))} labels have one value throughout"
-
-
-def suspicions_of_levels(links: Links, stands: Float[Tensor, "r 3"], given: Tensor) -> Iterator[str]:
-    """Signs, marks, constant and equal receivers, and receivers that the law of distance does not suit."""
-    query, names = links.query, [receiver.name for receiver in links.receivers]
-    values = links.labels[torch.arange(len(links))].double()
-    if positive := int((values > 0).sum()):
-        yield f"{positive} levels are above 0 dBm; was a sign lost?"
-    for mark in marks_of(values[:, None].numpy()):
-        yield f"{int((values == mark).sum())} levels are {mark:g} dBm; does it mean not heard?"
-    places, which = query.transmitters.unique(dim=0, return_inverse=True)
-    table = torch.full((len(names), len(places)), math.nan, dtype=torch.float64)
-    table[query.receivers, which] = values
-    heard = ~table.isnan()
-    constant = [k for k in range(len(names)) if heard[k].sum() >= 5 and table[k][heard[k]].unique().numel() == 1]
-    if constant:
-        yield f"levels are constant at {shortened([names[k] for k in constant])}"
-    first: dict[bytes, int] = {}
-    for k in set(range(len(names))) - {*constant}:
-        other = first.setdefault(np.nan_to_num(table[k].numpy()).tobytes(), k)
-        if other != k and heard[k].sum() >= 3:
-            yield f"{names[other]} and {names[k]} have the same levels"
-    own = given.nonzero()[:, 0]
-    if len(own) < 3:
-        return
-    usual, exponents = misfit(table, heard, places, stands, own)
-    if rising := [names[k] for k, slope in zip(own.tolist(), exponents, strict=True) if slope > 5]:
-        yield f"levels rise with the distance from {shortened(rising)}; are names or places exchanged?"
-    others = {"x and y are exchanged": stands[:, [1, 0, 2]]}
-    for factor in (1e-3, 1e-2, 0.3048, 1 / 0.3048, 1e2, 1e3):
-        others[f"coordinates are times {factor:.4g}"] = stands * factor
-    errors = {name: misfit(table, heard, places, moved, own)[0] for name, moved in others.items()}
-    name, error = min(errors.items(), key=lambda pair: pair[1])
-    if error < BETTER * usual:
-        yield f"levels follow the distance to {error:.2g} dB instead of {usual:.2g} dB if the receivers' {name}"
-
-
-def misfit(
-    table: Float[Tensor, "r n"], heard: Tensor, places: Float[Tensor, "n 3"], stands: Float[Tensor, "r 3"], own: Tensor
-) -> tuple[float, list[float]]:
-    """Root mean square error of a + b log10(distance) at some receivers, and b of each [dB per decade]."""
-    errors, slopes = [], []
-    decades = distances(stands.double(), places.double()).clamp_min(0.1).log10()
-    for k in own.tolist():
-        x, y = decades[k][heard[k]], table[k][heard[k]]
-        if len(x) < 10:
-            slopes.append(0.0)
-            continue
-        x, y = x - x.mean(), y - y.mean()
-        slopes.append(((x @ y) / x.square().sum().clamp_min(1e-12)).item())
-        errors.append(y - min(slopes[-1], 0.0) * x)  # levels fall with the distance
-    return (torch.cat(errors).square().mean().sqrt().item() if errors else 0.0), slopes
+def _repeats(links: Links) -> int:
+    """Number of links that repeat transmitter, receiver and carrier of another."""
+    query = links.query
+    columns = [query.transmitters, query.receivers[:, None].float()]
+    if query.frequencies is not None:
+        columns.append(query.frequencies[:, None])
+    keys = torch.cat(columns, 1)  # (n, 4 or 5)
+    return len(keys) - len(keys.unique(dim=0))
 
 
 def run(config: dict, folder: Path) -> None:

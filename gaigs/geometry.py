@@ -3,7 +3,8 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from importlib.util import find_spec
+from numbers import Integral, Real
 
 import numpy as np
 import torch
@@ -24,8 +25,13 @@ class ExtrapolationWarning(UserWarning):
     """A prediction is far from all measurements."""
 
 
-class Frame(NamedTuple):
+@dataclass(frozen=True)
+class Frame:
     """The place of the world frame on a map: its origin (x, y) in the projected system of an EPSG code [m].
+
+    Raises:
+        ValueError: There is no such system, it has other units than metres, or the origin is not within it. Without
+            pyproj systems other than UTM are not checked.
 
     Example:
         >>> places, levels = [[10.0, 20.0, 1.5], [30.0, 5.0, 1.5], [0.0, 9.0, 1.5]], [-50.0, -60.0, -55.0]
@@ -38,6 +44,36 @@ class Frame(NamedTuple):
     epsg: int
     x: float
     y: float
+
+    def __post_init__(self) -> None:
+        remedy = "gaigs.data.maps.to_utm converts degrees and feet into metres of UTM, and gives its code"
+        is_number = isinstance(self.epsg, Integral) and isinstance(self.x, Real) and isinstance(self.y, Real)
+        if not is_number or not math.isfinite(self.x + self.y) or self._is_elsewhere():
+            raise ValueError(f"a frame must be an EPSG code with an easting and a northing [m], got {self}\n{remedy}")
+        if is_utm(self.epsg) or find_spec("pyproj") is None:
+            return
+        import pyproj
+
+        try:
+            system = pyproj.CRS.from_epsg(self.epsg)
+        except pyproj.exceptions.CRSError:
+            raise ValueError(f"there is no coordinate system EPSG:{self.epsg}\n{remedy}") from None
+        units = [axis.unit_name for axis in system.axis_info[:2]]
+        if not system.is_projected or units != ["metre", "metre"]:
+            found = f"EPSG:{self.epsg}, {system.name} in {units[0]}"
+            raise ValueError(f"a frame must be a projected system in metres, got {found}\n{remedy}")
+
+    def _is_elsewhere(self) -> bool:
+        """True if the origin is in degrees, or beyond all of UTM: Norway has eastings of -80 to 1120 km in zone 33."""
+        is_small = abs(self.x) <= 180 and abs(self.y) <= 90
+        if is_utm(self.epsg):
+            return is_small or not (-2e5 <= self.x <= 1.3e6 and -1e5 <= self.y <= 1.01e7)
+        return is_small and (self.x, self.y) != (0, 0)
+
+
+def is_utm(epsg: int) -> bool:
+    """True for the codes of UTM on WGS 84."""
+    return 1 <= epsg % 100 <= 60 and epsg // 100 in (326, 327)
 
 
 @dataclass(frozen=True)
@@ -78,11 +114,13 @@ class Pose:
 
     def local(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """World points in the array's frame [m]."""
-        return (points - self.position) @ self.rotation
+        pose = self.to(points)
+        return (points - pose.position) @ pose.rotation
 
     def world(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Points of the array's frame in the world frame [m]."""
-        return points @ self.rotation.mT + self.position
+        pose = self.to(points)
+        return points @ pose.rotation.mT + pose.position
 
 
 def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
@@ -244,7 +282,7 @@ class Grid:
     @classmethod
     def degrees(cls, elevations=range(1, 91), azimuths=range(360)) -> "Grid":
         """A grid of whole degrees; the default is that of the NeRF² spectra, 90 x 360."""
-        as_radians = lambda values: torch.deg2rad(torch.tensor([float(v) for v in values]))
+        as_radians = lambda values: torch.tensor([float(v) for v in values], dtype=torch.float32).deg2rad()
         return cls(as_radians(elevations), as_radians(azimuths))
 
     @classmethod

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
+from gaigs import stages
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.geometry import ExtrapolationWarning, Frame, even_places
@@ -31,7 +32,7 @@ from gaigs.query import ROUNDING, as_positions, as_receivers, as_tensor, evenly
 from gaigs.registry import call, check_instance, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, load
-from gaigs.runs.evaluation import is_trained, unseen
+from gaigs.runs.evaluation import fold_count, is_trained, unseen
 from gaigs.split import rows_of
 from gaigs.task import Task, check_range
 
@@ -289,7 +290,8 @@ def fingerprints(
     tells = links is None or not torch.isin(*(rows_of(links)[part] for part in (known, tested))).any()
     whole = mapped(model, known)
     tries: list[Any] = []
-    for one, part, others in unseen(model, links) if links is not None else ():
+    unknown = () if links is None else unseen(model, links)
+    for one, part, others in stages.track(unknown, "folds", fold_count(model)):
         one.calibration = model.calibration
         rows = rows_of(links)  # those known links that share a transmission with the part
         asked, truth = received(links, known[torch.isin(rows[known], rows[part])])
@@ -371,7 +373,7 @@ def locate(
             unit = getattr(prints.task, "error_unit", prints.task.unit)
             words = f"readings are up to {beyond.max():.3g} {unit} beyond all predicted ones"
             advice = "check their unit, and leave out what was not heard"
-            warnings.warn(f"{words}; {advice}", ExtrapolationWarning, stacklevel=2)
+            warnings.warn(f"{words}; {advice}", ExtrapolationWarning, stacklevel=3)  # as of a radio map
     return posterior(prints, asked, unknown_power, step, level)
 
 
@@ -415,7 +417,8 @@ def run(config: dict, folder: Path) -> None:
     ``locate.png`` and, of a test, ``locate.json`` into a folder."""
     if config["folder"] is None:
         raise ValueError("command=locate needs the folder of a finished run; add folder=runs/...")
-    model, links, options = load(config["folder"]), links_of(config["folder"]), dict(config["locate"])
+    model, links = load(config["folder"], config["trust"]), links_of(config["folder"])
+    options = dict(config["locate"])
     own, value = {name: options.pop(name) for name in ("region", "frequency", "points")}, options.pop("value")
     value = read_value(Path(value), links) if isinstance(value, str) else value
     start = time.perf_counter()
@@ -612,7 +615,7 @@ def predicted(
     # A look-up reads its labels once a batch.
     size = 8192 if not task.shape else 64 if is_trained(model) else 512
     with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):  # prior places may be outside
-        for part in places.split(max(1, size // count)):
+        for part in stages.track(places.split(max(1, size // count)), "fingerprints"):
             asked = part[:, None].expand(-1, count, 3), torch.arange(count).expand(len(part), -1)
             if task.shape:
                 value = model.predict(*asked, frequency=frequency, batch_size=size).cpu().flatten(0, 1)

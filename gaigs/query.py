@@ -59,7 +59,7 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
         if values.is_meta or values.layout is not torch.strided:
             kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
             raise ValueError(f"{name} must be {expected}, got a {kind} tensor; give a dense tensor with values")
-        return values
+        return values.clone() if values.is_inference() else values  # which a training could not use
     if isinstance(values, list | tuple) and any(isinstance(value, Tensor) for value in values):
         parts = [as_tensor(name, value, expected) for value in values]
         if len({part.shape for part in parts}) == 1:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from gaigs import stages
 from gaigs.geometry import ExtrapolationWarning
 from gaigs.io.files import atomic_write
 from gaigs.query import as_receivers
@@ -159,7 +160,7 @@ def radio_map(
         if size > most:
             message = f"{name} puts transmitters {size:.4g} m outside the box of the training transmitters, which with "
             message += f"the receivers is {scene.extent:.3g} m across; is it in m?"
-            warnings.warn(message, ExtrapolationWarning, stacklevel=2)
+            warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # behind the decorator of its public name
     if pitch is not None and not (0 < pitch <= longest and math.prod(((upper - lower) / pitch).tolist()) <= 1e8):
         raise ValueError(
             f"pitch must be above 0, at most {longest:.3g} m, the longer side of the map, and give at most 1e+08 "
@@ -186,7 +187,8 @@ def radio_map(
             predict(some[:1])  # the first prediction compiles and loads
             start = time.perf_counter()
             predict(some)
-        most = POINTS * SECONDS / (time.perf_counter() - start)  # points
+        # Points in a minute, or in half of the time left: figures follow.
+        most = POINTS * min(SECONDS, stages.left() / 2) / (time.perf_counter() - start)
         while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, FEWEST):
             pitch *= 2
     x, y = _axes(lower, upper, pitch)

@@ -1,6 +1,7 @@
 """The scene of a model: receivers with their arrays, the box of the training transmitters, the task."""
 
 import functools
+import logging
 from dataclasses import dataclass, field
 
 import torch
@@ -15,6 +16,8 @@ from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.task import Task
 from gaigs.task.csi import Csi
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,10 +45,10 @@ class Scene:
     upper: Float[Tensor, "3"]
     spacing: float
     task: Task
-    frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0))
+    frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
     bandwidth: float | None = None
     frame: Frame | None = None
-    floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0))
+    floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""
@@ -103,7 +106,7 @@ class Scene:
                 name: getattr(self, name)
                 for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors")
             },
-            "frame": self.frame and tuple(self.frame),
+            "frame": self.frame and (int(self.frame.epsg), float(self.frame.x), float(self.frame.y)),
         }
 
     @classmethod
@@ -113,8 +116,12 @@ class Scene:
             Receiver(r["name"], Pose(r["position"], r["rotation"]), Array(r["elements"], r["pattern"]))
             for r in state["receivers"]
         )
-        task, frame = registry("task").build(state["task"]), state.get("frame")
-        return cls(**state | {"receivers": receivers, "task": task, "frame": frame and Frame(*frame)})
+        task, frame = registry("task").build(state["task"]), None
+        try:
+            frame = state.get("frame") and Frame(*state["frame"])
+        except ValueError as error:  # of a checkpoint from before frames were checked
+            log.warning("predictions have no place on a map: %s", error)
+        return cls(**state | {"receivers": receivers, "task": task, "frame": frame})
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:

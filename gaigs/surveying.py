@@ -22,6 +22,7 @@ from gaigs.query import Query, as_positions, evenly
 from gaigs.registry import call, check_type
 from gaigs.report import style
 from gaigs.runs import load
+from gaigs.stages import track
 
 POINTS = 1000
 """Approximate number of candidates, and of places at which the error is stated, of a region."""
@@ -207,7 +208,7 @@ def survey(
 
     chosen, errors = [], [error(posteriors)]
     free = torch.ones(len(places), dtype=torch.bool)
-    for _ in range(min(count, len(places))):
+    for _ in track(range(min(count, len(places))), "places to measure"):
         gains = sum(
             own[: len(places)]
             * (own[stated] @ part[stated, : len(places)].square())
@@ -231,7 +232,7 @@ def survey(
 
 def run(config: dict, folder: Path) -> None:
     """Plans a survey, by the model of a finished run if given; writes ``survey.csv`` and ``survey.png``."""
-    model = None if config["folder"] is None else load(config["folder"])
+    model = None if config["folder"] is None else load(config["folder"], config["trust"])
     options = dict(config["survey"])
     if isinstance(options["candidates"], str):
         options["candidates"] = read_points(Path(options["candidates"]), "xyz", "x,y,z [m] of one candidate a line")
@@ -365,7 +366,8 @@ def without(
         return mean_of_heard(torch.stack(parts), hears)
 
     losses = known.new_zeros(len(known))
-    for process, own, place, variance, likely in zip(processes, rows, which, prior, hears, strict=True):
+    parts = zip(processes, rows, which, prior, hears, strict=True)
+    for process, own, place, variance, likely in track(parts, "places to leave out", len(processes)):
         left, root = process.whitened(asked, own)
         deviations = ((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt()
         weights = torch.linalg.solve_triangular(root.mT, left, upper=True)

@@ -1,10 +1,14 @@
 """The library: public names, their examples, and equality with the command line."""
 
+import contextlib
 import doctest
 import inspect
+import pickle
 import re
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -17,6 +21,7 @@ from hydra import compose, initialize_config_dir
 import gaigs
 from gaigs import configuration
 from gaigs.algebra import Algebra
+from gaigs.geometry import ExtrapolationWarning
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.model.kriging import Kriging
@@ -241,6 +246,61 @@ def test_arguments_of_another_type_are_refused(spectra, tmp_path):
     untested = replace(spectra, split=replace(spectra.split, test=spectra.split.test[:0]))
     with pytest.raises(ValueError, match="links must have some to test on"):
         gaigs.evaluate(model, untested)
+
+
+@contextlib.contextmanager
+def double_precision():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    assert torch.get_default_dtype() == torch.float64
+    torch.set_default_dtype(before)
+
+
+def numbers(path):
+    """Predictions of a model of the built-in room, and of one of arrays, which are tensors of the caller's mode."""
+    links = gaigs.links("synthetic_rssi", transmitters=40)
+    model = gaigs.train("gaigs", links, max_steps=2, count=20, tokenizer="ga", enable_progress_bar=False)
+    model.save(path)
+    values = [gaigs.load(path).predict(PLACES), *model.predict(PLACES, interval=0.5)[:4]]
+    places = torch.tensor([[float(k), k % 3, 1.0] for k in range(20)], dtype=torch.float32)
+    array = gaigs.Receiver("door", gaigs.Pose.from_xyzw([0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0]))
+    links = gaigs.links(task="rssi", transmitters=places, receivers=array, labels=-40 - places[:, 0])
+    model = gaigs.train("mirrored", links, max_steps=2, enable_progress_bar=False)
+    return [*values, model.predict(PLACES), array.array.elements, gaigs.Grid.degrees().elevations]
+
+
+@pytest.mark.parametrize("mode", [double_precision, torch.inference_mode])
+def test_numbers_are_the_same_in_any_mode_of_torch(mode, tmp_path):
+    usual = numbers(tmp_path / "room.ckpt")
+    with mode():
+        found = numbers(tmp_path / "room.ckpt")
+        assert torch.is_inference_mode_enabled() == (mode is torch.inference_mode)
+    for value, true in zip(found, usual, strict=True):
+        assert value.dtype == true.dtype == torch.float32
+        assert torch.equal(value, true)
+
+
+def test_links_are_made_in_several_threads_at_once():
+    """In any default dtype, which is that of all threads."""
+    start, found = threading.Barrier(6), []
+
+    def make(_):
+        start.wait()
+        return gaigs.links("synthetic_rssi", transmitters=20, split="random").split.test
+
+    with double_precision(), ThreadPoolExecutor(6) as pool:
+        found = [*pool.map(make, range(6))]
+    assert all(torch.equal(test, found[0]) for test in found)
+
+
+def test_public_functions_go_to_other_processes_and_warn_at_the_line_that_calls_them():
+    functions = [value for value in (getattr(gaigs, name) for name in PUBLIC) if inspect.isfunction(value)]
+    assert all(pickle.loads(pickle.dumps(function)) is function for function in functions)
+    model = gaigs.train("mean", gaigs.links("synthetic_rssi", transmitters=20))
+    with pytest.warns(ExtrapolationWarning) as warned:
+        gaigs.radio_map(model, pitch=1.0, height=500.0)
+    assert warned[0].filename == __file__
 
 
 def test_test_links_that_a_model_has_learnt_from_are_told(spectra, tmp_path, caplog):

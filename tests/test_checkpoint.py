@@ -9,7 +9,7 @@ import subprocess
 import sys
 import traceback
 from pathlib import Path
-from zipfile import ZipFile
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ import gaigs
 from gaigs import checkpoint, runs
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
+from gaigs.registry import digests
 from gaigs.scene import Scene
 
 OVERRIDES = (
@@ -134,11 +135,21 @@ DEFECTS = {
         lambda content: MODEL(content)["tokenizer"].update(name="fourier"), "unknown tokenizer 'fourier'"
     ),
     "a task that is not installed": (lambda content: SCENE(content)["task"].update(name="odour"), "unknown task"),
-    "a plug-in that cannot be imported": (lambda content: MODEL(content).update(name="broken"), "ZeroDivisionError"),
+    "a plug-in that cannot be imported": (
+        lambda content: content[checkpoint.KEY].update(model={"name": "broken"}, plugins=digests("broken")),
+        "ZeroDivisionError",
+    ),
+    "a plug-in that is not recorded": (
+        lambda content: content[checkpoint.KEY].update(model={"name": "broken"}, plugins={}),
+        r"plugins/broken.py is not the source of model 'broken' that was recorded .*\n.* trust=True in gaigs.load",
+    ),
     "other weights": (lambda content: MODEL(content)["deformation"].update(width=32), "size mismatch for deformation"),
     "a weight too few": (lambda content: WEIGHTS(content).pop(MEANS), "Missing key.*gaussians.means"),
     "a weight that is a word": (lambda content: WEIGHTS(content).update({MEANS: "means"}), "means"),
     "NaN": (lambda content: WEIGHTS(content)[MEANS][3].fill_(torch.nan), "weights gaussians.means is not finite"),
+    "a rotation that is none": (
+        lambda content: SCENE(content)["receivers"][0].update(rotation=7 * torch.eye(3)), "must have a rotation, whose"
+    ),
     "a box of NaN": (lambda content: SCENE(content)["lower"].fill_(torch.nan), "scene lower is not finite"),
 }  # fmt: skip
 
@@ -171,11 +182,30 @@ def test_a_file_with_another_content_is_refused(defect, content, tmp_path, monke
         del sys.modules[name]
 
 
+ENDLESS: list = []
+ENDLESS.append(ENDLESS)
+
+
+def compress(path):
+    """Its own records, deflated: zeros would take a thousandth of their memory."""
+    with ZipFile(path) as archive:
+        records = {entry: archive.read(entry) for entry in archive.namelist()}
+    with ZipFile(path, "w", ZIP_DEFLATED) as archive:
+        for name, record in records.items():
+            archive.writestr(name, record)
+    checkpoint.seal(path)
+
+
 SPOILT = {
     "empty": lambda path: path.write_bytes(b""),
     "text": lambda path: path.write_text("means, quats\n"),
     "without a seal": lambda path: torch.save(checkpoint.read(path), path),
     "a tensor": lambda path: (torch.save(torch.zeros(3), path), checkpoint.seal(path)),
+    "compressed": lambda path: compress(path),
+    "larger than its file": lambda path: checkpoint.write(
+        checkpoint.read(path) | {"state": torch.zeros(1).expand(2**30)}, path
+    ),
+    "endless": lambda path: checkpoint.write(checkpoint.read(path) | {"loop": ENDLESS}, path),
     "truncated": lambda path: path.write_bytes(path.read_bytes()[:-2000]),
     "longer": lambda path: path.write_bytes(path.read_bytes() + b"0"),
 }

@@ -42,7 +42,10 @@ def changed(column, values):
 
 FAULTS = {
     "sound": ({}, ""),
-    "millimetres": ({"places": 1e3 * PLACES, "gateways": 1e3 * GATEWAYS}, "places span .* m; are they in mm, cm or km"),
+    "millimetres": (
+        {"places": 1e3 * PLACES, "gateways": 1e3 * GATEWAYS},
+        "receivers are 5.* m above .* all places; are places in mm",
+    ),
     "centimetres": (
         {"gateways": 100 * GATEWAYS},
         "if the receivers' coordinates are times 0.01",
@@ -52,13 +55,15 @@ FAULTS = {
         {"places": PLACES + np.array([5e4, 0, 0])},
         "receivers are .* m from all places",
     ),
-    "sign": ({"levels": -LEVELS}, "240 levels are above 0 dBm; was a sign lost"),
+    "sign": ({"levels": -LEVELS}, "240 levels are above 0 dBm, .* was a sign lost"),
     "mark": ({"levels": np.where(LEVELS < -58, -100, LEVELS)}, "levels are -100 dBm; does it mean not heard"),
     "constant": ({"levels": changed(2, -50.0)}, "levels are constant at rx2"),
     "twice": ({"levels": changed(2, LEVELS[:, 1])}, "rx1 and rx2 have the same levels"),
-    "place": ({"gateways": GATEWAYS[[0, 1, 2, 2]]}, "rx2 and rx3 stand at one place"),
-    "rows": ({"places": PLACES[[0, *range(59)]]}, "4 links repeat place and receiver of another"),
-    "exchanged": ({"levels": LEVELS[:, [1, 0, 2, 3]]}, "levels rise with the distance from rx0, rx1"),
+    "place": ({"gateways": GATEWAYS[[0, 1, 2, 2]]}, "levels of rx3 follow the distance to .* m off its place"),
+    "exchanged": (
+        {"levels": LEVELS[:, [1, 0, 2, 3]]},
+        "levels of rx0, rx1 follow the distance to .* from the places of rx1, rx0",
+    ),
 }
 
 
@@ -79,6 +84,13 @@ def test_links_of_every_task_are_described(task, tmp_path):
     assert "at 2 receivers" in text
     assert text.endswith("nothing suspicious")
     assert text.count("\n") < 40
+
+
+def test_repeated_readings_are_counted_and_no_fault():
+    rows = [0, *range(59)]
+    found = described(places=PLACES[rows], levels=LEVELS[rows])
+    assert "4 links repeat place and receiver of another" in found.read
+    assert found.findings == ()
 
 
 def test_black_spectra_are_named():

@@ -62,6 +62,20 @@ def uninterrupted(tmp_path_factory):
     return folder, out, err
 
 
+@pytest.mark.parametrize(
+    ("experiment", "task", "count"),
+    [("spectrum", "rssi", 1), ("mirrored_csi", "rssi", 1), ("spectrum_full", "csi", 1), ("rssi", "rssi", 0),
+     ("claims_rssi", "rssi", 0), ("mirrored", "rssi", 0)],
+)  # fmt: skip
+def test_an_experiment_for_another_task_than_the_data_is_named(caplog, experiment, task, count):
+    config = {"task": {"name": task}, "data": {"name": "rssi_csv"}}
+    command_line.note_task([f"+experiment={experiment}", "data=rssi_csv"], config)
+    command_line.note_task([f"+experiment={experiment}", "command=devices"], {"command": "devices"})
+    found = [record.message for record in caplog.records]
+    assert len(found) == count
+    assert all(f"labels of data=rssi_csv are of {task}" in line for line in found)
+
+
 def test_a_run_prints_what_it_does_and_nothing_else(uninterrupted):
     folder, out, err = uninterrupted
     assert err == ""

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -19,7 +20,7 @@ import yaml
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs import configuration, runs
+from gaigs import checkpoint, configuration, runs
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.geometry import Pose
@@ -542,6 +543,23 @@ class OwnMean(Mean):
 """
 
 
+LEVEL = """
+import gaigs
+import torch
+from gaigs.model import Model, Prediction
+from plugins.other import LEVEL
+
+@gaigs.register("model", "own_level")
+class OwnLevel(Model):
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.level = torch.nn.Parameter(torch.tensor(-50.0))
+
+    def forward(self, batch):
+        return Prediction(self.level * torch.ones(len(batch)), {})
+"""
+
+
 def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch, caplog):
     (tmp_path / "plugins").mkdir()
     own, other = tmp_path / "plugins/own.py", tmp_path / "plugins/other.py"
@@ -569,6 +587,41 @@ def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch, caplog):
     assert not caplog.text
     (tmp_path / "plugins/unrelated.py").write_text("")
     runs.folder.claim(folder, config)
+
+
+@pytest.mark.parametrize("name", ["own_mean", "own_level"])
+def test_a_plug_in_is_imported_if_it_is_the_recorded_one_or_trusted(name, tmp_path, monkeypatch, caplog):
+    """A look-up by the digests of its folder; a trained model by those of its checkpoint, or of an old one's folder."""
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins/other.py").write_text("LEVEL = 1")
+    (tmp_path / f"plugins/{name}.py").write_text(PLUGIN if name == "own_mean" else LEVEL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    monkeypatch.setattr(registry("model"), "_registered", registry("model")._registered.copy())
+    words = "data=synthetic_rssi", "data.transmitters=30", "trainer.max_steps=1", "trainer.enable_progress_bar=false"
+    config = gaigs.compose(f"model={name}", *words, baselines=[])
+    runs.run(config, tmp_path / "run")
+    loaded = [tmp_path / "run"]
+    if name == "own_level":
+        loaded.append(tmp_path / "saved.ckpt")
+        gaigs.load(tmp_path / "run").save(loaded[-1])
+        gaigs.load(tmp_path / "run/best.ckpt")
+        content = checkpoint.read(tmp_path / "run/best.ckpt")
+        del content[checkpoint.KEY]["plugins"]
+        checkpoint.write(content, tmp_path / "run/best.ckpt")
+        with pytest.raises(ValueError, match="that was recorded with the model"):
+            gaigs.load(tmp_path / "run/best.ckpt")
+    for path in loaded:
+        gaigs.load(path)
+    (tmp_path / "plugins/other.py").write_text("LEVEL = 2")
+    for path in loaded:
+        with pytest.raises(ValueError, match=rf"plugins/{name}.py is not the source .*\n.*trust=True in gaigs.load"):
+            gaigs.load(path)
+        gaigs.load(path, trust=True).predict([[1.0, 2.0, 1.5]])
+    with pytest.raises(ValueError, match="is not the source"):
+        gaigs.run(gaigs.compose("command=survey", folder=str(tmp_path / "run")), tmp_path / "survey")
+    for module in [module for module in sys.modules if module.partition(".")[0] == "plugins"]:
+        del sys.modules[module]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import io
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 from gaigs.antenna import PATTERNS, Array, Receiver
 from gaigs.data import floors_of
-from gaigs.geometry import Grid, Pose
+from gaigs.geometry import Frame, Grid, Pose
 from gaigs.query import Query
 from gaigs.scene import Scene
 from gaigs.task.csi import Csi
@@ -67,6 +68,13 @@ def test_rows_lie_along_y_and_columns_along_x(rows, columns):
     assert not elements[:, :, 2].any()
 
 
+def test_elements_of_an_array_have_places_in_the_room():
+    receiver = Receiver("door", Pose.from_xyzw([1.0, 2.0, 3.0], [0.0, 0.0, 1.0, 0.0]), Array.planar(2, 2, 1.0))
+    places = receiver.pose.world(receiver.array.elements)
+    assert places.tolist() == [[1.5, 2.5, 3.0], [1.5, 1.5, 3.0], [0.5, 2.5, 3.0], [0.5, 1.5, 3.0]]
+    assert torch.equal(receiver.pose.local(places), receiver.array.elements)
+
+
 def test_elements_hear_as_their_pattern_says():
     directions = Grid.degrees(range(-90, 91, 30), range(0, 360, 60)).vectors().double()
     assert torch.equal(Array.single().gain(directions), torch.ones(7, 6, dtype=torch.float64))
@@ -88,6 +96,8 @@ def test_elements_hear_as_their_pattern_says():
         (lambda: Array.planar(4, 4, 0.0), "at 0.0 m"),
         (lambda: Array.planar(4, 4, math.nan), "at nan m"),
         (lambda: Array.planar(4, 4, math.inf), "at inf m"),
+        (lambda: Receiver("door", Pose(torch.zeros(3), torch.eye(3) * 7)), "of receiver 'door' must have a rotation"),
+        (lambda: Receiver("door", Pose(torch.zeros(3), torch.eye(3).flip(0))), "must have a rotation"),
     ],
 )
 def test_impossible_arrays_are_refused(make, message):
@@ -133,6 +143,52 @@ def test_each_pair_of_elements_has_its_lag(array):
     assert not steps[len(steps) // 2].any()
 
 
+# --- frames ---
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (
+            (32632, 11.5, 48.1),
+            r"an easting and a northing .*, got Frame\(epsg=32632, x=11.5, y=48.1\)",
+        ),
+        ((32632, 0.0, 0.0), "an easting and a northing"),
+        ((32632, 5.4e6, 4.5e5), "an easting and a northing"),
+        ((32632, math.nan, 5.4e6), "x=nan"),
+        (("32632", 4.5e5, 5.4e6), "epsg='32632'"),
+        (
+            (2263, 980000.0, 200000.0),
+            r"projected system in metres, got EPSG:2263, .* in US survey foot\ngaigs.data",
+        ),
+        ((4978, 4e6, 5e5), "projected system in metres, got EPSG:4978"),
+        ((99999, 1e5, 1e5), "there is no coordinate system EPSG:99999"),
+    ],
+)
+def test_frames_that_are_no_projected_metres_are_refused(frame, message):
+    pytest.importorskip("pyproj")
+    with pytest.raises(ValueError, match=message):
+        Frame(*frame)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_systems_in_metres_are_taken_and_those_of_utm_without_pyproj(monkeypatch):
+    pytest.importorskip("pyproj")
+    for code, x, y in ((25832, 4.5e5, 5.4e6), (27700, 0.0, 0.0), (3857, 1e6, 6e6), (np.int64(32633), -8e4, 6.9e6)):
+        assert Frame(code, x, y).epsg == code
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    assert Frame(32632, 4.5e5, 5.4e6) == Frame(32632, 450000.0, 5400000.0)
+    with pytest.raises(ValueError, match="an easting and a northing"):
+        Frame(4326, 11.5, 48.1)
+
+
+def test_a_stored_scene_with_an_impossible_frame_has_none(scene, caplog):
+    for frame, expected in (((4326, 11.5, 48.1), None), ((32632, 4.5e5, 5.4e6), Frame(32632, 4.5e5, 5.4e6))):
+        assert Scene.from_state(scene.state() | {"frame": frame}).frame == expected
+    assert caplog.text.count("predictions have no place on a map: a frame must be an EPSG code") == 1
+
+
 # --- states ---
 
 
@@ -140,7 +196,7 @@ def test_each_pair_of_elements_has_its_lag(array):
 def test_a_scene_comes_back_from_its_state(task):
     patches = Receiver("patches", POSE, Array.planar(2, 3, 0.1, "cosine"))
     scene = replace(example_links(task).scene, frequencies=torch.tensor([2.4e9, 5.0e9]), bandwidth=499.2e6)
-    scene = replace(scene, receivers=(*scene.receivers, patches))
+    scene = replace(scene, receivers=(*scene.receivers, patches), frame=Frame(32632, np.float64(4.5e5), 5.4e6))
     again = Scene.from_state(stored(scene.state()))
     for receiver, other in zip(scene.receivers, again.receivers, strict=True):
         assert other.name == receiver.name
@@ -150,7 +206,7 @@ def test_a_scene_comes_back_from_its_state(task):
         assert other.array.pattern == receiver.array.pattern
     for field in ("lower", "upper", "frequencies"):
         assert torch.equal(getattr(again, field), getattr(scene, field))
-    assert again.spacing == scene.spacing
+    assert (again.spacing, again.frame) == (scene.spacing, scene.frame)
     assert again.bandwidth == 499.2e6
     assert type(again.task) is type(scene.task)
     assert again.task.shape == scene.task.shape

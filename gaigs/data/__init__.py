@@ -12,15 +12,15 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gaigs.antenna import Receiver, lacking
-from gaigs.data.doubts import doubts
+from gaigs.data.checks import check
 from gaigs.data.gateways import estimate_place
+from gaigs.data.maps import check_metres
 from gaigs.geometry import Frame, Pose
 from gaigs.io.images import GreyImages
 from gaigs.io.tables import shortened
-from gaigs.phases import MANY, phase_sign, strange_parts, unknown_phase
 from gaigs.query import Batch, Query
 from gaigs.registry import registry
-from gaigs.scene import Scene, direct_waves
+from gaigs.scene import Scene
 from gaigs.task import Task
 from gaigs.task.csi import Csi
 
@@ -111,7 +111,7 @@ class Links:
     frame: Frame | None = None
     uncertainties: Float[Tensor, " r"] | None = None
     noises: Float[Tensor, " n"] | None = None
-    edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
+    edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3, dtype=torch.float32))
     remarks: str = ""
     origin: Mapping = field(default_factory=dict)
 
@@ -208,6 +208,8 @@ def divide(links: Links, split: Mapping) -> Links:
         at = [f"at {band.min():.7g} .. {band.max():.7g} GHz" for band in bands]
         parts = replace(parts, name=f"{parts.name}, trained {at[0]}, tested {at[1]}")
     links = replace(links, split=parts)
+    if links.frame is None:
+        check_metres("transmitters", links.query.transmitters.unique(dim=0).double().numpy())
     if isinstance(links.task, Csi):
         check_elements(links)
     if links.uncertainties is not None:
@@ -216,9 +218,10 @@ def divide(links: Links, split: Mapping) -> Links:
     if phase != "known":
         unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[phase]
         remarks.append(f"{unknown} of each link unknown, and removed in every score")
-    for doubt in [*doubts(links), *phase_doubts(links)]:
-        log.warning(doubt)
-        remarks.append(doubt)
+    found = tuple(check(links))
+    for finding in found:
+        log.warning("%s", finding)
+        remarks.append(str(finding))
     return replace(links, remarks="; ".join(filter(None, remarks)))
 
 
@@ -238,50 +241,6 @@ def check_elements(links: Links) -> None:
                 f"labels must be 0 at elements that an array lacks; that of link {int(part[link])} is not at element "
                 f"{element}, and {links.receivers[int(own[link])].name} has {sizes[int(own[link])]} elements"
             )
-
-
-def phase_doubts(links: Links) -> list[str]:
-    """Sentences if phases of channels do not follow the geometry, or disagree with those that are declared."""
-    task = links.task
-    if not isinstance(task, Csi) or task.phase == "per_link_and_delay":
-        return []
-    train, every = links.split.train, links.query.receivers[links.split.train]
-    own = (train[every == receiver] for receiver in range(len(links.receivers)))
-    train = torch.cat([part[:: max(1, len(part) // 64)] for part in own])
-    receivers, labels = links.query.receivers[train], links.labels[train].to(torch.complex128)
-    everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
-    waves, found = direct_waves(everywhere, links.query[train], task.frequencies), []
-    is_known, strange = task.phase == "known", {}
-    sign = phase_sign(labels, waves, receivers) if is_known else 0
-    if sign:
-        strange = strange_parts(labels, waves, receivers, task.frequencies, sign)
-    is_fixed = any(elements or delay is not None for elements, _, delay in strange.values())
-    if not is_fixed and (phase := unknown_phase(labels, waves, receivers, task.frequencies, task.phase)):
-        common = "phase" if is_known else "delay"
-        found.append(
-            f"channels have no {common} in common, as if each packet had its own; set data.phase={phase}, "
-            "or check units, axes and order of tx, rx and elements"
-        )
-        strange = {}
-    elif is_known and not sign and len(train) >= MANY * len(receivers.unique()):
-        found.append(
-            "phases of the channels do not follow the direct distance; unless walls block most direct waves, "
-            "check units and order of tx, rx, elements and h, and the frequencies, or set data.phase=per_link if each "
-            "packet has a phase of its own"
-        )
-    for receiver, (elements, subcarriers, delay) in strange.items():
-        unexplained = "have phases that geometry does not explain, the same at all links"
-        if elements:
-            found.append(
-                f"the elements of {links.receivers[receiver].name} {unexplained}; check order, axes and unit of "
-                "elements and tx, or calibrate the array"
-            )
-        if subcarriers:
-            late = "check their order"
-            if delay is not None:
-                late = f"take a delay of {1e9 * delay:.3g} ns off h, or set data.phase=per_link_and_delay"
-            found.append(f"the subcarriers of {links.receivers[receiver].name} {unexplained}; {late}")
-    return found
 
 
 def only_trained(links: Links) -> Links:

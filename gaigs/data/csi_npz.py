@@ -14,6 +14,7 @@ from gaigs.antenna import Array, Receiver
 from gaigs.data import Links
 from gaigs.data.bands import hold_out_band
 from gaigs.data.impulse_responses import from_sionna
+from gaigs.data.parts import check_parts, join
 from gaigs.geometry import FAR, WITHIN, Pose
 from gaigs.io.files import atomic_write
 from gaigs.io.tables import find_file, number_places
@@ -56,6 +57,7 @@ def read(
     phase: str = "known",
     band_train: Sequence[float] | None = None,
     band_test: Sequence[float] | None = None,
+    parts: str | None = None,
 ) -> Links:
     """A data set from an ``.npz``, ``.mat`` or HDF5 file: one link for each channel.
 
@@ -66,15 +68,17 @@ def read(
     Args:
         file: Arrays ``tx`` (n, 3), positions of the transmitters [m]; ``rx`` (k, 3), positions of the receivers [m];
             ``rx_index`` (n,), receiver of each link, from 0, not needed with one receiver; ``frequencies`` (s,),
-            subcarriers [Hz]; ``h`` (n, e, s), complex channels, linear amplitude, or real and imaginary part along a
-            first or last axis of 2; optionally ``elements`` (e, 3), offsets of an array's elements from its receiver's
-            position along the world's axes [m], by default 0. With (k, e, 3) each receiver has its own, and NaN for
-            those that it lacks, where ``h`` is 0. The remarks name other arrays. In place of ``h`` and ``rx_index`` the
-            file may have impulse responses, see ``gaigs.data.impulse_responses.from_sionna``.
+            subcarriers [Hz]; ``h`` (n, e, s), complex channels, linear amplitude; optionally ``elements`` (e, 3),
+            offsets of an array's elements from its receiver's position along the world's axes [m], by default 0. With
+            (k, e, 3) each receiver has its own, and NaN for those that it lacks, where ``h`` is 0. The remarks name
+            other arrays. In place of ``h`` and ``rx_index`` the file may have impulse responses, see
+            ``gaigs.data.impulse_responses.from_sionna``.
         arrays: Names of these arrays in the file where they differ, such as ``{"h": "CSI"}``; two names are those of
             real and imaginary part.
         phase: Of ``gaigs.task.csi.Csi``.
         band_train, band_test: Subcarriers to train and to test on, as for ``gaigs.data.bands.hold_out_band`` [Hz].
+        parts: Axis of 2, ``first`` or ``last``, along which a real ``h`` has real and imaginary part. None: ``h`` is
+            complex, or two arrays.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -86,14 +90,20 @@ def read(
     known = ARRAYS | RESPONSES
     if unknown := [suggest(name, known) for name in arrays if name not in known]:
         raise ValueError(f"data.arrays has no array {listed(unknown)}; it has: {listed(known)}")
-    loaded, ignored = _load(file, arrays)
+    if parts not in (None, "first", "last"):
+        raise ValueError(
+            f"data.parts must be first or last, the axis of real and imaginary part, or null, got {parts!r}"
+        )
+    loaded, ignored = _load(file, arrays, parts)
+    added: list[str] = []
     if "a" in loaded:
         try:
-            loaded = from_sionna(loaded, needs_delays=phase != "per_link_and_delay")
+            loaded, added = from_sionna(loaded, needs_delays=phase != "per_link_and_delay")
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
     _check_shapes(file, loaded)
     _check_values(file, loaded)
+    check_parts(f"{file}: h", loaded["h"])
     _move_missing_elements_last(file, loaded)
 
     numbers = {name: torch.from_numpy(array) for name, array in loaded.items()}
@@ -108,7 +118,7 @@ def read(
     antennas = [Array(own[own.isfinite().all(1)]) for own in elements]
     poses = [Pose(position, torch.eye(3)) for position in positions]
     everyone = [Receiver(f"rx{k}", *parts) for k, parts in enumerate(zip(poses, antennas, strict=True))]
-    remarks = [f"{len(rows)} channels from {len(places)} places at {len(present)} receivers"]
+    remarks = [f"{len(rows)} channels from {len(places)} places at {len(present)} receivers", *added]
     if silent := int((~heard).sum()):
         remarks.append(f"{silent} that are zero throughout are left out")
     if absent := [receiver.name for k, receiver in enumerate(everyone) if k not in present]:
@@ -144,7 +154,7 @@ def write(folder: str | Path, links: Links) -> None:
         )
 
 
-def _load(file: Path, given: Mapping[str, str | list]) -> tuple[dict[str, np.ndarray], list[str]]:
+def _load(file: Path, given: Mapping[str, str | list], axis: str | None) -> tuple[dict[str, np.ndarray], list[str]]:
     """The arrays by name, and the names of ignored arrays; ``given`` has other names of arrays in the file."""
     arrays: dict[str, np.ndarray] = {}
     place, used = "", list[str]()
@@ -167,6 +177,8 @@ def _load(file: Path, given: Mapping[str, str | list]) -> tuple[dict[str, np.nda
                     if name == "rx_index" and arrays["rx"].shape[:1] == (1,):
                         arrays[name] = np.zeros(arrays["tx"].shape[:1], np.int64)
                         continue
+                    if name == "rx_index" and arrays["rx"].shape[1:] != (3,):
+                        continue  # the error names the shape of rx
                 if len(names) > 1 and not (name in ("h", "a") and len(names) == 2):
                     raise ValueError(f"data.arrays has {len(names)} names")
                 if missing := [own for own in names if members.count(own) != 1]:
@@ -176,7 +188,7 @@ def _load(file: Path, given: Mapping[str, str | list]) -> tuple[dict[str, np.nda
                         f"{missing[0]!r} among {reprlib.repr(members)}; data.arrays takes other names"
                     )
                 parts, used = [get(own) for own in names], used + names
-                array = _join(parts, arrays["tx"].shape[0]) if kind == "complex" else parts[0]
+                array = join(parts, axis) if kind == "complex" else parts[0]
                 if opened is not _npz and name != "a":
                     array = _from_matlab(array, kind, len(sizes))
                 arrays[name] = array
@@ -185,23 +197,6 @@ def _load(file: Path, given: Mapping[str, str | list]) -> tuple[dict[str, np.nda
     except Exception as error:  # damaged files make numpy, scipy and h5py raise exceptions of many types
         raise ValueError(f"cannot parse {file}: {place}{error}; expected {expected}") from error
     return arrays, [name for name in members if name not in used]
-
-
-def _join(parts: list[np.ndarray], links: int) -> np.ndarray:
-    """Channels from real and imaginary part, in two arrays or along the first or last axis of one."""
-    if len(parts) == 2:
-        shapes, kinds = zip(*((part.shape, part.dtype.kind) for part in parts), strict=True)
-        if shapes[0] != shapes[1] or not all(kind in "iuf" for kind in kinds):
-            got = " and ".join(f"{part.dtype} {part.shape}" for part in parts)
-            raise ValueError(f"data.arrays: real and imaginary part of h must be real and of one shape, got {got}")
-        return parts[0] + 1j * parts[1]
-    (array,) = parts
-    if array.ndim == 4 and array.dtype.kind in "iuf":
-        if array.shape[-1] == 2 and array.shape[0] == links:
-            return array[..., 0] + 1j * array[..., 1]
-        if array.shape[0] == 2 and array.shape[1] == links:
-            return array[0] + 1j * array[1]
-    return array
 
 
 def _from_matlab(array: np.ndarray, kind: str, axes: int) -> np.ndarray:
@@ -274,8 +269,10 @@ def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
         kind, letters = ARRAYS[name]
         letters = ("k", *letters) if name == "elements" and array.ndim == 3 else letters
         if array.dtype.kind not in kinds[kind]:
-            hint = "; data.arrays={h: [RE, IM]} names real and imaginary part" if kind == "complex" else ""
-            raise ValueError(f"{file}: {name}: expected {kind} numbers, got {array.dtype}{hint}")
+            hint = "; data.arrays={h: [RE, IM]} names real and imaginary part, data.parts=last or first their axis of 2"
+            hint += "; amplitudes alone have no phase"
+            got = f"{array.dtype}{hint}" if kind == "complex" else array.dtype
+            raise ValueError(f"{file}: {name}: expected {kind} numbers, got {got}")
         sizes = tuple(known.get(letter, letter) for letter in letters)
         fits = [isinstance(size, str) or size == got for size, got in zip(sizes, array.shape, strict=False)]
         if array.ndim != len(sizes) or not all(fits) or not array.size:

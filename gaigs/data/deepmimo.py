@@ -18,7 +18,7 @@ from torch import Tensor
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links
 from gaigs.data.bands import hold_out_band
-from gaigs.data.impulse_responses import to_channels
+from gaigs.data.impulse_responses import lacks_carrier, to_channels
 from gaigs.geometry import FAR, WITHIN, Pose
 from gaigs.io.files import atomic_write, write_text
 from gaigs.io.tables import find_folder, has_file, number_places, quote
@@ -173,6 +173,13 @@ def gather(
 def read_stations(root: str | Path, with_angles: bool) -> tuple[float, list[StationPaths], list[str]]:
     """The carrier of a scenario [Hz], its paths of each base station and set of users, and remarks on them."""
     root = find_folder(root)
+    names = sorted(path.name for path in (*root.iterdir(), *root.glob("*/*.mat")))  # scenes have a folder each
+    old = [name for name in names if re.fullmatch(r"BS\d+_(BS|UE_\d+-\d+)\.mat|.*\.\d+\.(CIR|DoA|DoD)\.mat", name)]
+    if old:
+        raise ValueError(
+            f"{root}: a scenario of DeepMIMO v3 or before, as {old[0]} shows; get that of v4\n"
+            f"by the package deepmimo: deepmimo.download({root.name!r}), or deepmimo.convert of the ray tracer's files"
+        )
     file = root / "params.json"
     if not has_file(file) and has_file(root.parent / file.name):  # of a dynamic scenario, one folder a scene
         file = root.parent / file.name
@@ -204,7 +211,7 @@ def read_stations(root: str | Path, with_angles: bool) -> tuple[float, list[Stat
         raise ValueError(f"{root}: expected a path to a user in {names}, got none")
     remarks = []
     fields, delays = (np.concatenate(part) for part in zip(*direct, strict=True))
-    if _lacks_carrier(fields, delays, frequency, tracer):
+    if lacks_carrier(fields, delays, frequency, otherwise=tracer.startswith("Sionna")):
         turn = lambda station: np.exp(-2j * np.pi * frequency * station.delays)
         stations = [replace(station, fields=station.fields * turn(station)) for station in stations]
         remarks.append("phases lack the carrier's over the delay, as those of Sionna RT; it is added")
@@ -275,21 +282,6 @@ def _load(file: Path, name: str) -> np.ndarray:
     except Exception as error:  # damaged files make numpy and scipy raise exceptions of many types
         cause = " ".join(f"{type(error).__name__}: {error}".split())
         raise ValueError(f"cannot parse {file}: {cause}; expected an array {name!r} of real numbers") from error
-
-
-def _lacks_carrier(
-    fields: Complex[np.ndarray, " k"], delays: Float[np.ndarray, " k"], frequency: float, tracer: str
-) -> bool:
-    """True if phases are without that of the delay at the carrier: those of the lines of sight are then all alike.
-
-    Converters store the phase as their ray tracer gives it, and Sionna RT gives it so. Fewer than ten lines of sight
-    leave it to the ray tracer's name.
-    """
-    if len(fields) < 10:
-        return tracer.startswith("Sionna")
-    units = fields / np.abs(fields)
-    alike, included = abs(units.mean()), abs((units * np.exp(2j * np.pi * frequency * delays)).mean())
-    return bool(alike > max(0.9, included))
 
 
 def write(

@@ -4,7 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.constants import speed_of_light
 
+from gaigs.data.parts import check_parts
 from gaigs.query import check_carrier
 
 PART = 256
@@ -35,10 +37,26 @@ def to_channels(
     return found
 
 
-def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> dict[str, np.ndarray]:
-    """Arrays of ``gaigs.data.csi_npz`` from impulse responses as ``sionna.rt.Paths.cir`` gives them.
+def lacks_carrier(
+    fields: Complex[np.ndarray, " k"], delays: Float[np.ndarray, " k"], frequency: float, otherwise: bool = False
+) -> bool:
+    """True if gains of lines of sight are without the phase of their delay at the carrier: all phases are alike.
 
-    The end with fewer places, the receivers in a tie, becomes the fixed one; a channel is the same both ways.
+    Ray tracers may give gains so. Fewer than ten lines of sight leave it to ``otherwise``.
+    """
+    if len(fields) < 10:
+        return otherwise
+    units = fields / np.abs(fields)
+    alike, included = abs(units.mean()), abs((units * np.exp(2j * np.pi * frequency * delays)).mean())
+    return bool(alike > max(0.9, included))
+
+
+def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Arrays of ``gaigs.data.csi_npz`` from impulse responses as ``sionna.rt.Paths.cir`` gives them, and remarks.
+
+    Gains without the phase of the delay at the carrier, as of ``sionna.rt.Paths.a``, get it. Lines of sight show it:
+    first paths whose delay is the distance over the speed of light. The end with fewer places, the receivers in a tie,
+    becomes the fixed one; a channel is the same both ways.
 
     Args:
         arrays: ``a`` (k, e, n, m, p, 1) and ``tau`` (k, n, p) or (k, e, n, m, p), of k receivers ``rx`` with e antennas
@@ -64,6 +82,7 @@ def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> dict[st
             "tau = paths.cir(normalize_delays=False, out_type='numpy')"
         )
     a = a[..., 0]
+    check_parts("a", a[a != 0])
     tau = tau[:, None, :, None] if tau.ndim == 3 else tau
     shared = (a.shape[0], 1, a.shape[2], 1, a.shape[4])  # the delays of a synthetic array
     if tx.shape != (a.shape[2], 3) or rx.shape != (a.shape[0], 3) or tau.shape not in (a.shape, shared):
@@ -88,6 +107,18 @@ def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> dict[st
     )
     is_relative = (np.abs(subcarriers) < carrier / 2).all()
     frequencies = subcarriers + (carrier if is_relative else 0.0)
+    distances = np.linalg.norm(tx[:, None] - rx, axis=2).reshape(-1)  # (links,)
+    near = np.zeros(1, int)  # the element next to the receiver's position
+    if "elements" in arrays and arrays["elements"].ndim == 2:
+        near = np.linalg.norm(arrays["elements"], axis=1).argmin(keepdims=True)
+    own, times = gains[:, near[0]], delays[:, min(near[0], delays.shape[1] - 1)]  # (links, p)
+    first = np.where(own != 0, times, np.inf).argmin(1, keepdims=True)
+    own, times = (np.take_along_axis(part, first, 1)[:, 0] for part in (own, times))
+    is_direct = (own != 0) & (np.abs(times * speed_of_light - distances) < 0.1 + 1e-3 * distances)
+    remarks = []
+    if lacks_carrier(own[is_direct], times[is_direct], carrier):
+        gains = gains * np.exp(-2j * np.pi * carrier * delays.astype(float))
+        remarks.append("phases of a lack the carrier's over the delay, and get it")
     return {
         "tx": tx.repeat(len(rx), 0),
         "rx": rx,
@@ -95,4 +126,4 @@ def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> dict[st
         "frequencies": frequencies,
         "h": to_channels(gains.astype(complex), delays, frequencies - carrier),
         **{name: arrays[name] for name in ("elements",) if name in arrays},
-    }
+    }, remarks

@@ -15,6 +15,7 @@ from torch import Tensor
 from gaigs import configuration
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, divide, load
+from gaigs.data.parts import check_parts
 from gaigs.data.readings import loud_remark, marks_of
 from gaigs.geometry import Frame, Pose
 from gaigs.io.tables import number_places, shortened
@@ -143,6 +144,8 @@ def from_arrays(
     if task.dtype.is_complex and not labels.is_complex():
         raise ValueError(f"labels of task {task.name!r} must be complex, got {labels.dtype}; magnitudes have no phase")
     labels = labels.to(task.dtype)
+    if labels.is_complex():
+        check_parts("labels", labels.numpy())
     count, most, shape = len(places), len(receivers), tuple(task.shape)
     rows = torch.arange(count)
     if tuple(labels.shape) == (count, most, *shape) and index is None:
@@ -230,8 +233,9 @@ def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
     if rows.dtype == torch.bool and rows.shape == (count,):
         rows = rows.nonzero()[:, 0]
     is_whole = not (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool)
-    numbers = rows.long()
+    numbers, given = rows.long(), reprlib.repr(values)
     if not (is_whole and rows.ndim == 1 and len(rows) and ((numbers >= 0) & (numbers < count)).all()):
-        given = reprlib.repr(values)
         raise ValueError(f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got {given}")
-    return numbers.unique()
+    if len(numbers.unique()) < len(numbers):
+        raise ValueError(f"{name} must hold each row once, got {given}; a mask must be boolean, of True and False")
+    return numbers.sort().values

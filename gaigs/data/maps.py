@@ -6,10 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-
-def is_utm(epsg: int) -> bool:
-    """True for the codes of UTM on WGS 84."""
-    return 1 <= epsg % 100 <= 60 and epsg // 100 in (326, 327)
+from gaigs.geometry import is_utm
 
 
 def find_pyproj() -> Any:
@@ -19,6 +16,54 @@ def find_pyproj() -> Any:
     except ImportError:
         raise ImportError("coordinate systems need pyproj: pip install 'gaigs[maps]'") from None
     return pyproj
+
+
+def metres_of(epsg: int) -> float | None:
+    """Metres in a unit of a system's coordinates; None for degrees.
+
+    Raises:
+        ImportError: pyproj is needed and not installed.
+        ValueError: There is no such system.
+
+    Example:
+        >>> from gaigs.data.maps import metres_of
+        >>> round(metres_of(2263), 6)  # New York, in feet of the US survey
+        0.304801
+    """
+    if is_utm(epsg):
+        return 1.0
+    pyproj = find_pyproj()
+    try:
+        system = pyproj.CRS.from_epsg(epsg)
+    except pyproj.exceptions.ProjError as error:
+        raise ValueError(f"data.epsg={epsg} is no coordinate system: {' '.join(str(error).split())}") from None
+    return None if system.is_geographic else system.axis_info[0].unit_conversion_factor
+
+
+def are_degrees(points: Float[ndarray, "n d"]) -> bool:
+    """True if x and y [m] are probably longitude and latitude, in either order.
+
+    They then span less than 0.3 and less than a hundredth of their distance from the origin, and have five decimals or
+    more. A grid in metres has no such decimals.
+    """
+    if len(points) < 2:
+        return False
+    x, y = np.abs(points[:, :2]).max(0)
+    span = np.ptp(points[:, :2], axis=0).max()
+    rests = np.abs(points[:, :2] - points[:, :2].round(4))
+    is_on_earth = max(x, y) <= 180 and min(x, y) <= 90
+    return bool(is_on_earth and 0 < span < min(0.3, max(x, y) / 100) and (rests > 1e-5).mean() > 0.3)
+
+
+def check_metres(
+    where: str,
+    points: Float[ndarray, "n d"],
+    mend: str = "convert them, as gaigs.data.maps.to_utm(points, 4326) does, longitude first",
+) -> None:
+    """Raises a ``ValueError`` if coordinates are longitudes and latitudes; ``mend`` says how to read them."""
+    if are_degrees(points):
+        x, y = points[0, :2].tolist()
+        raise ValueError(f"{where}: expected metres, got such as ({x:.7g}, {y:.7g}), which look like degrees\n{mend}")
 
 
 def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 2"], int]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gaigs.data import Links, Parts
-from gaigs.data.readings import carriers_of, gateway, loud_remark, to_dbm
+from gaigs.data.readings import carriers_of, gateway, loud_remark, match_names, suggested, to_dbm
 from gaigs.io import tables
 from gaigs.io.yaml import read_mapping, to_position
 from gaigs.query import Query
@@ -80,16 +80,20 @@ def read(root: str | Path, frequency: float | None = None) -> Links:
 def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list[list[float]]]:
     """The gateway of each column, and the readings [dBm] of each row."""
     lines = tables.read_lines(file, "an RSSI [dBm] of each gateway, one measurement a line")
-    first = tables.split_cells(lines[0])
+    delimiter = tables.find_delimiter(lines)
+    first = tables.split_cells(lines[0], delimiter)
     header = any(cell in gateways for cell in first) or all(math.isnan(tables.to_number(cell)) for cell in first)
-    names = first if header else [*gateways]
+    matched = match_names(first, gateways) if header else {}
+    names = [matched.get(cell, cell) for cell in first] if header else [*gateways]
     for name in names:
         if name not in gateways:
-            raise ValueError(f"{file}, line 1: column {tables.quote(name)} has no position in gateway_position.yml")
+            near = suggested(name, [other for other in gateways if other not in names])
+            raise ValueError(f"{file}, line 1: column {near} has no position in gateway_position.yml")
     for name in gateways:
         if names.count(name) != 1:
             raise ValueError(f"{file}, line 1: expected one column {tables.quote(name)}, got {names.count(name)}")
-    readings = to_dbm(file, tables.split_rows(file, lines, names, int(header)), names, NOT_HEARD, NOT_HEARD)
+    rows = tables.split_rows(file, lines, names, int(header), delimiter)
+    readings = to_dbm(file, rows, names, NOT_HEARD, [NOT_HEARD], f"write {NOT_HEARD:g}")
     if all(value == NOT_HEARD for row in readings for value in row):
         raise ValueError(f"{file}: expected readings above {NOT_HEARD:g} dBm, got none; no gateway heard anything")
     return names, readings

@@ -153,7 +153,7 @@ def _read_frequencies(file: Path, count: int) -> Float[Tensor, " n"]:
     gigahertz = [tables.to_number(line) for line in lines]
     low, high = (bound / 1e9 for bound in CARRIERS)
     wrong = {
-        number: f"{tables.quote(line)}{unit_hint(value)}"
+        number: f"{tables.described(line)}{unit_hint(value)}"
         for number, (line, value) in enumerate(zip(lines, gigahertz, strict=True), 1)
         if not low <= value <= high
     }

@@ -1,5 +1,7 @@
 """Readings of received signal strength: their bounds and receivers."""
 
+import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -11,8 +13,9 @@ from torch import Tensor
 
 from gaigs.antenna import Receiver
 from gaigs.geometry import Pose
-from gaigs.io.tables import Rows, to_numbers
+from gaigs.io.tables import Rows, to_number, to_numbers
 from gaigs.query import check_carrier
+from gaigs.registry import suggest
 
 QUIETEST, LOUDEST = -150.0, 30.0
 """Bounds of readings [dBm]: others are another unit, a lost sign or a mark of "not heard" such as 100."""
@@ -26,11 +29,54 @@ def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiv
     return Receiver(name, Pose(torch.as_tensor(position), torch.eye(3)))
 
 
-def to_dbm(file: Path, rows: Rows, names: Sequence[str], lowest: float, not_heard: float) -> list[list[float]]:
-    """Cells of a table as readings [dBm]; a ``ValueError`` where one is neither ``not_heard`` nor in range."""
-    holds = lambda value: value == not_heard or lowest <= value <= LOUDEST
-    expected = f"an RSSI from {lowest:g} to {LOUDEST:g} dBm ({not_heard:g} where nothing was heard)"
-    return to_numbers(file, rows, names, holds, expected)
+def to_dbm(
+    file: Path, rows: Rows, names: Sequence[str], lowest: float, not_heard: Sequence[float], mend: str
+) -> list[list[float]]:
+    """Cells of a table as readings [dBm]; a ``ValueError`` where one is neither ``not_heard`` nor in range.
+
+    ``mend`` says in the error what to do with other marks of "not heard".
+    """
+    cells = {line: [re.sub(r"(?i)\s*dbm$", "", cell) for cell in own] for line, own in rows.items()}
+    holds = lambda value: value in not_heard or lowest <= value <= LOUDEST
+    expected = f"an RSSI from {lowest:g} to {LOUDEST:g} dBm ({and_list(not_heard)} where nothing was heard)"
+    try:
+        return to_numbers(file, cells, names, holds, expected)
+    except ValueError as error:
+        levels = np.array([[to_number(cell) for cell in own] for own in cells.values()])
+        others = [mark for mark in marks_of(levels) if mark not in not_heard]
+        if not others:
+            raise
+        raise ValueError(f'{error}\n{and_list(others)} seem to mean "not heard": {mend}') from None
+
+
+def marks_given(not_heard: float | Sequence[float]) -> list[float]:
+    """The values of the option ``not_heard``, one number or several."""
+    return [float(mark) for mark in (not_heard if isinstance(not_heard, Sequence) else [not_heard])]
+
+
+def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
+    """The known name of each name: the same, or the only one that differs in case, blanks, ``_``, ``-`` and ``:``."""
+    plain = lambda name: re.sub(r"[\s_:-]", "", name.casefold())
+    spelt, alike = Counter(map(plain, names)), Counter(map(plain, known))
+    same, last = {*known}, {plain(name): name for name in known}
+    found = {}
+    for name in names:
+        if name in same:
+            found[name] = name
+        elif alike[plain(name)] == 1 == spelt[plain(name)]:
+            found[name] = last[plain(name)]
+    return found
+
+
+def suggested(name: str, others: Iterable[str]) -> str:
+    """A name, with the most similar one of others that have the same digits."""
+    return suggest(name, [other for other in others if re.findall(r"\d+", other) == re.findall(r"\d+", name)])
+
+
+def and_list(numbers: Iterable[float]) -> str:
+    """Ascending numbers in words: 0, 60 and 102."""
+    words = [f"{number:g}" for number in sorted(numbers)]
+    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
 
 
 def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
@@ -38,18 +84,20 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
 
     Out of bounds they are repeated or usual values. Within bounds they are
 
-    - 0, or a repeated -1 or 1, 10 dB above all others;
-    - of columns with two values or more, a usual value from -105 down, 5 dB below all others; -100, if it is repeated
-      and more than 10 dB below them; and the lowest or a usual value with 5 % of the readings, five times those of each
-      value within 5 dB, in two columns or the only one.
+    - 0 and repeated values from -1 up, three at most, more than 10 dB above all others;
+    - of columns with two values or more, a usual value from -105 down, 5 dB below all others, or 10 dB if it is not
+      repeated; -100, if it is repeated and more than 10 dB below them; and the lowest or a usual value with 5 % of the
+      readings, five times those of each value within 5 dB, in two columns or the only one;
+    - the lowest values, three at most, more than 10 dB below all others, each of them three times and in two columns
+      that have higher levels.
     """
     values, counts = np.unique(levels[np.isfinite(levels)], return_counts=True)
     outside = (values < QUIETEST) | (values > LOUDEST)
     marks = values[outside & ((counts > 1) | np.isin(values, MARKS))].tolist()
     values, counts = values[~outside], counts[~outside]
-    is_usual = len(values) > 1 and (values[-1] == 0 or (abs(values[-1]) <= 1 and counts[-1] > 1))
-    if is_usual and values[-2] < values[-1] - 10:
-        marks.append(values[-1].item())
+    loud = values >= -1
+    if 0 < loud.sum() <= min(3, len(values) - 1) and values[loud][0] > values[~loud][-1] + 10:
+        marks += values[loud & ((counts > 1) | (values == 0))].tolist()
     lowest = values.min(initial=0)
     own = np.where((levels >= QUIETEST) & (levels <= LOUDEST), levels, np.nan)
     own = own[:, [len(np.unique(column[~np.isnan(column)])) > 1 for column in own.T]]
@@ -57,9 +105,15 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     for value in values[np.isin(values, [*ROUND, lowest])].tolist():
         count, near = counts[values == value][0], counts[(values != value) & (np.abs(values - value) < 5)]
         is_often = count >= max(3, 0.05 * counts.sum()) and count > 5 * near.max(initial=0)
-        is_apart = value in ROUND[1:] and value == lowest and not len(near)
-        is_apart |= value == ROUND[0] == lowest and count > 1 and not (np.abs(values - value) <= 10).sum() > 1
+        is_alone = (np.abs(values - value) <= 10).sum() == 1
+        is_apart = value in ROUND[1:] and value == lowest and not len(near) and (count > 1 or is_alone)
+        is_apart |= value == ROUND[0] == lowest and count > 1 and is_alone
         if is_apart or (is_often and (own == value).any(0).sum() >= min(2, own.shape[1])):
+            marks.append(value)
+    ends = np.flatnonzero(np.diff(values[:4]) > 10)
+    for value in values[: ends[-1] + 1 if len(ends) else 0].tolist():
+        mixed = (own == value).any(0) & (own > values[ends[-1]]).any(0)  # a weak receiver has its floor alone
+        if value not in marks and (own == value).sum() >= 3 and mixed.sum() >= 2:
             marks.append(value)
     return marks
 

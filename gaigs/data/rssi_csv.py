@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from gaigs.data import Links
-from gaigs.data.readings import carriers_of, gateway, loud_remark, to_dbm
+from gaigs.data.readings import and_list, carriers_of, gateway, loud_remark, marks_given, to_dbm
 from gaigs.io import tables
 from gaigs.io.files import write_text
 from gaigs.query import Query
@@ -27,7 +27,7 @@ def read(
     file: str | Path,
     layout: str | Path | None = None,
     fixed: str | None = None,
-    not_heard: float = -100.0,
+    not_heard: float | list[float] = -100.0,
     frequency: float | None = None,
 ) -> Links:
     """A data set from a table with a heading, one reading a line: one link for each reading that was heard.
@@ -42,7 +42,7 @@ def read(
             any order and in any case; the remarks name other columns.
         layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; None for no walls.
         fixed: End that stands still, ``tx`` or ``rx``; None for the end with fewer places, the receiver in a tie.
-        not_heard: Value of readings that were not heard [dBm]; all others lie in [-200, 30].
+        not_heard: Value, or values, of readings that were not heard [dBm]; all others lie in [-200, 30].
         frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
 
     Raises:
@@ -52,28 +52,29 @@ def read(
     if fixed not in (None, *ENDS):
         raise ValueError(f"fixed must be tx or rx, or null for the end with fewer places, got {fixed!r}")
     file = tables.find_file(file, "a table of readings")
-    if not math.isfinite(not_heard):
-        raise ValueError(f"not_heard must be a finite number [dBm], got {not_heard!r}; write such a number in the file")
-    points, dbm, ignored = _read_table(file, not_heard)
+    marks = marks_given(not_heard)
+    if not marks or not all(map(math.isfinite, marks)):
+        raise ValueError(f"not_heard must be finite numbers [dBm], got {not_heard!r}; write such numbers in the file")
+    points, dbm, ignored = _read_table(file, marks)
     walls = torch.zeros(0, 2, 3) if layout is None else tables.read_walls(Path(layout).expanduser())
 
     numbered = {end: tables.number_places(points[end]) for end in ENDS}
     fixed = fixed or ("rx" if len(numbered["rx"][0]) <= len(numbered["tx"][0]) else "tx")
     moving = "tx" if fixed == "rx" else "rx"
     places, at = numbered[fixed]
-    heard = torch.tensor([value != not_heard for value in dbm])
+    heard = torch.tensor([value not in marks for value in dbm])
     present, receivers = at[heard].unique(return_inverse=True)
     transmitters = torch.tensor(points[moving])[heard]
     remarks = (
         f"{len(transmitters)} readings of a moving {ENDS[moving]} at {len(present)} places of a fixed {ENDS[fixed]}; "
-        f"{int((~heard).sum())} of {not_heard:g} dBm were not heard and are left out"
+        f"{int((~heard).sum())} of {and_list(marks)} dBm were not heard and are left out"
     )
     silent = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
     if silent:
         remarks += f", and so are the places that nothing was heard at: {', '.join(silent)}"
-    if below := sum(value < not_heard <= 0 for value in dbm):
-        remarks += f"; {below} readings below {not_heard:g} dBm are taken for levels"
-    remarks += loud_remark(value for value in dbm if value != not_heard)
+    if below := sum(value < min(marks) < 0 for value in dbm):
+        remarks += f"; {below} readings below {min(marks):g} dBm are taken for levels"
+    remarks += loud_remark(value for value in dbm if value not in marks)
     if ignored:
         remarks += f"; columns ignored: {', '.join(ignored)}"
     return Links(
@@ -96,20 +97,27 @@ def write(folder: str | Path, links: Links) -> None:
     write_text(Path(folder) / "room.csv", "\n".join((",".join(COLUMNS), *rows)) + "\n")
 
 
-def _read_table(file: Path, not_heard: float) -> tuple[dict[str, list], list[float], list[str]]:
+def _read_table(file: Path, marks: list[float]) -> tuple[dict[str, list], list[float], list[str]]:
     """Positions of either end [m], readings [dBm], and the names of other columns."""
     lines = tables.read_lines(file, f"a heading with {','.join(COLUMNS)}")
-    written = tables.split_cells(lines[0])
+    delimiter = tables.find_delimiter(lines)
+    written = tables.split_cells(lines[0], delimiter)
     names = [name.lower() for name in written]
+    if not any(name in COLUMNS for name in names):
+        raise ValueError(
+            f"{file}, line 1: expected columns {','.join(COLUMNS)}, got {tables.quote(lines[0])}; a table with a place "
+            "a row and a gateway a column takes data=rssi_wide"
+        )
     for name in COLUMNS:
         if (count := names.count(name)) != 1:
             raise ValueError(f"{file}, line 1: expected one column {name}, got {count} in {tables.quote(lines[0])}")
     at = [names.index(name) for name in COLUMNS]
-    rows = {number: [cells[k] for k in at] for number, cells in tables.split_rows(file, lines, names, 1).items()}
+    everything = tables.split_rows(file, lines, names, 1, delimiter)
+    rows = {number: [cells[k] for k in at] for number, cells in everything.items()}
     positions = tables.to_coordinates(file, {number: cells[:6] for number, cells in rows.items()}, COLUMNS)
     levels = {number: cells[6:] for number, cells in rows.items()}
-    dbm = [value for (value,) in to_dbm(file, levels, COLUMNS[6:], QUIETEST, not_heard)]
-    if all(value == not_heard for value in dbm):
-        raise ValueError(f"{file}: expected a reading that was heard, got none but {not_heard:g} dBm")
+    dbm = [value for (value,) in to_dbm(file, levels, COLUMNS[6:], QUIETEST, marks, "list them in data.not_heard")]
+    if all(value in marks for value in dbm):
+        raise ValueError(f"{file}: expected a reading that was heard, got none but {and_list(marks)} dBm")
     points = {"tx": [row[:3] for row in positions], "rx": [row[3:] for row in positions]}
     return points, dbm, [name for name in written if name.lower() not in COLUMNS]

@@ -91,7 +91,7 @@ def run(config: dict, folder: Path) -> None:
     if form is None:
         raise ValueError(f"command=export needs export.format, one of {', '.join(one[1:] for one in SUFFIXES)}")
     suffix = check_suffix(Path(f"export.{form}"))
-    model = load(config["folder"])
+    model = load(config["folder"], config["trust"])
     takes_places = suffix in (*PREDICTIONS, SCENARIO)
     if places is None and takes_places and (suffix not in MAPS or not model.scene.task.is_scalar):
         places = "test"

@@ -77,7 +77,9 @@ def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 
 
 def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """A point for each place, with value and deviation at each receiver.
+    """A point for each place, with value and deviation at each receiver, ``ap`` and ``ap deviation``.
+
+    If a receiver has such a name, the keys are ``ap value`` and ``ap deviation``.
 
     Source: RFC 7946: longitudes and latitudes of WGS 84. Without a frame, coordinates are metres.
     """
@@ -85,11 +87,14 @@ def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     if scene.frame is not None:
         transformer = find_pyproj().Transformer.from_crs(scene.frame.epsg, 4326, always_xy=True)
         x, y = transformer.transform(x, y)
-    columns = {
-        name if key == "value" else f"{name} {key}": kind.values[receiver].ravel().tolist()
-        for receiver, name in enumerate(floor.receivers)
-        for key, kind in layers(floor, scene).items()
-    }
+    kinds = layers(floor, scene)
+    # Names that are also another's with "deviation": every key then ends with its kind.
+    collide = {f"{name} {key}" for name in floor.receivers for key in kinds} & {*floor.receivers}
+    columns = {}
+    for receiver, name in enumerate(floor.receivers):
+        for key, kind in kinds.items():
+            full = name if key == "value" and not collide else f"{name} {key}"
+            columns[full] = kind.values[receiver].ravel().tolist()
     features = [
         {
             "type": "Feature",

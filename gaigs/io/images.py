@@ -61,9 +61,12 @@ def _grey(file: Path, image: Image.Image) -> UInt[np.ndarray, "rows columns"]:
     if image.mode in ("1", "L"):
         return np.array(image.convert("L"))
     channels = np.array(image.convert("RGBA"))
-    for row, column in np.argwhere(np.ptp(channels[..., :3], -1) > 0)[:1]:
-        got = channels[row, column, :3].tolist()
-        raise ValueError(f"{file}: expected grey values, got the colour {got} in row {row}, column {column}")
+    coloured = np.argwhere(np.ptp(channels[..., :3], -1) > 0)
+    for row, column in coloured[:1]:
+        got = f"the colour {channels[row, column, :3].tolist()} in row {row}, column {column}"
+        if len(coloured) > channels[..., 0].size / 10:
+            got += "; as of a colour map: store the grey amplitudes"
+        raise ValueError(f"{file}: expected grey values, got {got}")
     for row, column in np.argwhere(channels[..., 3] < 255)[:1]:
         raise ValueError(f"{file}: expected no transparent pixel, got one in row {row}, column {column}")
     return channels[..., 0]

@@ -5,6 +5,7 @@ import csv
 import math
 import os
 import re
+import reprlib
 import sys
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNOR
 
 def quote(value: object) -> str:
     """A value as errors show it: printable and short."""
-    text = repr(value)
+    text = repr(value) if isinstance(value, str) else reprlib.repr(value)  # of few entries: aliases of YAML multiply
     return text if len(text) <= 100 else f"{text[:100]} ..."
 
 
@@ -95,12 +96,13 @@ def refuse(file: Path, wrong: Mapping[int, str], expected: str) -> None:
 def read_points(file: Path, names: Sequence[str], content: str) -> list[list[float]]:
     """Coordinates [m], one point a line; the first line may hold their names, and those of other columns."""
     lines = read_lines(file, content)
-    header = [cell.lower() for cell in split_cells(lines[0])]
+    delimiter = find_delimiter(lines)
+    header = [cell.lower() for cell in split_cells(lines[0], delimiter)]
     if not {*names} <= {*header}:
-        return to_coordinates(file, split_rows(file, lines, names, 0), names)
+        return to_coordinates(file, split_rows(file, lines, names, 0, delimiter), names)
     if len(lines) == 1:
         raise ValueError(f"{file}: no positions below the header")
-    rows = split_rows(file, lines, header, 1).items()
+    rows = split_rows(file, lines, header, 1, delimiter).items()
     return to_coordinates(file, {line: [cells[header.index(name)] for name in names] for line, cells in rows}, names)
 
 
@@ -113,8 +115,23 @@ def read_walls(file: Path) -> Float[Tensor, "k 2 3"]:
     return torch.stack((corners[:-1], corners[1:]), 1)
 
 
+SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": "blanks"}
+"""Marks between the cells of a line, the most certain ones first."""
+
+
+def find_delimiter(lines: Sequence[str]) -> str:
+    """The mark that separates the first three lines into equally many cells, two or more; or else a comma."""
+    for mark in SEPARATORS:
+        counts = {len(split_cells(line, mark)) for line in lines[:3]}
+        if len(counts) == 1 and counts != {1}:
+            return mark
+    return ","
+
+
 def split_cells(line: str, delimiter: str = ",") -> list[str]:
     """Cells of a line, without the blanks around them."""
+    if delimiter == " ":
+        return line.split()
     try:
         # csv appends blanks behind a quoted cell to it.
         line = re.sub(rf"(?<=\")[ \t]+(?={re.escape(delimiter)}|$)", "", line) if '"' in line else line
@@ -124,12 +141,45 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
     return [cell.strip() for cell in cells] or [line]
 
 
-def split_rows(file: Path, lines: Sequence[str], names: Sequence[str], skip: int) -> dict[int, list[str]]:
-    """Cells of all lines but the first few; a ``ValueError`` unless each line has one for each name."""
-    rows = {number: split_cells(line) for number, line in enumerate(lines[skip:], skip + 1)}
-    wrong = {n: f"{len(cells)}: {quote(lines[n - 1])}" for n, cells in rows.items() if len(cells) != len(names)}
-    refuse(file, wrong, f"{len(names)} columns {quote(','.join(names))}")
+def split_rows(
+    file: Path, lines: Sequence[str], names: Sequence[str], skip: int, delimiter: str
+) -> dict[int, list[str]]:
+    """Cells of all lines but the first few; a ``ValueError`` unless each line has one for each name.
+
+    A comma that separates no cells is a decimal one.
+    """
+    rows, wrong = {}, {}
+    for number, line in enumerate(lines[skip:], skip + 1):
+        cells = split_cells(line, delimiter)
+        rows[number] = cells if delimiter == "," else [cell.replace(",", ".") for cell in cells]
+        if len(cells) != len(names):
+            wrong[number] = miscounted(line, cells, len(names))
+    refuse(file, wrong, f"{len(names)} columns {quote(delimiter.join(names))}")
     return rows
+
+
+def miscounted(line: str, cells: Sequence[str], count: int) -> str:
+    """A line with the number of its cells, which is not ``count``, and the probable reason."""
+    others = [word for mark, word in SEPARATORS.items() if len(split_cells(line, mark)) == count]
+    reason = f"; columns separated by {others[0]}?" if others else ""
+    if len(cells) > count and all(re.fullmatch(r"[+-]?\d+", cell) for cell in cells):
+        reason = "; decimal commas? write points, or semicolons between columns"
+    return f"{len(cells)}: {quote(line)}{reason}"
+
+
+def numbers_in(cell: str) -> list[float]:
+    """The numbers of a cell that has several, and nothing else but marks between them."""
+    numbers = [to_number(part) for part in re.split(r"[;|/\s]+", cell.strip("[]() "))]
+    return numbers if len(numbers) > 1 and not any(map(math.isnan, numbers)) else []
+
+
+def described(cell: str) -> str:
+    """The text of a cell that is no number as expected, with the reason if it is plain."""
+    if numbers_in(cell):
+        return f"{quote(cell)}, several numbers,"
+    if re.fullmatch(r"[+-]?\d+,\d+", cell):
+        return f"{quote(cell)}, with a decimal comma,"
+    return quote(cell)
 
 
 EMPTY = {"", "nan", "na", "n/a", "null", "none", "-inf", "-"}
@@ -145,10 +195,13 @@ class Table(NamedTuple):
     names: list[str]
     numbers: Float[ndarray, "rows columns"]
 
+    def text(self, row: int, column: int) -> str:
+        """The text of a cell."""
+        return split_cells(self.lines[row + 1], self.delimiter)[column]
+
     def cell(self, row: int, column: int) -> str:
         """The text of a cell with its column, for messages."""
-        text = split_cells(self.lines[row + 1], self.delimiter)[column]
-        return f"{quote(text)} in column {self.names[column]}"
+        return f"{described(self.text(row, column))} in column {self.names[column]}"
 
     def column(self, name: str) -> int:
         """The number of a column; a ``ValueError`` if there is none of that name."""
@@ -158,10 +211,9 @@ class Table(NamedTuple):
 
 
 def read_table(file: Path, content: str) -> Table:
-    """A table with a heading, its cells separated by tabs, semicolons, bars or commas."""
+    """A table with a heading, its cells separated by tabs, semicolons, bars, commas or blanks."""
     lines = read_lines(file, content)
-    counts = {mark: {len(split_cells(line, mark)) for line in lines[:3]} for mark in ("\t", ";", "|", ",")}
-    delimiter = next((mark for mark, found in counts.items() if len(found) == 1 and found != {1}), ",")
+    delimiter = find_delimiter(lines)
     names = split_cells(lines[0], delimiter)
     for name in names:
         if not name.isprintable():
@@ -183,7 +235,7 @@ def read_table(file: Path, content: str) -> Table:
         cells = split_cells(text, delimiter)
         rows.append(np.array([number(cell) for cell in cells]))
         if len(cells) != len(names):
-            wrong[line] = f"{len(cells)}: {quote(text)}"
+            wrong[line] = miscounted(text, cells, len(names))
     refuse(file, wrong, f"{len(names)} columns {quote(delimiter.join(names))}")
     if not rows:
         raise ValueError(f"{file}: no rows below the heading")
@@ -198,7 +250,7 @@ def to_numbers(
     wrong = {}
     for (line, cells), values in zip(rows.items(), numbers, strict=True):
         if bad := [k for k, value in enumerate(values) if not holds(value)]:
-            wrong[line] = f"{quote(cells[bad[0]])} in column {names[bad[0]]}"
+            wrong[line] = f"{described(cells[bad[0]])} in column {names[bad[0]]}"
     refuse(file, wrong, expected)
     return numbers
 

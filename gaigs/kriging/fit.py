@@ -15,6 +15,7 @@ from gaigs.kriging.kernel import Process, kernel, kriging_weights
 from gaigs.kriging.links import PART, coordinates, distances, known_links, scale_bounds, scaled
 from gaigs.query import Query, evenly
 from gaigs.scene import Scene
+from gaigs.stages import end_in_time
 
 
 class Hyperparameters(NamedTuple):
@@ -111,7 +112,8 @@ def fit_hyperparameters(
         axes = [low + (high - low) * np.array([1, 3, 5]) / 6 for low, high in bounds]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(bounds))
         start = min(grid, key=lambda point: value(torch.from_numpy(point)).item())
-        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-6})
+        options: dict = {"options": {"ftol": 1e-6}, "callback": end_in_time}
+        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, **options)
         best, least = found.x, float(found.fun)
     return Hyperparameters(*np.exp(best).tolist()), least
 

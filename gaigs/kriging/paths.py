@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from gaigs.kriging.fit import AROUND
 from gaigs.kriging.kernel import kernel, resize
 from gaigs.kriging.links import distances
+from gaigs.stages import track
 
 JITTER = 1e-6
 """Variance of the processes that is not shared by places, over their variance: for places that are measured twice."""
@@ -69,7 +70,7 @@ class Equations:
         """From the fields m_i of each ``slice`` of the links, one after the other: all together may take gigabytes."""
         grams, sides = [], []
         size = max(1, min(64, 300_000 // labels[0].numel()))
-        for start in range(0, len(places), size):
+        for start in track(range(0, len(places), size), "kriging"):
             part = slice(start, start + size)
             fields = margins(part).flatten(2).to(torch.complex128)
             left, whole = (channels[part].abs().double().square().mean((1, 2)) for channels in (residuals, labels))

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
 from torch import Tensor, nn
 
+from gaigs import stages
 from gaigs.kriging.fit import EDGES
 from gaigs.kriging.kernel import Process, resize
 from gaigs.kriging.links import distances, scale_bounds, scaled
@@ -309,11 +310,17 @@ class ScalarProcess(nn.Module):
                 own, made = unpacked(torch.from_numpy(point))
                 between = covariances(around, own.exp(), made)[:, :-1, :-1]
                 factors = expected_factors(between, heard, (2 * own[around.receivers, 2]).exp(), made.degrees)
+            if stages.is_up():  # the start has to do
+                least = cost(point)[0]
+                continue
             options = {"maxiter": ITERATIONS, "ftol": 1e-8}
-            found = minimize(cost, point, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-            point = found.x
+            found = minimize(
+                cost, point, jac=True, method="L-BFGS-B", bounds=bounds, options=options, callback=stages.end_in_time
+            )
+            point, least = found.x, float(found.fun)
+        stages.advance()
         own, made = unpacked(torch.from_numpy(point))
-        return float(found.fun), own, made._replace(scale=float(made.scale))
+        return least, own, made._replace(scale=float(made.scale))
 
     def _held_out(self, held: Int[Tensor, " h"], folds: Int[Tensor, " k"], most: int) -> tuple[Tensor, Around]:
         """About ``most`` of the rows that may be held out (m,), and the readings of other folds around each.

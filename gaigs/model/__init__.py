@@ -24,7 +24,9 @@ from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import PART
 from gaigs.query import ROUNDING, Batch, Query, as_directions, as_receivers, as_subcarriers
 from gaigs.registry import check_type, name_of, registry
+from gaigs.registry.modes import usual_modes
 from gaigs.scene import Scene
+from gaigs.stages import track
 from gaigs.task.csi import Csi
 
 NUMBERS, MOST = 2**17, 1024
@@ -315,7 +317,9 @@ class Model(nn.Module):
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
         batch_size = max(1, batch_size // every) * every
         query, directions = query.to(self.device), None if directions is None else directions.to(self.device)
-        batches = (Batch(part, directions) for part in query.parts(batch_size))
+        count = math.ceil(len(query) / batch_size)
+        parts = track(query.parts(batch_size), "predictions", count, is_fixed=True)
+        batches = (Batch(part, directions) for part in parts)
         if interval is not None:
             if messages or model is not self:
                 raise ValueError("intervals are those of the labels' own subcarriers; leave frequencies out")
@@ -325,6 +329,7 @@ class Model(nn.Module):
         values = map(model._answer, batches)
         return values if chosen is None else (part[..., chosen] for part in values), shape
 
+    @usual_modes()
     @torch.no_grad()
     def _answer(self, batch: Batch) -> Tensor:
         """Values of a batch in evaluation mode; the mode stays as it was."""
@@ -335,6 +340,7 @@ class Model(nn.Module):
         finally:
             self.train(training)
 
+    @usual_modes()
     def _estimate(self, batch: Batch, interval: float) -> Estimate:
         value = self._answer(batch)
         assert self.calibration is not None

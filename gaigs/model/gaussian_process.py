@@ -16,6 +16,7 @@ from gaigs.model import LookUp, Model, Prediction, build_trend
 from gaigs.query import Batch, Query, evenly, thin_labels
 from gaigs.registry import name_of, register
 from gaigs.scene import Scene
+from gaigs.stages import stage
 from gaigs.task.csi import Csi
 
 NEIGHBOURS = 300
@@ -124,10 +125,11 @@ class GaussianProcess(LookUp):
         query, process = links.query[index], self.scalar[0]
         left = lambda trend: (links.labels[index] - trend(Batch(query)).value).double()
         known, folds = (coordinates(self.scene, query, 1.0), query.receivers), folds_of(links, index)
-        if chooses:
-            self.chosen = process.fit(*known, [left(trend) for trend in self.trends], folds)
-        else:
-            process.refit(*known, left(self.trend), folds)
+        with stage("gaussian_process", len(self.trends) + 4 if chooses else 1):
+            if chooses:
+                self.chosen = process.fit(*known, [left(trend) for trend in self.trends], folds)
+            else:
+                process.refit(*known, left(self.trend), folds)
         process.solve(*known, left(self.trend))
 
     @property

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from gaigs import stages
 from gaigs.data import Links
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters
@@ -18,7 +20,7 @@ from gaigs.kriging.links import PART, coordinates, folds_of, scaled, thinned
 from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, Wrapper, call_optional
-from gaigs.query import Batch, thin_labels
+from gaigs.query import Batch, evenly, thin_labels
 from gaigs.registry import name_of, register, registry
 from gaigs.scene import Scene
 from gaigs.task import Task
@@ -106,7 +108,9 @@ class Kriging(Wrapper):
         If not ``is_final``, only the validation model is fitted, without a word. ``by_paths`` says if strengths of
         paths are kriged, or whole labels; None: ``FEWEST`` validation links or more choose.
         """
-        links = thinned(links, LIMIT)
+        count, links = len(links.split.known), thinned(links, self._most(links))
+        if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
+            stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
         values, held = predicted(self.trend, links, links.split.known), links.split.validation
         self.fallback.fit(links)
         has_paths = getattr(self.trend, "has_margins", False)
@@ -125,6 +129,20 @@ class Kriging(Wrapper):
                     *(score.mean() for score in scores[::-1]),
                 )
         return self._krige_labels(links, values, is_final)
+
+    def _most(self, links: Links) -> int:
+        """Most known links of a receiver: ``LIMIT``, or those whose three predictions take a third of the time left.
+
+        The trained model predicts the links once, and once more for each half of the validation links.
+        """
+        if math.isinf(stages.left()):
+            return LIMIT
+        some = evenly(links.split.known, 64)
+        predicted(self.trend, links, some[:1])  # the first prediction compiles and loads
+        began = time.monotonic()
+        predicted(self.trend, links, some)
+        each = max(time.monotonic() - began, 1e-9) / len(some)
+        return int(min(LIMIT, max(100, stages.left() / 9 / each / len(links.receivers))))
 
     def _validation_scores(self, links: Links, values: Iterable[Tensor]) -> list[Float[Tensor, " k"]]:
         """Monitored scores of predictions of the validation links, higher ones better."""
@@ -205,7 +223,7 @@ class Kriging(Wrapper):
         plain, kriged, process = values[held], values[held].clone(), PathProcess.usual(self.scene.spacing)
         for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
             field.solve(known_ones[rows < len(split.train)], process)
-            for row in rows[rows >= len(split.train)].tolist():
+            for row in stages.track(rows[rows >= len(split.train)].tolist(), "kriging"):
                 strengths = field(query.transmitters[row : row + 1].double(), process)[0]
                 margins = trend.margins(query[row : row + 1].to(device)).cpu()[0]
                 kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), margins, 1)
@@ -282,22 +300,24 @@ class Kriging(Wrapper):
             query = links.query[index]
             left = [torch.cat(residuals[trend_weight]).flatten().double() for trend_weight in WEIGHTS]
             readings, folds = (coordinates(self.scene, query, 1.0), query.receivers), folds_of(links, index)
-            self.process.cpu().fit(*readings, left[-1:], folds)
             # Training links' own residuals are too small, as the trend was trained on them: validation links decide.
             held = torch.arange(len(links.split.train), len(index)) if len(links.split.validation) else None
-            start = self.process.logarithms, self.process.choice
 
             def refit(values: Tensor) -> float:
                 self.process.logarithms, self.process.choice = start
                 return self.process.refit(*readings, values, folds, held)
 
-            shares = torch.full((len(WEIGHTS),), 1 / len(WEIGHTS), dtype=torch.float64)
-            if held is not None:
-                # Readings at one place err together: they count as one.
-                each = len(held) / len(query.transmitters[held].unique(dim=0))
-                costs = torch.tensor([refit(values) for values in left], dtype=torch.float64)
-                shares = torch.softmax(-costs.clamp_min(-1e300) / each, 0)  # -inf if a trend explains all
-            refit(shares @ torch.stack(left))
+            # Maximisations of the likelihood: 5 of the fit, 2 of each refit, or 1 without validation links.
+            with stages.stage("kriging", 6 if held is None else 5 + 2 * (len(left) + 1)):
+                self.process.cpu().fit(*readings, left[-1:], folds)
+                start = self.process.logarithms, self.process.choice
+                shares = torch.full((len(WEIGHTS),), 1 / len(WEIGHTS), dtype=torch.float64)
+                if held is not None:
+                    # Readings at one place err together: they count as one.
+                    each = len(held) / len(query.transmitters[held].unique(dim=0))
+                    costs = torch.tensor([refit(values) for values in left], dtype=torch.float64)
+                    shares = torch.softmax(-costs.clamp_min(-1e300) / each, 0)  # -inf if a trend explains all
+                refit(shares @ torch.stack(left))
             self.trend_weight.fill_(shares @ torch.tensor(WEIGHTS, dtype=torch.float64))
             return
 
@@ -307,7 +327,7 @@ class Kriging(Wrapper):
                 left = left * damping(left, thin_labels(links.labels[index]), links.query.receivers[index])[:, None]
             return fit_hyperparameters(self.scene, links, lambda some: left[rows[some]], **options)
 
-        found = {trend_weight: fitted(trend_weight) for trend_weight in weights}
+        found = {trend_weight: fitted(trend_weight) for trend_weight in stages.track(weights, "kriging")}
         best = min(weights, key=lambda trend_weight: found[trend_weight][1])
         # Residuals of a good trend correlate weakly with position: few links would overfit.
         process, _ = fitted(best, most=1000) if best else found[best]
@@ -335,7 +355,7 @@ class Kriging(Wrapper):
             self.process.to(self.weight.device)
             return
         process = self._hyperparameters
-        for receiver, field in enumerate(self.fields):
+        for receiver, field in enumerate(stages.track(self.fields, "kriging")):
             rows = (query.receivers == receiver).nonzero()[:, 0]
             field.solve(coordinates(self.scene, query[rows], process.scale), residuals(rows), process)
 

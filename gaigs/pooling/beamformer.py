@@ -142,9 +142,7 @@ class Beamformer:
             key = int(query.receivers[0]), carrier, parts.dtype, parts.device, *axes
             basis = self._kept.get(key)
         if basis is None:
-            # Kept beyond this call: made in inference mode it could not be saved for a later backward pass.
-            with torch.inference_mode(False):
-                basis = self._basis(carrier, query, directions).to(parts)
+            basis = self._basis(carrier, query, directions).to(parts)
             if key is not None:
                 if len(self._kept) >= 64:  # thinning by a stride of 4 has 16 grids
                     self._kept.clear()

@@ -1,5 +1,6 @@
 """Rasterizers composite splats front to back into a map over directions."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,7 +21,7 @@ OPAQUE = -(2.0**18)
 """The logarithm of an attenuation of 0: G times this is in effect minus infinity, and its products stay finite."""
 
 STEEPEST = 1e-30
-"""Below this attenuation the gradient is that at this value, as its own would overflow float32."""
+"""Below this attenuation the logarithm's gradient is divided by this value, lest float32 overflows; at 0 it is 0."""
 
 
 @runtime_checkable
@@ -87,6 +88,9 @@ def rasterize(
         Where an input has a leading axis b of transmitters, both have it. Differentiable in all tensors. ``opencl`` and
         ``torch`` agree to 2e-6 of the map's maximum in float32.
 
+    Raises:
+        TypeError, ValueError: An input is no tensor of its shape and dtype, or is out of range.
+
     Source: GAI-GS, "Projection and Render Module"; Zwicker et al., EWA Splatting, 2002.
 
     Example:
@@ -122,6 +126,10 @@ def rasterize(
         if values.dtype != means.dtype or not values.is_floating_point():
             raise ValueError(f"{name} must be real numbers of means' {means.dtype}, got {values.dtype}")
         sizes |= set(values.shape[:-2])
+    for name, values in {"scales": scales, **rest}.items():
+        most, advice = (math.inf, "take their exp") if name == "scales" else (1.0, "pass them through a sigmoid")
+        if len(wrong := values[(values < 0) | (values > most)]):  # NaN passes, and shows in the map
+            raise ValueError(f"{name} must lie in [0, {most:g}], got {wrong[0]:.3g}; {advice} first")
     if len(sizes) > 2:
         raise ValueError(f"inputs must have one number of transmitters, got {', '.join(map(str, sorted(sizes - {1})))}")
     chosen = registry("rasterizer").build(rasterizer)

@@ -215,8 +215,8 @@ class _Render:
     def forward(self, differentiate):
         """The map and the transmittance; to ``differentiate``, checkpoints for the way back are kept."""
         sizes = self.sizes
-        image = torch.empty(sizes.transmitters, self.channels, sizes.height, sizes.width)
-        left = torch.empty(sizes.transmitters, sizes.height, sizes.width)
+        image = torch.empty(sizes.transmitters, self.channels, sizes.height, sizes.width, dtype=torch.float32)
+        left = torch.empty(sizes.transmitters, sizes.height, sizes.width, dtype=torch.float32)
         outputs = self._share(image), self._share(left)
         ends, checkpoints, bounds = self._empty(sizes.groups * self.tiles), None, None
         if differentiate:
@@ -235,7 +235,7 @@ class _Render:
         partials = self._empty(self.groups_per_list * sizes.entries * self.partials)
         self._run("backward", sizes.groups * self.tiles, *self.scene, *self.path, *images, partials)
         shapes = (n, 2), (sizes.sets, n, 3), (b, n, self.channels), (b, n), (b, n) if self.attenuates else None
-        gradients = [None if shape is None else torch.empty(shape) for shape in shapes]
+        gradients = [None if shape is None else torch.empty(shape, dtype=torch.float32) for shape in shapes]
         outputs = [self._share(gradient) for gradient in gradients]
         *_, entries, geometry, appearance = self.scene
         inverse = self.order, self.bounds, self.path[0], entries, geometry, appearance

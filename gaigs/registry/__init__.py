@@ -16,12 +16,14 @@ import numbers
 import reprlib
 import sys
 import typing
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from types import MappingProxyType, NoneType, UnionType
 from typing import Any
 
 from gaigs.registry.holders import GIVEN, MISSING, Holder, find_holders, is_plain, sources
+from gaigs.registry.modes import usual_modes
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
@@ -36,6 +38,8 @@ PLAIN: dict[Any, tuple[Any, str]] = {
     **dict.fromkeys((dict, Mapping), (Mapping, "a mapping")),
 }  # fmt: skip
 """Annotations that options are checked against: accepted types, and the words of errors. A bool is no number."""
+
+_recorded: ContextVar[Mapping[str, str] | None] = ContextVar("recorded", default=None)
 
 LARGEST = 2**63 - 1
 """Largest whole number of an option: torch takes 64 bits. Other numbers must be finite."""
@@ -143,6 +147,11 @@ class Registry:
 
     def _load(self, holder: Holder) -> Callable:
         if holder.root is not None:
+            recorded = _recorded.get()
+            if recorded is not None and recorded.get(f"{self.kind} {holder.name}") != holder.digest:
+                source = f"the source of {self.kind} {holder.name!r} that was recorded with the model"
+                advice = "if you trust that file, set trust=True in gaigs.load, or trust=true on the command line"
+                raise ValueError(f"{holder.where} is not {source}\n{advice}")
             # A package in ./plugins may import another one there.
             roots = {str(root): None for root in (holder.root, *sources(Path.cwd() / "plugins"))}
             sys.path += [root for root in roots if root not in sys.path]  # last: nothing shadows what is installed
@@ -202,15 +211,29 @@ def register(kind: str, name: str, /) -> Callable:
     return registry(kind).register(name)
 
 
-def digests(names: Container[str]) -> dict[str, str]:
-    """Digests of the sources of components outside gaigs that have some of these names, by kind and name.
+@contextlib.contextmanager
+def only_recorded(recorded: Mapping[str, str] | None) -> Iterator[None]:
+    """Imports components of ./plugins only if their sources have these ``digests``; None: all."""
+    token = _recorded.set(recorded)
+    try:
+        yield
+    finally:
+        _recorded.reset(token)
+
+
+def digests(*configurations: object) -> dict[str, str]:
+    """Digests of the sources of components outside gaigs that configurations name, by kind and name.
 
     Of a component of a notebook or a script, the statement that registers it counts, a class or a function as a rule.
     """
-    found = {}
+    found, names, parts = {}, set(), [*configurations]
+    while parts:
+        part = parts.pop()
+        names |= {part} if isinstance(part, str) else set()
+        parts += part.values() if isinstance(part, Mapping) else part if isinstance(part, list | tuple) else ()
     for kind, components in registries.items():
         holders = {holder.name: holder for holder in find_holders(kind)[0]}
-        for name in filter(names.__contains__, components.names()):
+        for name in sorted(names.intersection(components.names())):
             if (holder := holders.get(name)) is None:
                 if source := components._sources.get(name):
                     found[f"{kind} {name}"] = hashlib.sha256(source.encode()).hexdigest()
@@ -294,7 +317,8 @@ def _noting(kind: str, name: str, component: Any) -> Any:
 
     @functools.wraps(make)
     def noting(self, *args, **kwargs) -> None:
-        make(self, *args, **kwargs)
+        with usual_modes():
+            make(self, *args, **kwargs)
         if type(self) is component:  # a subclass has a name of its own, or none
             bound = signature.bind(self, *args, **kwargs)
             bound.apply_defaults()

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from gaigs import stages
 from gaigs.data import Links
 from gaigs.model import Model, call_optional
 from gaigs.report import figures, style
@@ -41,4 +42,10 @@ def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
         drawn["intervals"] = drawn_intervals
     drawn |= figures_of(type(links.task)).of_run(task, folder, links)
     (folder / "figures").mkdir(exist_ok=True)
-    return [file for name, figure in drawn.items() for file in style.save(figure, folder / "figures" / f"{name}.png")]
+    files: list[Path] = []
+    for number, (name, figure) in enumerate(stages.track(drawn.items(), "figures")):
+        if stages.is_up():
+            stages.leave_out(f"no figures {', '.join([*drawn][number:])}")
+            break
+        files += style.save(figure, folder / "figures" / f"{name}.png")
+    return files

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ from gaigs.processes import is_first, limited_threads, only_run
 from gaigs.radio_maps import radio_map
 from gaigs.registry import check_type, registry
 from gaigs.report.table import metrics_table, verdict
-from gaigs.runs.folder import claim, is_configuration, store, warn_of_changes
+from gaigs.runs.folder import claim, is_configuration, store, stored_software, warn_of_changes
+from gaigs.stages import stage
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +38,9 @@ def run(config: dict, folder: Path) -> dict | None:
     Raises:
         TypeError, ValueError, OSError, KeyboardInterrupt: As for ``gaigs.run``.
     """
-    with limited_threads(config["threads"]):
+    from gaigs.training.budget import watched  # slow to import
+
+    with limited_threads(config["threads"]), watched(config) as watch:
         if not is_first():
             logging.getLogger("gaigs").setLevel(logging.WARNING)  # the first process logs for all
             train_and_test(config, folder)
@@ -52,6 +56,8 @@ def run(config: dict, folder: Path) -> dict | None:
                 metrics = read_metrics(finished)
             else:
                 metrics = train_and_test(config, folder)
+                if math.isfinite(watch.limit):
+                    metrics |= {"max_time": watch.limit, "left_out": watch.left_out}
                 if not is_configuration(folder / "config.yaml"):  # loggers make a removed folder again
                     store(config, folder)
                 write_text(finished, json.dumps(metrics, indent=2) + "\n")
@@ -62,13 +68,15 @@ def run(config: dict, folder: Path) -> dict | None:
     return metrics
 
 
-def load(path: str | Path) -> Model:
+def load(path: str | Path, trust: bool = False) -> Model:
     """The model of a checkpoint or of a finished run, ready to predict.
 
     It needs neither data nor Hydra.
 
     Args:
         path: ``best.ckpt`` or ``last.ckpt`` of a run, a file of ``Model.save``, or the folder of a run.
+        trust: True to import any plug-in of ./plugins that the file names; else only one whose source is the recorded
+            one. Installed packages are always imported.
 
     Returns:
         The model in evaluation mode, on the CPU: ``load(path).predict(transmitters)``.
@@ -76,7 +84,8 @@ def load(path: str | Path) -> Model:
     Raises:
         FileNotFoundError: The file or folder does not exist, or the run is not finished.
         ValueError: The file is damaged or of another format, a component is not installed, or the weights do not fit
-            the configuration or are not finite; or the run is not finished, or its data were arrays.
+            the configuration or are not finite; or the run is not finished, or its data were arrays; or a plug-in of
+            ./plugins has another source.
         ImportError: A component cannot be imported.
 
     Example:
@@ -87,18 +96,18 @@ def load(path: str | Path) -> Model:
     """
     check_type("path", path, str | Path)
     if not os.path.isdir(path):
-        loaded: Any = checkpoint.load(path)
+        loaded: Any = checkpoint.load(path, trust, {})
         return loaded
     folder, config = Path(path), configuration_of(path)
-    warn_of_changes(folder, config["model"])
     if not (folder / "best.ckpt").is_file():
         raise FileNotFoundError(
             f"{folder} has no best.ckpt: the run is not finished, or one of a look-up by gaigs 0.3\n"
             "start it again, a finished one in another folder"
         )
-    model: Any = checkpoint.load(folder / "best.ckpt")
+    model: Any = checkpoint.load(folder / "best.ckpt", trust, stored_software(folder))
     if config["kriging"] and not hasattr(model, "krige"):
         raise ValueError(f"the run in {folder} is not finished: it lacks its kriging\nstart it again, it goes on")
+    warn_of_changes(folder, config["model"])
     return model
 
 
@@ -149,8 +158,11 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         return None
     model, is_trained, best = fitted.models[name], bool(fitted.unseen), folder / "best.ckpt"
     own = {} if is_trained else {name: registry("model").build(config["model"], scene=scene)}
-    validation = evaluation.validate(fitted.unseen, {**own, **baselines}, links)
-    scores = evaluation.score(fitted.models, baselines, links, folder)
+    # Shares of the run's limit; maps and figures have the rest.
+    with stage(until=0.86):
+        validation = evaluation.validate(fitted.unseen, {**own, **baselines}, links)
+    with stage(until=0.92):
+        scores = evaluation.score(fitted.models, baselines, links, folder)
     metrics = {
         "task": task.name,
         "data": links.remarks,

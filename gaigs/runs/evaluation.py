@@ -19,6 +19,7 @@ from rich.console import Console, Group
 from rich.jupyter import JupyterMixin
 from torch import Tensor
 
+from gaigs import stages
 from gaigs.configuration import composed, files_of
 from gaigs.data import Links, with_places
 from gaigs.data.matching import check_fit
@@ -95,7 +96,9 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
     if links.held_out is not None:
         return None
     asked, values, deviations, near = [], [], [], []
-    for one, part, known in unseen(model, links):
+    for one, part, known in stages.track(unseen(model, links), "intervals", fold_count(model)):
+        if one is not model and stages.is_up():  # it was fitted in haste
+            break
         asked.append(part)
         values.append(predicted(one, links, part))
         if isinstance(one, GaussianProcess | Kriging) and isinstance(model, GaussianProcess | Kriging):
@@ -104,6 +107,8 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
         deviations.append(spreads(one, links, part, values[-1]))
         there = links.query[known]
         near.append(nearest(links.query[part], there.transmitters, there.receivers))
+    if stages.is_up() and len(asked) < fold_count(model):
+        stages.leave_out(f"{len(asked)} of {fold_count(model)} folds calibrate {name_of(model)}")
     if not asked:
         return None
     index = torch.cat(asked)
@@ -112,19 +117,28 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
     return Calibration.of(links.task, *parts, apart, links.query[links.split.known])
 
 
+def fold_count(model: Model) -> int:
+    """Most models that ``unseen`` gives."""
+    if isinstance(model, Kriging):
+        return 2
+    return 1 if is_trained(model) else CALIBRATION_FOLDS
+
+
 def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"], Int[Tensor, " j"]]]:
     """Models like a model, links that they have not seen, and the links that they know; each when it is asked for.
 
     A look-up is fitted anew without each fold of the known links; so are estimated places of receivers. A trained model
     has the validation links; the step of its training stays the one chosen on all of them. Kriging is fitted anew to
     the training links, and its weights and hyperparameters are chosen for each half of the validation links by the
-    other half; one group alone chooses, too.
+    other half; one group alone chooses, too. The time limit of a run leaves later folds out.
     """
     split, validation, receivers = links.split, links.split.validation, links.query.receivers
     if not (is_trained(model) or isinstance(model, Kriging)):
         index = split.known
         folds, asked = folds_of(links, index) % CALIBRATION_FOLDS, evenly(index, MOST)
         for fold in range(CALIBRATION_FOLDS):
+            if stages.is_up():
+                return
             is_known = folds != fold
             # A receiver that a fold alone has heard keeps its links there.
             is_known |= torch.isin(receivers[index], receivers[index[is_known]], invert=True)
@@ -149,6 +163,8 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
     if not len(validation):
         return
     for own, other in (parts, parts[::-1]) if all(map(len, parts)) else ((validation, validation),):
+        if stages.is_up():
+            return
         kriged = Kriging(links.scene, model.trend, model.fallback_options).to(model.device)
         kind = {"is_final": False, "by_paths": model.by_paths}
         yield kriged.krige(replace(links, split=split.choosing(own)), **kind), other, split.train
@@ -280,8 +296,21 @@ def score(
         content.update({f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()})
 
     frequencies = None if links.held_out is None else task.frequencies
-    for key in [*models, *look_ups]:
+    keys, gone = [*models, *look_ups], list[str]()
+
+    def is_left_out(key: str) -> bool:
+        """True for a baseline if time is up: it has no fit, or one in haste."""
+        is_out = key in look_ups and key != keys[0] and stages.is_up()
+        if is_out:
+            gone.append(key)
+        return is_out
+
+    for key in keys:
+        if is_left_out(key):
+            continue
         model = models[key] if key in models else fitted(look_ups[key], links)
+        if is_left_out(key):
+            continue
         values = predicted(model, links, index, frequencies)
         add(key, values)
         calibration = model.calibration if key in models or not has_intervals else calibrated(model, links)
@@ -306,6 +335,8 @@ def score(
             found["places"] = query.place_keys.unique(return_inverse=True)[1].double()
             scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
             content[f"shares_{key}"] = shares(calibration, aligned, thin_values, thin_deviations, query)
+    if gone:
+        stages.leave_out(f"no {'test' if has_intervals else 'validation'} scores of {', '.join(gone)}")
     if links.held_out is not None:
         known: Any = links.task
         closest = (known.frequencies - frequencies[:, None]).abs().argmin(1)

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -59,15 +58,7 @@ def store(config: dict, folder: Path) -> None:
 
 def software(config: dict) -> dict[str, str]:
     """The version of gaigs, and the digests of the plug-ins that a configuration uses."""
-    return {"gaigs": __version__} | digests({*_names(config)})
-
-
-def _names(part: object) -> Iterator[str]:
-    """Names of all components in a configuration."""
-    if isinstance(part, dict):
-        yield from (value for key, value in part.items() if key == "name")
-    for entry in part.values() if isinstance(part, dict) else part if isinstance(part, list) else ():
-        yield from _names(entry)
+    return {"gaigs": __version__} | digests(config)
 
 
 def stored_software(folder: Path) -> dict[str, str]:
@@ -81,7 +72,7 @@ def stored_software(folder: Path) -> dict[str, str]:
 def warn_of_changes(folder: Path, model: dict) -> None:
     """Warns if sources of a model's plug-ins have changed since its run: stored numbers then mean something else."""
     there = stored_software(folder)
-    changed = [key for key, digest in digests({*_names(model)}).items() if there.get(key, digest) != digest]
+    changed = [key for key, digest in digests(model).items() if there.get(key, digest) != digest]
     if changed:
         log.warning("the source of %s has changed since %s was trained: predictions differ", ", ".join(changed), folder)
 
@@ -95,7 +86,9 @@ def check_software(folder: Path, config: dict) -> None:
         raise ValueError(f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}\n{ANOTHER}")
     changed = sorted(key for key in here.keys() | there.keys() if key != "gaigs" and here.get(key) != there.get(key))
     if changed:
-        raise ValueError(f"the source of {', '.join(changed)} has changed since {folder} was begun\n{ANOTHER}")
+        raise ValueError(
+            f"the source of {', '.join(changed)} has changed since {folder} was begun\nrestore it, or {ANOTHER}"
+        )
 
 
 def is_configuration(file: Path) -> bool:

@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import logging
+import math
 import signal
 import tempfile
 import threading
@@ -20,7 +21,7 @@ from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from lightning.pytorch.utilities.seed import isolate_rng
 from torch import distributed
 
-from gaigs import checkpoint
+from gaigs import checkpoint, stages
 from gaigs.configuration import composed, preset
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
@@ -30,11 +31,11 @@ from gaigs.model import Model
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
-from gaigs.registry import call, configuration_of, registry
+from gaigs.registry import call, configuration_of, digests, registry
 from gaigs.runs.evaluation import calibrated, is_trained
 from gaigs.runs.folder import ANOTHER, check_same_links, claim, fingerprint
 from gaigs.training.batches import Batches, InOrder
-from gaigs.training.budget import ENDLESS, make_budget
+from gaigs.training.budget import ENDLESS, make_budget, watched
 from gaigs.training.checkpoints import Interrupted, KeepBest, KeepLast
 from gaigs.training.density_control import DensityControl
 from gaigs.training.progress import ProgressLine
@@ -98,6 +99,7 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
         place.mkdir(parents=True, exist_ok=True)
         stack.enter_context(only_run(place))
         claim(place, config)
+        stack.enter_context(watched(config))
         lightning.seed_everything(config["seed"], verbose=False)
         loss = registry("loss").build(parts.pop("loss", config["loss"]), task=links.task)
         if parts:
@@ -144,17 +146,23 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         parts["tokenizer"] = "none"
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
     began, places = time.monotonic(), links.query[links.split.known].place_keys.unique()
-    model.fit(links)
+    # Shares of the run's limit at which parts end: the search 0.3, the training 0.5, kriging and intervals 0.8.
+    with stages.stage(until=0.3 if is_trained(model) else 0.8):
+        model.fit(links)
+        if stages.is_up():
+            stages.leave_out(f"the time for the fit of {name} before a training was up")
     if is_trained(model) and model.known_places is not None:  # a training before this one
         places = torch.cat((places, model.known_places)).unique()
     model.known_places = places
     searched, start = time.monotonic() - began, count_gaussians(model)
     if not is_trained(model):
-        model.calibration = calibrated(model, links)
+        with stages.stage(until=0.8):
+            model.calibration = calibrated(model, links)
         if is_first() and model.state_dict():
             checkpoint.save(model, folder / "best.ckpt")
         return Fitted({name: model}, {}, start)
-    model, seconds = descend(model, loss, links, config, folder, searched)
+    with stages.stage(until=0.5 / config["ensemble"]):
+        model, seconds = descend(model, loss, links, config, folder, searched)
     if not is_first():
         return None
     best, trained = folder / "best.ckpt", ""
@@ -162,16 +170,19 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         model, more = with_others(model, loss, links, config, folder)
         model.known_places = places
         kriged, seconds, trained = make_kriged(model), seconds + more, "members.0"
-        checkpoint.exchange_model(best, model, trained)
+        checkpoint.update(best, model, trained)
     model.calibration = calibrated(model, links)
     if kriged is None:
-        checkpoint.add_calibration(best, model)
+        checkpoint.update(best, model)
         return Fitted({name: model}, {name: model}, start, seconds)
     began = time.monotonic()
-    validation_model = kriged.to(model.device).krige(links)
-    kriging_seconds = time.monotonic() - began
-    kriged.calibration, kriged.known_places = calibrated(validation_model, links), places
-    checkpoint.exchange_model(best, kriged, ".".join(filter(None, ("trend", trained))))
+    with stages.stage(until=0.8):
+        validation_model = kriged.to(model.device).krige(links)
+        kriging_seconds = time.monotonic() - began
+        if stages.is_up():
+            stages.leave_out("the fit of kriging ended early")
+        kriged.calibration, kriged.known_places = calibrated(validation_model, links), places
+    checkpoint.update(best, kriged, ".".join(filter(None, ("trend", trained))))
     models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged, validation_model))
     return Fitted(models, unseen, start, seconds, kriging_seconds)
 
@@ -184,10 +195,11 @@ def with_others(model: Model, loss: Loss, links: Links, config: dict, folder: Pa
         place.mkdir(parents=True, exist_ok=True)
         lightning.seed_everything(seed, verbose=False)
         other = registry("model").build(config["model"], scene=links.scene)
-        began = time.monotonic()
-        other.fit(links)
-        searched = time.monotonic() - began
-        other, seconds = descend(other, loss, links, config | {"seed": seed}, place, searched)
+        with stages.stage(until=0.5 * (number + 1) / config["ensemble"]):
+            began = time.monotonic()
+            other.fit(links)
+            searched = time.monotonic() - began
+            other, seconds = descend(other, loss, links, config | {"seed": seed}, place, searched)
         members.append(other)
         total += seconds
     ensemble = Ensemble(links.scene, members).eval().to(model.device)
@@ -204,7 +216,7 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
     """
     split = {"name": links.split.name, **links.split.parts()}
     identity = {"version": checkpoint.VERSION, "model": config["model"], "scene": links.scene.state(), "split": split}
-    identity |= {"config": config, "links": fingerprint(links)}
+    identity |= {"config": config, "links": fingerprint(links), "plugins": digests(config, links.scene.state()["task"])}
     context = {"model": model, "loss": loss, "identity": identity, "seed": config["seed"]}
     module = registry("training").build(config["training"], **context)
     last, best = folder / "last.ckpt", folder / "best.ckpt"
@@ -229,6 +241,8 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
     trainer = make_trainer(options, **context)
     if config["ensemble"] > 1 and trainer.world_size > 1:
         raise ValueError("an ensemble trains in one process; set trainer.devices=1 and trainer.num_nodes=1")
+    if math.isfinite(stages.left()) and trainer.world_size > 1:
+        raise ValueError("max_time limits a run of one process; of several set trainer.max_time")
     steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
     batches = Batches(links, links.split.train, module.batch_size, config["seed"], steps)
     validation = InOrder(links, links.split.validation, module.batch_size) if len(links.split.validation) else None
@@ -238,6 +252,7 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
         content = resumable(last, best)
         check_same_links(content[checkpoint.KEY], identity, last)
         log.info("going on after step %d", content["global_step"])
+        stages.current().began -= content["callbacks"][budget.state_key]["seconds"]
     # Lightning converts after it has loaded a checkpoint, which would round the weights: so convert first.
     module = trainer.precision_plugin.convert_module(module)
     handlers = {number: signal.getsignal(number) for number in STOPPING}
@@ -264,6 +279,8 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
         raise Stopped(f"stopped after step {trainer.global_step}", keep_last.received)
     seconds, steps, size = budget.seconds - budget.searched, trainer.global_step, module.batch_size
     log.info("trained %d steps of %d places in %.0f s: %.1f steps/s", steps, size, seconds, steps / seconds)
+    if budget.seconds >= budget.end and steps < trainer.max_steps:
+        stages.leave_out(f"the training ended after {steps} of {trainer.max_steps} steps")
     module.load_state_dict(checkpoint.trained_weights(checkpoint.read(best)))
     return model.eval().to(trainer.strategy.root_device), budget.seconds
 

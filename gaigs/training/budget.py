@@ -3,10 +3,13 @@
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from gaigs import stages
+from gaigs.processes import is_first
 from gaigs.registry import check_type
 
 ENDLESS = 2**40
@@ -26,12 +29,13 @@ class Budget(Callback):
         searched: Duration of the search before the training [s]; of several processes the first one's counts.
 
     Attributes:
-        share: Share of the training's time spent, the same in all processes; 0 without ``max_time``.
+        end: Time at which the limit of the run ends the training, at least a second after the search [s]; or infinite.
+        share: Share of the training's time spent, the same in all processes; 0 without a limit.
     """
 
     def __init__(self, max_time: float | None = None, every: float | None = None, searched: float = 0.0):
         self.max_time, self.every, self.searched = max_time, every, searched
-        self.share = 0.0
+        self.share, self.end = 0.0, math.inf
         self.began = self.validated = searched  # the last validation, and its end [s]
         self.is_due = False
         self.spent, self.start = searched, None  # time before the training [s], and its clock at the start
@@ -43,8 +47,9 @@ class Budget(Callback):
 
     @property
     def limit(self) -> float:
-        """Time at which the training ends [s]; infinite without ``max_time``."""
-        return math.inf if self.max_time is None else max(self.max_time, self.searched + self.max_time / 2)
+        """Time at which the training ends [s]; infinite if steps alone end it."""
+        own = math.inf if self.max_time is None else max(self.max_time, self.searched + self.max_time / 2)
+        return min(own, max(self.end, self.searched + 1.0))
 
     def state_dict(self) -> dict:
         last = {"share": self.share, "began": self.began, "validated": self.validated, "is_due": self.is_due}
@@ -57,6 +62,7 @@ class Budget(Callback):
     def on_fit_start(self, trainer, module) -> None:
         own = self.searched, self.spent, self.began, self.validated
         self.searched, self.spent, self.began, self.validated = trainer.strategy.broadcast(own)
+        self.end = self.spent + stages.left()
         self._stop_in_time(trainer)  # a run that was killed once its time was up
 
     def on_train_start(self, trainer, module) -> None:
@@ -65,7 +71,7 @@ class Budget(Callback):
             trainer.val_check_batch = trainer.global_step
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
-        if self.max_time is None and self.every is None:
+        if math.isinf(self.limit) and self.every is None:
             return
         elapsed = self._look(trainer)
         pause = 4 * (self.validated - self.began)
@@ -78,7 +84,7 @@ class Budget(Callback):
             trainer.val_check_batch = ENDLESS
 
     def on_validation_end(self, trainer, module) -> None:
-        if self.max_time is None and self.every is None:
+        if math.isinf(self.limit) and self.every is None:
             return
         self.validated = self._look(trainer)
         if not trainer.sanity_checking:
@@ -113,7 +119,7 @@ def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
     max_time, every = options.pop("max_time", None), options.get("val_check_interval")
     if max_time is not None:
         max_time = seconds("trainer.max_time", max_time)
-    elif options.get("max_steps", -1) == -1:
+    elif options.get("max_steps", -1) == -1 and math.isinf(stages.left()):
         raise ValueError("trainer.max_steps must be at least 1, got -1; time alone ends it with trainer.max_time")
     if isinstance(every, str | dict):
         every, options["val_check_interval"] = seconds("trainer.val_check_interval", every), ENDLESS
@@ -142,10 +148,16 @@ def seconds(option: str, duration: object) -> float:
     return found
 
 
+def watched(config: Mapping) -> AbstractContextManager[stages.Timekeeper]:
+    """The watch of a configured run: its limit ``max_time``, and bars unless the trainer has none."""
+    limit = math.inf if config.get("max_time") is None else seconds("max_time", config["max_time"])
+    return stages.watched(limit, is_first() and config["trainer"].get("enable_progress_bar", True))
+
+
 def time_share(trainer) -> float | None:
-    """The spent share of the time, the same in all processes; None without ``max_time``."""
+    """The spent share of the time, the same in all processes; None if steps alone end the training."""
     budgets = (callback for callback in trainer.callbacks if isinstance(callback, Budget))
-    return next((budget.share for budget in budgets if budget.max_time is not None), None)
+    return next((budget.share for budget in budgets if math.isfinite(budget.limit)), None)
 
 
 def is_time_up(trainer) -> bool:

@@ -157,25 +157,25 @@ def side_by_side(contents: list[Contents]) -> list[Contents]:
     return contents
 
 
-def contents_of(source: str | Path) -> Contents:
+def contents_of(source: str | Path, trust: bool = False) -> Contents:
     """The contents of a run's folder, or of a checkpoint without its data."""
     path = Path(source)
     if path.is_file():
-        return Contents(load(path), title=path.stem)
+        return Contents(load(path, trust), title=path.stem)
     in_memory = configuration_of(path)["data"]["name"] == "arrays"  # which a run does not store
-    return Contents(load(path), None if in_memory else links_of(path), path.name)
+    return Contents(load(path, trust), None if in_memory else links_of(path), path.name)
 
 
 def run(config: dict) -> None:
     """Serves the view of a run's folder or of a checkpoint, or writes it into one file."""
     if config["folder"] is None:
         raise ValueError("command=view needs the folder of a finished run, or a checkpoint; add folder=runs/...")
-    call("view", show, config["view"], folder=config["folder"])
+    call("view", show, config["view"], folder=config["folder"], trust=config["trust"])
 
 
-def show(folder: str, other: str | None = None, out: str | None = None, port: int = 8080) -> None:
+def show(folder: str, trust: bool, other: str | None = None, out: str | None = None, port: int = 8080) -> None:
     """One run, or two side by side: in a file ``out``, or without one by a server."""
-    shown = View(side_by_side([contents_of(source) for source in (folder, other) if source is not None]))
+    shown = View(side_by_side([contents_of(source, trust) for source in (folder, other) if source is not None]))
     if out is None:
         shown.serve(port)
         return

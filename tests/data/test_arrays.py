@@ -61,6 +61,8 @@ def test_each_link_has_a_receiver_of_its_own():
         ({"receivers": [gateway("gw", place) for place in GATEWAYS]}, "must have different names, got 'gw' more than"),
         ({"test_rows": [0, 12]}, r"test_rows must be numbers of rows from 0 to 11, or a mask of 12, got \[0, 12\]"),
         ({"test_rows": [0.5]}, "test_rows must be numbers of rows"),
+        ({"test_rows": [0, 1] * 6}, r"test_rows must hold each row once, got \[0, 1, .*; a mask must be boolean"),
+        ({"test_rows": [3], "train_rows": [1] * 12}, "train_rows must hold each row once"),
         ({"test_rows": [2, 3], "train_rows": [0, 3]}, "must have no row in common, got 3 in both"),
         ({"test_rows": [0], "split": "random"}, "are for split='official'"),
         ({"train_rows": [0]}, "give test_rows"),

@@ -10,7 +10,10 @@ import pytest
 import scipy.io
 import torch
 
+import gaigs
 from gaigs.data import csi_npz, load
+from gaigs.data.parts import check_parts
+from gaigs.task.csi import Csi
 from gaigs.testing import check_data
 
 RANDOM = {"name": "random", "validation": 0}
@@ -261,9 +264,64 @@ def test_parts_of_complex_numbers_are_joined(file):
     h, expected = arrays()["h"], csi_npz.read(file).labels
     changed(file, h=None, re=h.real, im=h.imag)
     assert torch.equal(csi_npz.read(file, {"h": ["re", "im"]}).labels, expected)
-    for axis in (0, -1):
+    for axis, parts in ((0, "first"), (-1, "last")):
         changed(file, h=np.stack((h.real, h.imag), axis))
-        assert torch.equal(csi_npz.read(file).labels, expected)
+        assert torch.equal(csi_npz.read(file, parts=parts).labels, expected)
+        with pytest.raises(ValueError, match=r"h: expected complex numbers, got float64; .* data.parts=last or first"):
+            csi_npz.read(file)  # may be amplitudes at two antennas
+    for parts, given in (("first", np.abs(h)), ("last", h[..., :2])):
+        changed(file, h=given)
+        with pytest.raises(ValueError, match=rf"data.parts={parts} is for real numbers with 2 along the {parts} axis"):
+            csi_npz.read(file, parts=parts)
+    with pytest.raises(ValueError, match="must be first or last, the axis of"):
+        csi_npz.read(file, parts="both")
+
+
+@pytest.mark.parametrize("rx", [np.zeros((3, 1)), np.zeros(3), np.zeros((2, 1, 3))])
+def test_receivers_of_another_shape_are_named_before_their_index(tmp_path, rx):
+    content = arrays() | {"rx": rx}
+    del content["rx_index"]
+    for save_one, name in ((save_hdf5, "a.h5"), (save, "a.npz")):
+        save_one(tmp_path / name, content)
+        names = {name: f"room/{name}" for name in content} if name == "a.h5" else {}
+        with pytest.raises(ValueError, match=rf"rx: expected the shape \(k, 3\), got {re.escape(str(rx.shape))}"):
+            csi_npz.read(tmp_path / name, names)
+
+
+def mistaken(amplitude, phase):
+    """The two numbers of each channel in place of its parts, in either order."""
+    return [amplitude + 1j * phase, phase + 1j * amplitude]
+
+
+@pytest.mark.parametrize("unit", ["linear", "dB"])
+@pytest.mark.parametrize(
+    ("phases", "word"), [("radians", "jp"), ("degrees", "deg2rad"), ("turn", "jp"), ("turn_deg", "deg2rad")]
+)
+def test_amplitude_and_phase_as_parts_are_refused(file, unit, phases, word):
+    draw = np.random.default_rng(0)
+    h = draw.normal(size=(10, 3, 40)) + 1j * draw.normal(size=(10, 3, 40))
+    angle = np.angle(h) % (2 * np.pi) if phases.startswith("turn") else np.angle(h)
+    phase = np.rad2deg(angle) if "deg" in phases else angle
+    amplitude = np.abs(h) if unit == "linear" else 20 * np.log10(np.abs(h)) - 60
+    factor = "a" if unit == "linear" else r"10 \*\* \(a / 20\)"
+    frequencies = np.linspace(2.4e9, 2.46e9, 40)
+    mend = rf"as amplitude a and phase p\ngive {factor} \* np.exp\(1j \* {'p' if word == 'jp' else 'np.deg2rad'}"
+    for wrong in mistaken(amplitude, phase):
+        changed(file, h=None, re=wrong.real, im=wrong.imag, frequencies=frequencies)
+        with pytest.raises(ValueError, match=rf"h: (real|imaginary) parts are .*{mend}"):
+            csi_npz.read(file, {"h": ["re", "im"]})
+        with pytest.raises(ValueError, match=rf"labels: .*{mend}"):
+            gaigs.links(task=Csi(3, frequencies), transmitters=arrays()["tx"], receivers=[[0, 0, 2]], labels=wrong)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 3.0, 100.0])
+def test_parts_of_true_channels_are_no_amplitudes(scale):
+    """Random phases; phases near 0, as after calibration; channels of one sign; few numbers."""
+    draw = np.random.default_rng(0)
+    h = scale * (draw.normal(size=2000) + 1j * draw.normal(size=2000))
+    aligned = scale * np.exp(1j * draw.uniform(-1.5, 1.5, 2000))
+    for channels in (h, aligned, scale * (1 + 0.1 * h), np.abs(h.real) + 1j * np.abs(h.imag), h[:50]):
+        check_parts("h", channels)
 
 
 def test_a_single_receiver_needs_no_index(file):

@@ -197,6 +197,21 @@ def test_defects_of_the_parameters_are_named(folder, content, message):
         deepmimo.read(folder)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [("params.mat", "BS1_BS.mat", "BS1_UE_0-1024.mat"), ("O1_60.params.mat", "O1_60.1.CIR.mat", "O1_60.1.DoA.mat")],
+)
+def test_scenarios_of_earlier_versions_are_named(tmp_path, names):
+    scene = tmp_path / "scene_0"
+    scene.mkdir()
+    for name in names:
+        scipy.io.savemat(scene / name, {"tx_loc": np.zeros(3)})
+    message = r"a scenario of DeepMIMO v3 or before, as .*\nby the package deepmimo: deepmimo"
+    for root in (scene, tmp_path):
+        with pytest.raises(ValueError, match=message):
+            deepmimo.read(root)
+
+
 def test_a_folder_without_paths_and_options_out_of_range_are_refused(folder):
     for options, message in (
         ({"elements": [4]}, "elements must be the array's rows and columns"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.constants import speed_of_light
 
 from gaigs.data import csi_npz
 
@@ -75,6 +76,33 @@ def test_defects_are_named(tmp_path, change, message):
     content = arrays()
     with pytest.raises(ValueError, match=message):
         read(tmp_path, content | change(content))
+
+
+@pytest.mark.parametrize(("antennas", "per_antenna"), [(1, False), (3, False), (3, True)])
+def test_gains_without_the_carriers_phase_get_it(tmp_path, antennas, per_antenna):
+    """Free space and a reflection; walls block the direct paths of a third of the links."""
+    content = arrays(moving=20, antennas=antennas)
+    elements = 0.04 * np.outer(np.arange(antennas) - antennas // 2, (0, 1, 0))
+    stands = content["rx"][:, None] + elements * per_antenna
+    tau = np.linalg.norm(stands[:, :, None] - content["tx"], axis=-1)[..., None] / speed_of_light + [0, 2e-8, 0]
+    a = np.broadcast_to(np.array([1.0, -0.4, 0.0]), tau.shape).astype(complex)
+    a[:, :, ::3, 0] = 0
+    if not per_antenna:
+        tau = tau[:, 0]
+    full = tau if per_antenna else tau[:, None]
+    content |= {"elements": elements, "tau": tau[:, :, :, None] if per_antenna else tau}
+    expected = read(tmp_path, content | {"a": (a * np.exp(-2j * np.pi * CARRIER * full))[:, :, :, None, :, None]})
+    links = read(tmp_path, content | {"a": a[:, :, :, None, :, None]})
+    np.testing.assert_allclose(links.labels, expected.labels, atol=1e-3)
+    assert "phases of a lack the carrier's over the delay, and get it" in links.remarks
+    assert "carrier" not in expected.remarks
+
+
+def test_amplitude_and_phase_of_paths_are_refused(tmp_path):
+    content = arrays(moving=40)
+    parts = np.stack((np.abs(content["a"]), np.angle(content["a"])))
+    with pytest.raises(ValueError, match=r"a: real parts are 0 or more .*\ngive a \* np.exp\(1j \* p\)"):
+        read(tmp_path, content | {"a": parts})
 
 
 def test_delays_from_the_first_path_on_are_read_where_delays_are_unknown(tmp_path):

@@ -78,7 +78,7 @@ def test_the_fixed_end_can_be_chosen(file):
     assert read(file, fixed="rx").remarks == read(file).remarks
     with pytest.raises(ValueError, match="fixed must be tx or rx, or null for the end with fewer places, got 'both'"):
         read(file, fixed="both")
-    with pytest.raises(TypeError, match="'not_heard' must be a finite number, got nan"):
+    with pytest.raises(TypeError, match="'not_heard' must be a finite number or a list, got nan"):
         read(file, not_heard=math.nan)
     file.write_text(f"{BACK.splitlines()[0]}\n1,2,3,4,5,6,-50\n2,2,3,5,5,6,-51\n")
     tie = read(file, split=RANDOM | {"test": 0.5})
@@ -95,9 +95,8 @@ def test_only_the_mark_is_not_heard(file):
     file.write_text(FORTH.replace("-53", "-120.5").replace("-43", "-200"))
     links = read(file)
     assert links.labels.tolist() == [-40, -50.25, -41, -42, -200, -120.5]
-    assert links.remarks.endswith(
-        "2 of -100 dBm were not heard and are left out; 2 readings below -100 dBm are taken for levels"
-    )
+    counts = "2 of -100 dBm were not heard and are left out; 2 readings below -100 dBm are taken for levels"
+    assert counts in links.remarks
     links = read(file, not_heard=-200)
     assert links.labels.tolist() == [-40, -50.25, -41, -100, -42, -100, -120.5]
     assert links.remarks.endswith("; 1 of -200 dBm were not heard and are left out")
@@ -135,7 +134,7 @@ def test_levels_of_0_dbm_and_more_are_taken_and_counted(file):
     replace(file, "-42", "12.5")
     links = read(file)
     assert links.labels.tolist() == [-40, -50.25, 0, 12.5, -43, -53]
-    assert links.remarks.endswith("; 2 readings of 0 dBm or more are taken for levels")
+    assert "; 2 readings of 0 dBm or more are taken for levels" in links.remarks
 
 
 def test_seventy_gateways_are_more_than_the_usual_gaussians(file):

@@ -73,6 +73,23 @@ def test_geojson_is_in_longitude_and_latitude(on_map, tmp_path):
     assert north == pytest.approx([9.0, 1.0 / 110_574 / 0.9996], abs=1e-8)  # a metre of a meridian, scaled by UTM
 
 
+def test_geojson_has_a_key_for_each_value_of_each_receiver(rssi, tmp_path):
+    model, _ = rssi
+    inside = model.scene
+    names = ["ap", "ap deviation", "ap deviation deviation", "ap value"]
+    model.scene = replace(
+        inside, receivers=tuple(map(lambda one, name: replace(one, name=name), inside.receivers, names))
+    )
+    gaigs.export(model, tmp_path / "floor.geojson", pitch=1.0)
+    floor = gaigs.radio_map(model, pitch=1.0)
+    model.scene = inside
+    (first, *_) = json.loads((tmp_path / "floor.geojson").read_text())["features"]
+    assert len(first["properties"]) == 8
+    for number, name in enumerate(names):
+        assert first["properties"][f"{name} value"] == pytest.approx(floor.values[number, 0, 0], abs=1e-3)
+        assert first["properties"][f"{name} deviation"] == pytest.approx(floor.deviations[number, 0, 0], abs=1e-3)
+
+
 def test_netcdf_has_axes_units_and_the_coordinate_system(on_map, tmp_path):
     floor = gaigs.radio_map(on_map, pitch=0.5, height=1.2)
     gaigs.export(on_map, tmp_path / "floor.nc", pitch=0.5, height=1.2)

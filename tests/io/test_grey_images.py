@@ -99,6 +99,16 @@ def test_colours_and_transparent_pixels_are_no_grey_values(files, channel, value
         GreyImages(files, SHAPE)[torch.tensor([1])]
 
 
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P"])
+def test_a_colour_map_is_named(files, mode):
+    ramp = np.stack((GREY, 255 - GREY, np.full_like(GREY, 80)), -1)
+    Image.fromarray(ramp).convert(mode).save(files[1])
+    with pytest.raises(
+        ValueError, match=r"1\.png: expected grey values, got the colour .*; as of a colour map: store the"
+    ):
+        GreyImages(files, SHAPE)[torch.tensor([1])]
+
+
 @pytest.mark.parametrize("place", [45, 100, 6000, 20000, -60, -5000])
 def test_a_damaged_byte_is_no_other_pixel(files, place):
     content = bytearray(files[1].read_bytes())

@@ -4,6 +4,8 @@ import pytest
 
 from gaigs.io.yaml import read_mapping, to_position
 
+ALIASES = "".join(f"b{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 8))  # each twice as long when written out
+
 
 @pytest.fixture
 def read(tmp_path):
@@ -56,6 +58,7 @@ def test_a_position_too_far_for_float32_is_refused():
         ("east: !<tag:%E9> 1", "cannot parse FILE: "),
         ("east: [!feet 5, 1, 2]", "cannot parse FILE: could not determine a constructor for the tag '!feet'"),
         ("east: &a [*a, 1, 2]", "east must be 3 finite"),
+        (f"a: &a0 [5]\n{ALIASES}east: *a7", "got [[[[[[[...], [...]], "),
         ("east: [5, 1, 2]\n---\nwest: [5, 1, 2]\n", "cannot parse FILE: expected a single document"),
         ("east: [5, 1, 2]\n" * 2, "cannot parse FILE: the key 'east' is there twice"),
         ('"ea\\tst": 1', "expected a name in front of a colon, got 'ea\\tst'"),

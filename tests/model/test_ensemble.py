@@ -88,6 +88,8 @@ def test_an_ensemble_has_a_member_and_one_process_and_is_not_trained_again(links
         gaigs.train("gaigs", links, ensemble=0, **FEW)
     with pytest.raises(ValueError, match=r"an ensemble trains in one process; set trainer\.devices=1"):
         gaigs.train("gaigs", links, "trainer.devices=2", "trainer.strategy=ddp", ensemble=2, **FEW)
+    with pytest.raises(ValueError, match=r"max_time limits a run of one process; of several set trainer\.max_time"):
+        gaigs.train("gaigs", links, "trainer.devices=2", "trainer.strategy=ddp", max_time="00:00:10:00", **FEW)
     model = Ensemble(links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20})])
     with pytest.raises(ValueError, match=r"train one of its models, members\[0\]"):
         gaigs.train(model, links, **FEW)

@@ -10,7 +10,8 @@ from gaigs.geometry import Grid, Rays
 from gaigs.projection import Plane, Splats
 from gaigs.projection.direction_cosine import DirectionCosine
 from gaigs.projection.mercator import Mercator
-from gaigs.testing.rasterizer import distance_to_jumps, rasterize_densely, render_with_gradients
+from gaigs.rasterizer.torch import TorchRasterizer
+from gaigs.testing.rasterizer import cast_scene, distance_to_jumps, rasterize_densely, render_with_gradients
 
 opencl = pytest.importorskip("gaigs.rasterizer.opencl", exc_type=ImportError)
 pytestmark = pytest.mark.usefixtures("opencl_works")
@@ -164,6 +165,14 @@ def test_values_and_gradients_are_those_of_the_dense_float64_rasterizer(name):
         bound = 1 if part == "transmittance" else largest(true[part])
         tolerance = bound * (GRADIENTS if part.startswith("gradient") else VALUES)
         torch.testing.assert_close(value, true[part].float(), rtol=0, atol=tolerance, msg=lambda m, p=part: f"{p}: {m}")
+
+
+def test_an_attenuation_of_0_has_the_gradient_of_the_float64_rasterizer():
+    scene = random_scene(attenuations=(0.0, 0.0))
+    pixels = torch.ones(3, *scene[-1].shape, dtype=torch.bool)
+    true = render_with_gradients(TorchRasterizer(), cast_scene(scene, "cpu", torch.float64), pixels)
+    found = render_with_gradients(opencl.OpenCLRasterizer(), scene, pixels)
+    assert torch.equal(found["gradient of attenuations"], true["gradient of attenuations"].float())
 
 
 @pytest.mark.parametrize(("c", "own"), [(9, False), (19, True)])

@@ -61,6 +61,12 @@ def test_rays_are_pixels_of_the_grid():
         ({"quats": torch.ones(4, 4)}, r"quats must have 5 rows of 4, got \(4, 4\)"),
         ({"opacities": torch.ones(5)}, "opacities must be real numbers of means' torch.float64, got torch.float32"),
         ({"signal": torch.ones(2, 5, 1).double(), "means": torch.ones(3, 5, 3).double()}, "one number of transmitters"),
+        (
+            {"opacities": torch.full((5,), 1.5).double()},
+            r"opacities must lie in \[0, 1\], got 1.5; pass them through a",
+        ),
+        ({"attenuations": -torch.ones(3, 5).double()}, r"attenuations must lie in \[0, 1\], got -1"),
+        ({"scales": -torch.ones(5, 3).double()}, r"scales must lie in \[0, inf\], got -1; take their exp first"),
         ({"grid": COARSE.flatten()}, "pixel must be given for rays"),
         ({"grid": gaigs.Grid(torch.arange(1.0, 90.0), torch.arange(360.0))}, "Grid.degrees takes degrees"),
         ({"rasterizer": "torhc"}, r"unknown rasterizer 'torhc' \(did you mean 'torch'\?\)"),

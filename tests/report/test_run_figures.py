@@ -7,6 +7,7 @@ import pytest
 import torch
 from matplotlib import image
 
+from gaigs import stages
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Links, Split
 from gaigs.gaussians import Gaussians
@@ -127,6 +128,16 @@ def test_the_learnt_room_is_drawn(spectrum_links, tmp_path, spy):
     assert folded[0][0] == (spectrum_links, learnt)
     model = Untrained(spectrum_links.scene, room=learnt._replace(paths=[]))  # of a transmitter that nobody hears
     assert "paths" not in {file.stem for file in write_figures(tmp_path, spectrum_links, model)}
+
+
+def test_figures_that_have_no_time_are_named(spectrum_links, tmp_path, monkeypatch):
+    labels = spectrum_links.labels[spectrum_links.split.test].numpy().astype(np.float16)
+    np.savez(tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_mean=np.ones(1))
+    monkeypatch.setattr(stages, "is_up", iter([False, True]).__next__)
+    with stages.watched() as watch:
+        files = write_figures(tmp_path, spectrum_links, Untrained(spectrum_links.scene))
+    assert [file.name for file in files] == ["room.png"]
+    assert watch.left_out == ["no figures spectra, spectra_polar, ssim_cdf"]
 
 
 @pytest.fixture

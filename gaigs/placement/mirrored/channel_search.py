@@ -26,6 +26,7 @@ from gaigs.placement.mirrored.reflections import (
 )
 from gaigs.propagation import NEAREST, slab
 from gaigs.query import evenly
+from gaigs.stages import is_up, track
 from gaigs.task.csi import Csi
 
 log = logging.getLogger(__name__)
@@ -239,6 +240,8 @@ class ChannelSearch(PlaneSearch):
         best = planes, planes[:, :3]
         if len(planes):
             best = self.without_false(*self.resolve(self.refine(planes, 300, 5e-3)))
+        if is_up():
+            return best
         # Free strengths may find tilted planes in place of upright ones, or none, and move known walls away.
         if not len(best[0]) or (self.numbers < FEW and (len(self.start) or not is_square(best[0]))):
             walls = self.aligned()
@@ -437,7 +440,9 @@ class ChannelSearch(PlaneSearch):
         path. Walls go first. All planes move a little whenever there is one more.
         """
         count = len(planes)
-        while len(planes) < self.most:
+        for _ in track(range(self.most - len(planes)), "search of planes"):
+            if is_up():
+                break
             before = self.cost((planes, slabs))
             new = [plane for plane in others if not self.alike(planes, plane).any()]
             for candidates in (*self.along(planes, slabs, axes(planes), SMALL), new):
@@ -518,6 +523,8 @@ class ChannelSearch(PlaneSearch):
     def settled(self, planes, slabs, polishes: bool = False) -> Room:
         """Each plane once more at its best offset and tilt, as the others are known now."""
         for k in range(len(planes)):
+            if is_up():
+                return planes, slabs
             trials = [(planes, slabs)]
             for plane, material in self.proposals(planes, k, self.reach, 0.006, SLABS):
                 trials.append((planes.clone(), slabs.clone()))
@@ -542,7 +549,7 @@ class ChannelSearch(PlaneSearch):
 
     def without_false(self, planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]) -> Room:
         """Planes of which each explains something that the others do not, and their slabs."""
-        while len(planes) > len(self.start):
+        while len(planes) > len(self.start) and not is_up():
             without = [torch.arange(len(planes)) != k for k in range(len(self.start), len(planes))]
             best = min(((planes[kept], slabs[kept]) for kept in without), key=self.cost)
             if self.cost(best) > self.cost((planes, slabs)):
@@ -572,11 +579,15 @@ class ChannelSearch(PlaneSearch):
         normals = torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3)))
         grid = self.grid(normals.to(self.points), 80, BEYOND)
         planes = known
-        while len(planes) < self.most and (tried := self.with_one_more(planes, grid)):
+        for _ in track(range(self.most - len(planes)), "search of planes"):
+            if is_up() or not (tried := self.with_one_more(planes, grid)):
+                break
             _, share, planes = min(tried, key=lambda found: found[0])
             planes = self.refine(planes, 60, 1e-2)
             log.info("%s: %.1f %% of the power", self.words(planes[-1]), 100 * share)
-        for _ in range(len(planes) - len(known)):  # each once more, as the others are known now
+        for _ in track(range(len(planes) - len(known)), "search of planes"):  # each once more, as others are known now
+            if is_up():
+                break
             others = torch.cat((planes[: len(known)], planes[len(known) + 1 :]))
             kept = torch.cat((others, planes[len(known), None]))
             tried = [*self.with_one_more(others, grid), (self.unexplained(kept), 0.0, kept)]
@@ -687,7 +698,9 @@ class ChannelSearch(PlaneSearch):
         (planes, slabs), resolved = half_spaces(planes), torch.zeros(len(planes), dtype=torch.bool)
         parts = self.some(planes)
         for reach, tilt, materials in ((0.07, 0.04, SLABS[::3]), (0.05, 0.006, SLABS), (0.05, 0.006, SLABS)):
-            for k in range(len(planes)):
+            for k in track(range(len(planes)), "places of planes"):
+                if is_up():
+                    return planes, slabs
                 resolved[k] = True
                 trials: list[tuple[float, Tensor, Tensor]] = []
                 for about in (planes, *(self.squared(planes, k) if tilt > 0.01 else ())):

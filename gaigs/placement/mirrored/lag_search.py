@@ -30,6 +30,7 @@ from gaigs.placement.mirrored.reflections import (
 )
 from gaigs.propagation import NEAREST, fresnel
 from gaigs.query import Query, evenly
+from gaigs.stages import is_up, track
 
 MATERIAL = complex(4.0, -0.3)
 """Relative permittivity of all planes: between wood and concrete."""
@@ -417,7 +418,9 @@ class LagSearch(PlaneSearch):
     def around(self, found: Found) -> Found:
         """Each plane moved, the strongest first; then all together."""
         singles = all_sequences(len(found.planes), 1)[1:]
-        for k in self.powers(found.planes, singles).argsort(descending=True).tolist():
+        for k in track(self.powers(found.planes, singles).argsort(descending=True).tolist(), "search of planes"):
+            if is_up():
+                break
             found = self.moved(found, k)
         direct = [self.errors(found.planes, self.opened(found.open, 0, is_open)) for is_open in (True, False)]
         found = replace(found, open=self.opened(found.open, 0, direct[0] <= direct[1] + BLOCKED))
@@ -429,7 +432,9 @@ class LagSearch(PlaneSearch):
         """Further planes, one after the other, as long as the errors fall by ``GAIN``."""
         normals = torch.cat((fibonacci_lattice(200, 0.0, math.pi / 2).float(), torch.eye(3)))
         grid = self.grid(normals, 60, BEYOND).flatten(0, 1)
-        while len(found.planes) < most:
+        for _ in track(range(most - len(found.planes)), "search of planes"):
+            if is_up():
+                break
             before, trials = self.errors(found.planes, found.open), []
             for plane in self.candidates(found, grid):
                 tried = torch.cat((found.planes, plane[None])), torch.cat((found.open, found.open[:, :1] | True), 1)

@@ -1,5 +1,6 @@
 """Search for planes in received levels: interference with known paths, one plane after the other."""
 
+import itertools
 import logging
 import math
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from gaigs.placement.mirrored.lag_search import LagSearch, ReceiverLags, reflect
 from gaigs.placement.mirrored.paths import Mirrored
 from gaigs.placement.mirrored.reflections import seen_from, square_normals
 from gaigs.query import Query
+from gaigs.stages import is_up, track
 
 log = logging.getLogger(__name__)
 
@@ -105,8 +107,10 @@ class LevelSearch(LagSearch):
             learnt = 0.0 if placement.log_bandwidth is None else placement.log_bandwidth.exp().item()
             bandwidths = self.bandwidths(None if is_unknown else learnt)
             trials = []
-            for self.bandwidth in bandwidths:
-                trials += [(*self.clearest(planes, passing, located, k), self.bandwidth, k) for k in left]
+            for self.bandwidth, k in track([*itertools.product(bandwidths, left)], "search of planes"):
+                if is_up():
+                    return found
+                trials.append((*self.clearest(planes, passing, located, k), self.bandwidth, k))
             gain, plane, self.bandwidth, k = max(trials, key=lambda trial: trial[0])
             if gain >= CLEAR and not least:
                 least = CHANCE * self.by_chance(planes, passing, located, left, gain / CHANCE)
@@ -144,11 +148,11 @@ class LevelSearch(LagSearch):
     ) -> float:
         """Largest gain of ``clearest`` where the errors of each receiver's links are shuffled.
 
-        The first gain above ``enough`` ends the trials.
+        The first gain above ``enough`` ends the trials; if the time is up, it is infinite.
         """
         real, sequences, largest = self.receivers, self.sequences(planes), 0.0
         generator = torch.Generator().manual_seed(0)
-        for _ in range(SHUFFLES):
+        for _ in track(range(SHUFFLES), "search of planes"):
             shuffled = []
             for receiver, own in self.each(passing):
                 powers = self.received(receiver.paths(planes, sequences, own), self.phased(sequences, located))
@@ -156,6 +160,8 @@ class LevelSearch(LagSearch):
                 errors = errors[torch.randperm(len(errors), generator=generator)]
                 shuffled.append(replace(receiver, lags=powers * errors))
             for k in left:
+                if is_up():
+                    return math.inf
                 self.receivers = shuffled
                 largest = max(largest, self.clearest(planes, passing, located, k)[0])
                 self.receivers = real

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gaigs.placement.mirrored.reflections import reflection_points, seen_from, tangents
+from gaigs.stages import is_up, track
 
 
 class PlaneSearch:
@@ -112,7 +113,9 @@ class PlaneSearch:
             return torch.cat((normals, ((normals * pivots).sum(1) + heights + shifts[:, 0])[:, None]), 1)
 
         optimizer = torch.optim.Adam([{"params": [shifts]}, {"params": others}])
-        for step in range(steps):
+        for step in track(range(steps)):
+            if is_up():
+                break
             for group, highest in zip(optimizer.param_groups, (rate, 2e-2), strict=True):
                 group["lr"] = highest * 0.03 ** (step / steps)
             optimizer.zero_grad()

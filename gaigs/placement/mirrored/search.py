@@ -13,6 +13,7 @@ from gaigs.placement.mirrored.lag_search import WIDEST
 from gaigs.placement.mirrored.paths import Mirrored
 from gaigs.placement.mirrored.reflections import square_normals
 from gaigs.query import Batch
+from gaigs.stages import track
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +46,8 @@ def move_planes(model, batch: Batch, wavelength: float, least: float) -> list[fl
     if least > reach:  # steps cannot be coarser than a fraction of the wavelength
         log.info("planes are searched within %.3g m, not %.3g m; placement.walls can start nearer", reach, least)
     planes = by_strength(placement, batch)
-    return [_move(model, plane, reach, wavelength, some, model.takes_paths) for plane in planes]
+    moves = track(planes, "search of planes")
+    return [_move(model, plane, reach, wavelength, some, model.takes_paths) for plane in moves]
 
 
 def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, square: bool) -> float:

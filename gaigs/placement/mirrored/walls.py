@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from gaigs.data.doubts import walls_doubt
+from gaigs.data.checks.places import check_walls
 from gaigs.io.meshes import Face, read_obj, triangles
 from gaigs.io.tables import read_walls
 
@@ -49,8 +49,8 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
         raise ValueError(f"placement.walls must be a .csv or .obj, got {file.name}")
     if not len(planes):
         raise ValueError(f"{file} must have a wall longer than {SHORTEST} m")
-    if doubt := walls_doubt(points, torch.stack((lower, upper))):
-        log.warning("placement.walls: %s", doubt)
+    for finding in check_walls(points, torch.stack((lower, upper))):
+        log.warning("placement.walls: %s", finding)
     return planes
 
 

@@ -210,7 +210,7 @@ kernel void gather(sizes_t sizes, global const int *order, global const int *blo
                 int at = t * sizes.splats + to;
                 opacities[at] = found[0] == 0 ? 0 : found[0] / look[0];
 #if ATTENUATION
-                attenuations[at] = found[1] / fmax(exp2(look[1]), STEEPEST);
+                attenuations[at] = look[1] == OPAQUE ? 0 : found[1] / fmax(exp2(look[1]), STEEPEST);
 #endif
                 for (int c = 0; c < CHANNELS; c++) signal[at * CHANNELS + c] = found[1 + ATTENUATION + c];
             }

@@ -114,6 +114,16 @@ def test_planes_are_found(case):
         assert abs(next(heights) - next(heights)) < 0.005
 
 
+def test_a_search_whose_time_is_up_gives_the_planes_that_it_has(monkeypatch):
+    links, _ = room()
+    own, calls = search(links), []
+    one_more = own.with_one_more
+    monkeypatch.setattr(own, "with_one_more", lambda *parts: calls.append(0) or one_more(*parts))
+    monkeypatch.setattr(channel_search, "is_up", lambda: bool(calls))
+    planes, slabs = own.run()
+    assert len(calls) == len(planes) == len(slabs) == 1
+
+
 def test_no_plane_is_found_in_free_space(monkeypatch):
     monkeypatch.setattr(channel_search, "LEAST", 1e-6)
     monkeypatch.setattr(channel_search, "FAINTEST", 1e-6)

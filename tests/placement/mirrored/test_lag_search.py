@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch.nn import functional
 
+from gaigs import stages
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Split
 from gaigs.geometry import Pose
@@ -52,6 +53,13 @@ def test_planes_off_by_decimetres_and_degrees_are_found(search):
     assert off[:, :3].max() < 0.01, "the faintest counts least"
     assert off[1:, 3].max() < 0.005
     assert off[0, 3] < 0.3, "the faintest may be two wavelengths off: its error hardly counts"
+
+
+def test_a_search_whose_time_is_up_leaves_planes_near_their_start(search):
+    start = WALLS + torch.tensor([0.0, 0.0, 0.0, 0.3])
+    with stages.watched(1e-9):
+        found = search.run(start, 0.0, 4)
+    torch.testing.assert_close(found, start.double(), rtol=0, atol=1e-5)
 
 
 def test_an_unknown_band_is_a_carrier_where_waves_of_all_planes_interfere(search):

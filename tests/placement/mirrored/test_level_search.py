@@ -8,6 +8,7 @@ import torch
 from scipy.constants import speed_of_light
 from torch.nn import functional
 
+from gaigs import stages
 from gaigs.antenna import Array, Receiver
 from gaigs.data import Split
 from gaigs.geometry import Pose
@@ -87,6 +88,13 @@ def test_planes_off_by_decimetres_are_located(bandwidth):
     assert off[:, 3].max() < 0.02
     if bandwidth is None:
         assert 1 / 4 < placement.log_bandwidth.exp() / BANDWIDTH < 4
+
+
+def test_a_search_whose_time_is_up_locates_no_more():
+    search, placement = room(BANDWIDTH)
+    with stages.watched(1e-9):
+        assert search.locate(placement) == []
+    assert not placement.located.any()
 
 
 @pytest.mark.parametrize("seed", [0, 7])

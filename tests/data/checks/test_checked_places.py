@@ -1,4 +1,4 @@
-"""Doubts about sizes and spectra, each once and with its numbers."""
+"""Checks of places, walls, arrays and the range of spectra, each once and with its numbers."""
 
 import re
 from dataclasses import replace

@@ -1,0 +1,32 @@
+"""Checks of data against their own geometry: units, axes, signs and orders in which they may have been written."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from gaigs.data.checks.channels import check_channels
+from gaigs.data.checks.finding import Finding
+from gaigs.data.checks.levels import check_levels
+from gaigs.data.checks.places import check_arrays, check_constant, check_edges, check_places
+from gaigs.data.checks.spectra import check_spectra
+
+__all__ = ["Finding", "check"]
+
+
+def check(links: Any) -> Iterator[Finding]:
+    """What is probably wrong with ``Links``, with or without a split.
+
+    Raises:
+        ValueError: All spectra are constant, or too small for SSIM.
+    """
+    yield from check_places(links)
+    yield from check_edges(links)
+    yield from check_arrays(links)
+    if links.task.shape and links.task.name != "spectrum":
+        yield from check_constant(links)
+    match links.task.name:
+        case "spectrum":
+            yield from check_spectra(links)
+        case "csi":
+            yield from check_channels(links)
+        case "rssi":
+            yield from check_levels(links)

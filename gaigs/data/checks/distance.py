@@ -1,0 +1,105 @@
+"""Levels against the distance: the law that they follow, and how well under another convention."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.data.checks.hypotheses import Sample
+
+
+class Law(NamedTuple):
+    """Levels of each receiver as a + b log10(distance), with b from -60 to 0 dB a decade.
+
+    Attributes:
+        slopes: b of each receiver [dB per decade].
+        errors: Levels less the law [dB].
+    """
+
+    slopes: Float[Tensor, "*h r"]
+    errors: Float[Tensor, "*h n"]
+
+
+class Gain(NamedTuple):
+    """Mean errors of data as read and under another convention [dB], and the gain of log likelihood."""
+
+    read: float
+    fits: float
+    evidence: float
+
+    def is_clear(self, share: float = 0.85, evidence: float = 8.0) -> bool:
+        """True if the error falls to a share of it, and by more than chance explains."""
+        return self.fits < share * self.read and self.evidence > evidence
+
+
+def decades(sample: Sample) -> Float[Tensor, " n"]:
+    """Logarithm of each link's distance; below a hundredth of the median distance the law ends."""
+    distances = (sample.transmitters - sample.positions[sample.receivers]).norm(dim=1)
+    return distances.clamp_min(0.01 * distances.median()).clamp_min(1e-9).log10()
+
+
+def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = False) -> Law:
+    """The law of distance of each receiver, by Huber's weights, so that a few wrong levels do not bend it.
+
+    Args:
+        logarithms: Logarithms of the links' distances, under h conventions at once.
+        sample: Receivers and levels of the links.
+        patterns: True for receivers with a main direction: a harmonic of the azimuth is fitted, too; without h.
+
+    Source: Huber, Robust estimation of a location parameter, 1964.
+    """
+    others = torch.ones_like(logarithms)[..., None]  # (*h, n, c), fitted beside the slope
+    if patterns:
+        x, y, _ = (sample.transmitters - sample.positions[sample.receivers]).T
+        azimuths = torch.atan2(y, x)
+        others = torch.stack((torch.ones_like(x), azimuths.cos(), azimuths.sin()), 1)
+    levels = sample.labels.expand_as(logarithms)
+    weights = torch.ones_like(logarithms)
+    for _ in range(5):
+        x = _without(others, logarithms, weights, sample)
+        y = _without(others, levels, weights, sample)
+        squares = _sums(weights * x.square(), sample)  # (*h, r)
+        # Levels fall with the distance, by its sixth power at most.
+        slopes = (_sums(weights * x * y, sample) / squares.clamp_min(1e-9)).clamp(-60, 0)
+        errors = y - slopes[..., sample.receivers] * x
+        scale = 1.4826 * errors.abs().median(-1, keepdim=True).values
+        weights = (1.345 * scale.clamp_min(0.1) / errors.abs().clamp_min(1e-9)).clamp_max(1)
+    return Law(slopes, errors)
+
+
+def compare(read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6) -> Gain:
+    """Gain of errors about one law over those about another, where errors above 30 dB count as 30 dB.
+
+    Shadowing is alike at near places, so that each receiver's cells, at most ``cells`` along x and along y, count as
+    single observations. The log likelihood of m of them with a mean error of s is -m log(s), up to a constant.
+    """
+    before = read.abs().clamp_max(30).mean().item()
+    after = fits.abs().clamp_max(30).mean().item()
+    places = sample.transmitters[:, :2]
+    low, high = places.amin(0), places.amax(0)
+    cell = ((places - low) / (high - low).max().clamp_min(1e-9) * cells).long().clamp_max(cells - 1)
+    observed = len(((sample.receivers * cells + cell[:, 0]) * cells + cell[:, 1]).unique())
+    return Gain(before, after, observed * math.log(max(before, 1e-9) / max(after, 1e-9)))
+
+
+def _sums(values: Float[Tensor, "*h n"], sample: Sample) -> Float[Tensor, "*h r"]:
+    """Sums over the links of each receiver."""
+    zeros = values.new_zeros((*values.shape[:-1], len(sample.positions)))
+    return zeros.index_add_(-1, sample.receivers, values)
+
+
+def _without(
+    others: Float[Tensor, "*h n c"], values: Float[Tensor, "*h n"], weights: Float[Tensor, "*h n"], sample: Sample
+) -> Float[Tensor, "*h n"]:
+    """Values less their weighted least-squares fit by some columns at each receiver."""
+    if others.shape[-1] == 1:
+        means = _sums(weights * values, sample) / _sums(weights, sample).clamp_min(1e-9)
+        return values - means[..., sample.receivers]
+    columns = others.mT  # (c, n)
+    squares = _sums(weights * columns[:, None] * columns, sample)  # (c, c, r)
+    products = _sums(weights * columns * values, sample)  # (c, r)
+    ridge = 1e-9 * torch.eye(len(columns), dtype=values.dtype)
+    coefficients = torch.linalg.solve(squares.permute(2, 0, 1) + ridge, products.T)  # (r, c)
+    return values - (others * coefficients[sample.receivers]).sum(1)

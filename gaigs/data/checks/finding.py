@@ -1,0 +1,31 @@
+"""What a check finds in data."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A fault that data probably have.
+
+    Attributes:
+        fault: Its short name, such as "order of the quaternion".
+        text: What was found, and by how much.
+        mend: An option or a line of numpy that mends it; empty if there is none.
+        read: Score of the data as they were read; None if nothing was compared.
+        fits: The same score under the convention that fits.
+        score: Meaning of both scores with their unit.
+
+    Example:
+        >>> str(Finding("unit of levels", "levels are positive", "levels = 10 * np.log10(levels / 1e-3)"))
+        'levels are positive; levels = 10 * np.log10(levels / 1e-3)'
+    """
+
+    fault: str
+    text: str
+    mend: str = ""
+    read: float | None = None
+    fits: float | None = None
+    score: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text}; {self.mend}" if self.mend else self.text

@@ -1,0 +1,206 @@
+"""Checks of received levels: units, signs, marks, single levels that are wrong, and the places of receivers."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gaigs.data.checks.distance import decades, fit_law
+from gaigs.data.checks.finding import Finding
+from gaigs.data.checks.hypotheses import Hypothesis, Sample, best_fit, sample_of
+from gaigs.data.checks.receivers import check_power, check_receivers, sample_of_given
+from gaigs.data.readings import marks_of
+from gaigs.io.tables import shortened
+
+
+def check_levels(links: Any) -> Iterator[Finding]:
+    """Findings about the unit, sign and marks of levels, about single levels, and about receivers."""
+    levels = links.labels[torch.arange(len(links))].double()
+    heard = levels[levels != 0]
+    if len(heard) and (heard > 0).double().mean() > 0.9:
+        yield from check_unit(links, heard)
+        return
+    yield from check_signs(links, levels)
+    for mark in marks_of(levels[:, None].numpy()):
+        text = f"{int((levels == mark).sum())} levels are {mark:g} dBm"
+        yield Finding("mark of not heard", text, "does it mean not heard?")
+    yield from check_columns(links, levels)
+    yield from check_neighbours(links)
+    yield from check_receivers(links)
+    yield from check_power(links)
+
+
+def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
+    """A finding about levels that are positive: powers, amplitudes, or decibels without sign or of another unit."""
+    low, high = np.quantile(levels.numpy(), (0.05, 0.95)).tolist()
+    text = f"{int((levels > 0).sum())} levels are above 0 dBm, {levels.min():.3g} to {levels.max():.3g}"
+    known = sample_of_given(links)
+    # Powers span decades, decibels of one survey seldom a factor of 100; amplitudes are small, too.
+    if high > 100 * max(low, 1e-300) or levels.max() < 0.1:
+        yield _linear_unit(known, text, math.log10(np.median(levels)))
+        return
+    without_sign = Hypothesis("sign", _negated, "levels = -levels")
+    fit = best_fit(known[0], [without_sign], explained) if known else None
+    if fit is None or fit.fits >= fit.read:
+        yield Finding("sign of levels", text, "was a sign lost, or are they path losses? levels = -levels")
+        return
+    mend = "percent, scaled, dB over the noise, or dBuV? levels = levels - 107 of dBuV at 50 ohm"
+    yield Finding("unit of levels", f"{text}, and fall with the distance", mend)
+
+
+def _linear_unit(known: tuple[Sample, list[str]] | None, text: str, middle: float) -> Finding:
+    """The finding for levels whose logarithm counts; ``middle`` is the median's."""
+    score = "share of the spread that the distance explains"
+    read = fits = slope = 0.0
+    if known:
+        sample = known[0]
+        decibels = _decibels(sample)
+        read, fits = explained(sample), explained(decibels)
+        slope = fit_law(decades(decibels), decibels).slopes.median().item()
+        text += f"; the distance explains {read:.0%} of their spread, {fits:.0%} of that of their logarithm"
+    # Power falls by 20 dB a decade in free space, and amplitude by half of that.
+    if -14 < slope < -4 and fits > 0.1:
+        unit, mend = "volts", "levels = 20 * np.log10(levels) + 13 at 50 ohm"
+    elif 10 * middle + 30 < -20:
+        unit, mend = "watts", "levels = 10 * np.log10(levels / 1e-3), or 10 * np.log10(levels) of mW"
+    elif 10 * middle < -10:
+        unit, mend = "mW", "levels = 10 * np.log10(levels)"
+    else:
+        unit, mend = "microwatts or less", "levels = 10 * np.log10(levels * 1e-3) of microwatts"
+    return Finding("unit of levels", f"{text}; are they {unit}?", mend, read, fits, score)
+
+
+def explained(sample: Sample) -> float:
+    """Share of the levels' mean absolute deviation that the law of distance explains."""
+    law = fit_law(decades(sample), sample)
+    mean = fit_law(torch.zeros_like(law.errors), sample)
+    return max(0.0, 1 - (law.errors.abs().mean() / mean.errors.abs().mean().clamp_min(1e-9)).item())
+
+
+def check_signs(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
+    """A finding about some positive levels whose negatives are usual."""
+    positive = levels > 0
+    usual = levels[~positive]
+    if not positive.any():
+        return
+    low, high = np.quantile(usual.numpy(), (0.01, 0.99)).tolist()
+    lost = positive & (-levels >= low - 10) & (-levels <= high + 10) & (levels > high + 30)
+    if lost.any():
+        text = f"{int(lost.sum())} levels are above 0 dBm, and usual with the other sign"
+        yield Finding("sign of levels", text, "was a sign lost? levels = -np.abs(levels)")
+
+
+def check_columns(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
+    """Findings about receivers with one level throughout, or with the levels of another one."""
+    names = [receiver.name for receiver in links.receivers]
+    _, place = links.query.place_keys.unique(return_inverse=True)
+    count = int(place.max()) + 1
+    constant: list[str] = []
+    equal: list[str] = []
+    first: dict[bytes, int] = {}
+    for number in range(len(names)):
+        own = links.query.receivers == number
+        if own.sum() >= 5 and levels[own].unique().numel() == 1:
+            constant.append(names[number])
+            continue
+        column = np.full(count, np.nan)
+        column[place[own].numpy()] = levels[own].numpy()
+        other = first.setdefault(column.tobytes(), number)
+        if other != number and own.sum() >= 3:
+            equal.append(f"{names[other]} and {names[number]} have the same levels")
+    if constant:
+        yield Finding("constant levels", f"levels are constant at {shortened(constant)}")
+    for text in equal:
+        yield Finding("equal receivers", text)
+
+
+def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterator[Finding]:
+    """Findings about levels far from those of near places, and about levels that no near place shares."""
+    sample = sample_of(replace(links, split=None), most)
+    near = apart_from_neighbours(sample)
+    is_placed = torch.ones(len(links.receivers), dtype=torch.bool)
+    if links.uncertainties is not None:
+        is_placed = links.uncertainties == 0
+    errors = fit_law(decades(sample), sample).errors
+    errors = torch.where(is_placed[sample.receivers], errors, near)
+    # Beside a receiver levels are above their neighbours, and the law knows.
+    both = torch.where(near * errors > 0, torch.minimum(near.abs(), errors.abs()), 0.0)
+    scales = torch.stack([_scale(near, sample), _scale(errors, sample)]).amax(0)  # (r,)
+    wrong = (both > (6 * scales[sample.receivers]).clamp_min(50)).nonzero()[:, 0]
+    if not len(wrong):
+        yield from check_places_of_levels(sample, near, is_placed)
+        return
+    named = []
+    for number in wrong[both[wrong].argsort(descending=True)][:shown].tolist():
+        row = "" if links.rows is None else f"row {int(links.rows[sample.index[number]])} "
+        at = ", ".join(f"{x:.4g}" for x in sample.transmitters[number].tolist())
+        level = sample.labels[number].item()
+        usual = level - near[number].item()
+        name = links.receivers[int(sample.receivers[number])].name
+        named.append(f"{row}({at}) at {name}: {level:.3g} dBm, its neighbours {usual:.3g} dBm")
+    more = f" and {len(wrong) - shown} more" if len(wrong) > shown else ""
+    mend = "correct them, or leave them out as nan"
+    yield Finding("single levels", f"levels are far from those of near places: {', '.join(named)}{more}", mend)
+
+
+def apart_from_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, " n"]:
+    """Each level less the median of the nearest ones of its receiver [dB]; 0 where it has fewer than 6 links."""
+    apart = torch.zeros_like(sample.labels)
+    for number in range(len(sample.positions)):
+        own = (sample.receivers == number).nonzero()[:, 0]
+        if len(own) < 6:
+            continue
+        places = sample.transmitters[own].numpy()
+        _, near = cKDTree(places).query(places, k=min(neighbours + 1, len(own)))
+        levels = sample.labels[own]
+        apart[own] = levels - levels[torch.from_numpy(near[:, 1:])].median(1).values
+    return apart
+
+
+def check_places_of_levels(
+    sample: Sample, near: Float[Tensor, " n"], is_placed: Bool[Tensor, " r"]
+) -> Iterator[Finding]:
+    """A finding if levels follow neither the distance nor their neighbours, as in a wrong order of rows."""
+    own = is_placed[sample.receivers] & (near != 0)
+    flat = fit_law(torch.zeros_like(near), sample).errors[own]
+    if not own.any() or near[own].abs().mean() < 0.95 * flat.abs().mean():
+        return
+    logarithms = fit_law(torch.zeros_like(near), replace(sample, labels=decades(sample))).errors[own]
+    squares = logarithms.square().sum()
+    slope = (logarithms @ flat / squares).item()
+    deviation = (flat.square().mean() / squares).sqrt().item()
+    if slope - 3 * deviation > -12:  # free space has -20
+        text = f"levels change by {slope:.2g} +- {deviation:.2g} dB a decade of distance, and near places do not agree"
+        yield Finding("order of rows", text, "are places and levels in the same order?")
+
+
+def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
+    """Robust standard deviation at each receiver; of all where a receiver has fewer than 10 links."""
+    scales = (1.4826 * errors.abs().median()).expand(len(sample.positions)).clone()
+    for number in range(len(scales)):
+        own = errors[sample.receivers == number]
+        if len(own) >= 10:
+            scales[number] = 1.4826 * own.abs().median()
+    return scales
+
+
+def _negated(sample: Sample) -> Sample:
+    return replace(sample, labels=-sample.labels)
+
+
+def _decibels(sample: Sample) -> Sample:
+    """The sample's positive levels as powers."""
+    heard = sample.labels > 0
+    return replace(
+        sample,
+        index=sample.index[heard],
+        transmitters=sample.transmitters[heard],
+        receivers=sample.receivers[heard],
+        labels=10 * sample.labels[heard].log10(),
+    )

@@ -1,0 +1,158 @@
+"""Checks of places, walls and arrays: other units, other frames, receivers in twos."""
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.data.checks.finding import Finding
+from gaigs.query import Query, evenly
+
+
+def check_places(links: Any) -> Iterator[Finding]:
+    """Findings about transmitters and receivers of any task."""
+    yield from check_extent(links)
+    receivers = links.receivers
+    if len(receivers) > 10 and len(links) < 1.5 * len(receivers):
+        yield Finding(
+            "receivers that move",
+            f"{len(receivers)} receivers have {len(links)} links: models are learnt for each",
+            "give a fixed receiver one place for all its links",
+        )
+    sites = sites_of(links.query)
+    given = _given(links)
+    stands = _stands(links)
+    near = (torch.cdist(sites.double(), stands[given].double()) < 0.01).any(1)
+    if len(sites) > 1 and near.any():
+        text = f"{int(near.sum())} places are where a receiver stands"
+        yield Finding("places at a receiver", text)
+    if links.task.is_scalar:  # antennas of one mast may share their place; levels show whether they do
+        return
+    for a, b in itertools.combinations(given, 2):
+        turned = (receivers[a].pose.rotation - receivers[b].pose.rotation).norm()
+        if (stands[a] - stands[b]).norm() < 0.01 and turned < 0.01:
+            text = f"{receivers[a].name} and {receivers[b].name} stand at one place"
+            yield Finding("receivers at one place", text)
+
+
+def check_extent(links: Any) -> Iterator[Finding]:
+    """Findings about an unusual extent of the places, and receivers far from all of them."""
+    sites = sites_of(links.query)
+    given = _given(links)
+    extent = sites.amax(0) - sites.amin(0)
+    span = extent.max().item()
+    across = extent[:2].max().item()
+    x, y = sites[:, :2].mean(0).tolist()
+    is_global = abs(x) <= 180 and abs(y) <= 90 and math.hypot(x, y) > 30 * across > 0
+    if links.frame is None and is_global and across < 0.3:
+        text = f"x and y of places span {across:.2g} m around ({x:.7g}, {y:.7g})"
+        yield Finding("unit of places", text, "are they degrees? convert them to metres, as data=rssi_wide does")
+    elif links.frame is None and span < 0.3:  # less than a table
+        yield Finding("unit of places", f"places span {span:.3g} m", "are they in km or degrees?")
+    if len(sites) > 1 and given:
+        stands = _stands(links)[given]
+        closest = torch.cdist(sites.double(), stands.double()).min().item()
+        if closest > 10 * max(span, 1e-6):
+            text = f"receivers are {closest:.3g} m from all places, which span {span:.3g} m"
+            yield Finding("receivers far away", text, "are units and origin alike?")
+
+
+def sites_of(query: Query) -> Float[Tensor, "k 3"]:
+    """The different places of transmitters."""
+    _, which = query.place_keys.unique(return_inverse=True)
+    sites = query.transmitters.new_zeros((int(which.max()) + 1, 3))
+    sites[which] = query.transmitters
+    return sites
+
+
+def check_arrays(links: Any) -> Iterator[Finding]:
+    """Findings about elements in another unit or frame, and coordinates that float32 rounds."""
+    transmitters = links.query.transmitters
+    places = torch.cat((transmitters, _stands(links)))
+    room = _diagonal(places)
+    carriers = links.query.frequencies
+    wavelength = speed_of_light / carriers.max().item() if carriers is not None else 0.0
+    for receiver in links.receivers:
+        elements = receiver.array.elements
+        extent = _diagonal(elements)
+        aside = elements.mean(0).norm().item()
+        if extent > room > 0:
+            yield Finding(
+                "unit of elements",
+                f"the array of {receiver.name} is {extent:.3g} m across, transmitters and receivers {room:.3g} m",
+                "are its elements in m?",
+            )
+        elif len(elements) > 1 and aside > 2 * extent:
+            yield Finding(
+                "frame of elements",
+                f"the elements of {receiver.name} are {aside:.3g} m from its position",
+                "elements are relative to it",
+            )
+        elif len(elements) > 1 and wavelength:
+            apart = torch.pdist(elements).min().item()
+            if apart > 3 * wavelength:
+                yield Finding(
+                    "unit of elements",
+                    f"elements of {receiver.name} are {apart:.3g} m apart, {apart / wavelength:.3g} wavelengths",
+                    "are they in m?",
+                )
+    rounding = places.abs().max().item() * torch.finfo(torch.float32).eps / 2
+    if links.task.dtype.is_complex and rounding > wavelength / 300 > 0:
+        yield Finding(
+            "origin",
+            f"positions are rounded by up to {rounding:.2g} m, {rounding / wavelength:.2g} wavelengths, which phases "
+            "show",
+            "subtract a common origin from all",
+        )
+
+
+def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> Iterator[Finding]:
+    """A finding if walls are in another unit or elsewhere than transmitters and receivers as seen from above."""
+    own = _diagonal(walls[:, :2])
+    room = _diagonal(places[:, :2])
+    if own and room and not 1 / 50 < own / room < 50:  # millimetres differ by 1000
+        text = f"the walls are {own:.3g} m across, transmitters and receivers {room:.3g} m"
+        yield Finding("unit of walls", text, "are both in m?")
+        return
+    lower, upper = walls[:, :2].amin(0), walls[:, :2].amax(0)
+    gaps = torch.maximum(lower - places[:, :2].amax(0), places[:, :2].amin(0) - upper)  # (2,)
+    apart = gaps.clamp_min(0).norm().item()
+    if apart > 0.1 * (own + room):  # a single wall stands apart, too
+        text = f"the walls are {apart:.3g} m from all transmitters and receivers"
+        yield Finding("frame of walls", text, "are both in one frame?")
+
+
+def check_edges(links: Any) -> Iterator[Finding]:
+    """``check_walls`` of the walls that came with the data."""
+    if len(links.edges):
+        places = torch.cat((links.query.transmitters, _stands(links)))
+        yield from check_walls(links.edges.flatten(0, 1), places)
+
+
+def check_constant(links: Any) -> Iterator[Finding]:
+    """A finding if labels have the same number throughout."""
+    labels = links.labels[evenly(torch.arange(len(links)), 256)].flatten(1)  # (k, m)
+    constant = (labels == labels[:, :1]).all(1)
+    if labels.shape[1] > 1 and constant.any():
+        text = f"{int(constant.sum())} of {len(labels)} labels have one value throughout"
+        yield Finding("constant labels", text)
+
+
+def _given(links: Any) -> list[int]:
+    """Receivers whose place was measured, and not estimated from levels."""
+    numbers = range(len(links.receivers))
+    return [k for k in numbers if links.uncertainties is None or not links.uncertainties[k]]
+
+
+def _stands(links: Any) -> Float[Tensor, "r 3"]:
+    positions = [receiver.pose.position for receiver in links.receivers]
+    return torch.stack(positions).to(links.query.transmitters)
+
+
+def _diagonal(points: Float[Tensor, "k d"]) -> float:
+    return (points.amax(0) - points.amin(0)).norm().item()

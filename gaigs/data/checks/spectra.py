@@ -1,0 +1,319 @@
+"""Checks of spatial spectra: constant ones, and conventions by which bright directions follow the transmitters."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from gaigs.data.checks.finding import Finding
+from gaigs.data.checks.hypotheses import Hypothesis, Sample, axis_changes, sample_of, unit_changes
+from gaigs.geometry import Grid, from_spherical, to_spherical
+from gaigs.task.spectrum import SSIM_WINDOW
+
+
+def check_spectra(links: Any) -> Iterator[Finding]:
+    """Findings about spectra.
+
+    Raises:
+        ValueError: All spectra are constant, or too small for SSIM.
+    """
+    yield from check_extremes(links)
+    yield from check_directions(links)
+
+
+def check_extremes(links: Any) -> Iterator[Finding]:
+    """Counts of constant spectra, and of min-max spectra without a pixel of 0 or of 1."""
+    task, labels = links.task, links.labels
+    if min(task.shape) < SSIM_WINDOW:
+        rows, columns = task.shape
+        raise ValueError(f"spectra must have {SSIM_WINDOW} x {SSIM_WINDOW} pixels or more, got {rows} x {columns}")
+    parts = (labels[index].flatten(1) for index in torch.arange(len(labels)).split(256))
+    low, high = torch.cat([torch.stack((part.amin(1), part.amax(1)), 1) for part in parts]).T
+    constant = low == high
+    if constant.all():
+        raise ValueError(f"a spectrum must have pixels of different values; all {len(labels)} are constant")
+    lacking = torch.zeros_like(constant)
+    if task.normalisation.startswith("min-max"):
+        lacking = ((low != 0) | (high != 1)) & ~constant
+    for which, defect in ((constant, "are constant"), (lacking, "lack a pixel of 0 or of 1")):
+        if which.any():
+            first = int(which.nonzero()[0])
+            span = f"{low[first]:.3g} to {high[first]:.3g}"
+            yield Finding(
+                "range of spectra",
+                f"{int(which.sum())} of {len(labels)} spectra {defect}, first that of link {first}, {span}",
+            )
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What it takes to name another convention.
+
+    Attributes:
+        fewest: Fewest spectra that are checked.
+        most: Most spectra that are read.
+        pixels: Most rows and columns that are compared; an array resolves fewer.
+        better: Least excess of the score over that of the data as read.
+        share: The same as a share of the score.
+        known: Score of the data as read above which two faults at once are not sought.
+        of_others, of_axes, of_pairs: The excess in standard errors. Axes that point the other way need more, as
+            reflections look like them; hundreds of pairs need most.
+    """
+
+    fewest: int = 16
+    most: int = 160
+    pixels: tuple[int, int] = (45, 90)
+    better: float = 0.08
+    share: float = 0.35
+    known: float = 0.2
+    of_others: float = 3.0
+    of_axes: float = 4.0
+    of_pairs: float = 4.5
+
+
+class Convention(NamedTuple):
+    """Changes of a convention, and the score of the spectra under them."""
+
+    score: float
+    changes: tuple[Hypothesis, ...]
+
+
+def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Finding]:
+    """The convention by which spectra are bright where the transmitters stand, if it is not the one read.
+
+    The score of a spectrum says how rare a pixel is that is as bright as the one towards its transmitter,
+    less the same in other spectra of the receiver. So what is bright in every spectrum scores nothing, and
+    a link behind walls about 0 by every convention. The strongest pixel need not be the direct path.
+    """
+    limits = limits or Limits()
+    sample = sample_of(links, limits.most)
+    if len(sample.labels) < limits.fewest:
+        return
+    directions = Directions(links.task.directions, sample, limits.pixels)
+    sample = replace(sample, labels=directions.rareness)
+    read = directions.scores(sample)
+    groups = [
+        axis_changes(),
+        unit_changes(),
+        orientation_changes(sample),
+        [Hypothesis("rows are upside down", _upside_down, "spectra = spectra[:, ::-1]")],
+        column_changes(directions.grid),
+    ]
+    axes, *others = groups
+    single = [*itertools.chain(*others), *scaling_changes(sample, directions.grid), *order_changes(links, sample)]
+    tries: list[tuple[list[tuple[Hypothesis, ...]], float, int]] = [
+        ([(change,) for change in single], limits.of_others, 1),
+        ([(change,) for change in axes], limits.of_axes, 1),
+    ]
+    if read.mean() < limits.known:
+        pairs = itertools.combinations(groups, 2)
+        both = itertools.chain.from_iterable(itertools.product(*pair) for pair in pairs)
+        tries.append(([*both], limits.of_pairs, 2))  # by every other link: there are hundreds
+    best = Convention(0.0, ())
+    for candidates, deviations, step in tries:
+        fit, excess = _best(directions, sample, candidates, step, read)
+        needed = deviations * excess.std().item() / math.sqrt(directions.places)
+        is_clear = excess.mean() >= max(limits.better, needed, limits.share * fit.score)
+        # A pair has to be better than one fault, which is simpler.
+        if is_clear and fit.score > best.score + limits.better * (step - 1):
+            best = fit
+    if best.changes:
+        names = " and ".join(change.name for change in best.changes)
+        score = f"score {best.score:.2f} instead of {read.mean():.2f}"
+        yield Finding(
+            "directions of spectra",
+            f"spectra are bright towards their transmitters ({score}) if {names}",
+            "; ".join(change.mend for change in best.changes),
+            read.mean().item(),
+            best.score,
+            "rareness of pixels as bright as the one towards the transmitter, less that in other spectra",
+        )
+
+
+class Directions:
+    """How bright spectra are towards the transmitters of a sample.
+
+    Attributes:
+        grid: Directions of the pixels that are compared.
+        rareness: Of each pixel, 0 for the darkest and 1 for the brightest (n, rows, columns).
+        places: Number of places that count: within a sixth of the room spectra are alike.
+    """
+
+    def __init__(self, grid: Grid, sample: Sample, pixels: tuple[int, int]):
+        row_step = math.ceil(grid.shape[0] / pixels[0])
+        column_step = math.ceil(grid.shape[1] / pixels[1])
+        self.grid = grid.thin(slice(None, None, row_step), slice(None, None, column_step))
+        labels = sample.labels[:, ::row_step, ::column_step]
+        ranks = labels.flatten(1).argsort(1).argsort(1)  # (n, pixels)
+        brighter = 1 - ranks / (ranks.shape[1] - 1)  # share of brighter pixels
+        # ln(1 / share) as in a likelihood: the top per cent counts more than the top tenth.
+        least = 0.02
+        rareness = (brighter + least).log() / math.log(least)
+        self.rareness = rareness.clamp_min(0).reshape(labels.shape).float()
+        places = sample.transmitters - sample.transmitters.amin(0)
+        cells = (6 * places / places.amax().clamp_min(1e-9)).floor()  # (n, 3)
+        self.places = len(cells.unique(dim=0))
+
+    def scores(self, sample: Sample) -> Float[Tensor, " n"]:
+        """The score of each link; a transmitter beyond the grid's elevations counts as dark."""
+        azimuths, elevations, _ = to_spherical(sample.local.float())
+        rows = (elevations[:, None] - self.grid.elevations).abs().argmin(1)
+        columns = torch.cos(azimuths[:, None] - self.grid.azimuths).argmax(1)
+        rareness = sample.labels[:, rows, columns]  # (spectrum, transmitter)
+        low, high = self.grid.elevations.aminmax()
+        seen = (elevations > low - self.grid.pitch) & (elevations < high + self.grid.pitch)
+        rareness = rareness * seen
+        same = (sample.receivers[:, None] == sample.receivers).float()
+        others = (rareness * same).sum(0) / same.sum(0)  # towards a transmitter in all spectra
+        return rareness.diagonal() - others
+
+
+def _best(
+    directions: Directions,
+    sample: Sample,
+    candidates: Sequence[tuple[Hypothesis, ...]],
+    step: int,
+    read: Float[Tensor, " n"],
+) -> tuple[Convention, Float[Tensor, " n"]]:
+    """The candidate that is best at every ``step``-th link, and its excess over ``read`` at all links."""
+    some = replace(
+        sample,
+        index=sample.index[::step],
+        transmitters=sample.transmitters[::step],
+        receivers=sample.receivers[::step],
+        labels=sample.labels[::step],
+    )
+    means = [directions.scores(_changed(some, changes)).mean().item() for changes in candidates]
+    changes = candidates[max(range(len(means)), key=means.__getitem__)]
+    scores = directions.scores(_changed(sample, changes))
+    return Convention(scores.mean().item(), changes), scores - read
+
+
+def _changed(sample: Sample, changes: Sequence[Hypothesis]) -> Sample:
+    for hypothesis in changes:
+        sample = hypothesis.change(sample)
+    return sample
+
+
+def _upside_down(sample: Sample) -> Sample:
+    return replace(sample, labels=sample.labels.flip(1))
+
+
+def column_changes(grid: Grid) -> list[Hypothesis]:
+    """Other azimuths of the spectra's columns."""
+
+    def moved(turn: float, sign: int) -> Callable[[Sample], Sample]:
+        """Labels whose columns stand at the azimuths turn + sign * those read."""
+        azimuths = sign * (grid.azimuths - turn)
+        source = torch.cos(azimuths[:, None] - grid.azimuths).argmax(1)  # (columns,)
+        return lambda own: replace(own, labels=own.labels[:, :, source])
+
+    changes = [
+        Hypothesis("azimuths run clockwise", moved(0.0, -1), "spectra = spectra[:, :, -np.arange(columns)]"),
+        Hypothesis(
+            "azimuths run clockwise from the y axis",
+            moved(math.pi / 2, -1),
+            "spectra = spectra[:, :, columns // 4 - np.arange(columns)]",
+        ),
+    ]
+    for degrees in (-180, 90, -90):
+        name = f"the first column is at azimuth {degrees} degrees"
+        mend = f"spectra = np.roll(spectra, {degrees} * columns // 360, axis=2)"
+        changes.append(Hypothesis(name, moved(math.radians(degrees), 1), mend))
+    return changes
+
+
+def orientation_changes(sample: Sample) -> list[Hypothesis]:
+    """Other readings of the receivers' quaternions."""
+    quaternions = Rotation.from_matrix(sample.rotations.numpy()).as_quat()  # (r, 4), x, y, z, w
+    # A file with w, x, y, z that was read as x, y, z, w has w where x was read.
+    exchanged = quaternions[:, [1, 2, 3, 0]]
+    conjugate = [-1, -1, -1, 1]
+    readings = {
+        "quaternions are in the order w, x, y, z": (exchanged, "write them as x, y, z, w"),
+        "orientations turn the world into the array": (
+            quaternions * conjugate,
+            "negate x, y, z of the quaternions",
+        ),
+        "quaternions are in the order w, x, y, z and turn the world into the array": (
+            exchanged * conjugate,
+            "write them as -x, -y, -z, w",
+        ),
+    }
+    changes = []
+    for name, (values, mend) in readings.items():
+        rotations = torch.from_numpy(Rotation.from_quat(values).as_matrix())
+        change = lambda own, rotations=rotations: replace(own, rotations=rotations)
+        changes.append(Hypothesis(name, change, mend))
+    return changes
+
+
+def order_changes(links: Any, sample: Sample) -> list[Hypothesis]:
+    """Other orders of transmitters and receivers."""
+    total = len(links)
+    by_name = sorted(range(1, total + 1), key=str)  # 1, 10, 11, ..., 2, 20, ...
+    orders = {
+        "spectra are one row late": [max(k - 1, 0) for k in range(total)],
+        "spectra are one row early": [min(k + 1, total - 1) for k in range(total)],
+        "spectra are in the reverse order": list(range(total))[::-1],
+        "spectra are sorted by name (1, 10, 11, ... 2)": [k - 1 for k in by_name],
+    }
+    changes = []
+    for name, order in orders.items():
+        places = links.query.transmitters[order].double()
+        change = lambda own, places=places: replace(own, transmitters=places[own.index])
+        changes.append(Hypothesis(name, change, "sort spectra and positions alike"))
+    count = len(sample.positions)
+    for step, word in ((1, "less"), (-1, "more")) if count > 1 else ():
+        change = lambda own, step=step: replace(own, receivers=(own.receivers + step) % count)
+        changes.append(Hypothesis(f"receivers' numbers are {word} by one", change, "count receivers from 0"))
+    return changes
+
+
+def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
+    """Transmitters that fill 0..1 or -1..1, with the scales and offsets along the axes that suit the spectra best."""
+    low = sample.transmitters.amin().item()
+    high = sample.transmitters.amax().item()
+    lower = -1.0 if low < 0 else 0.0
+    margin = 0.15 * (1 - lower)  # places seldom reach the walls of the room that was scaled
+    if low < lower or low > lower + margin or not 1 - margin <= high <= 1:
+        return []
+    name = f"transmitters are scaled to {lower:g}..1 along each axis"
+    mend = "undo it, such as tx = centre + half_extent * tx" if lower else "undo it, such as tx = low + extent * tx"
+    return [Hypothesis(name, change, mend) for change in _unscaled(sample, grid)]
+
+
+def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sample], Sample]]:
+    """Positive scales s and offsets t of the axes by random threes of links, for the receiver with most links.
+
+    The direction u of a link's brightest pixel and its position x obey u x (s x + t) = 0, six equations of
+    three links for s and t but for a common factor. Threes are many, as a reflection may be the brightest.
+    """
+    receiver = int(sample.receivers.bincount().argmax())
+    own = (sample.receivers == receiver).nonzero()[:, 0]
+    brightest = sample.labels[own].flatten(1).argmax(1)
+    pixels = grid.flatten()[brightest]
+    towards = from_spherical(pixels.azimuths, pixels.elevations).double() @ sample.rotations[receiver].T  # (k, 3)
+    units = torch.eye(3, dtype=torch.float64).expand(len(own), 3, 3)
+    crossed = torch.linalg.cross(units, towards[:, None].expand(-1, 3, -1)).mT  # (k, 3, 3), columns e x u
+    equations = torch.cat((crossed * sample.transmitters[own, None], crossed), 2)  # (k, 3, 6), of s and t
+    generator = torch.Generator().manual_seed(0)
+    threes = torch.stack([torch.randperm(len(own), generator=generator)[:3] for _ in range(draws)])
+    systems = equations[threes].flatten(1, 2)  # (draws, 9, 6)
+    solutions = torch.linalg.svd(systems).Vh[:, -1]  # (draws, 6)
+    solutions = solutions * solutions[:, :1].sgn()
+    changes: list[Callable[[Sample], Sample]] = []
+    for solution in solutions[(solutions[:, :3] > 0).all(1)]:
+
+        def change(other: Sample, scales=solution[:3], offsets=solution[3:]) -> Sample:
+            places = other.positions[receiver] + scales * other.transmitters + offsets
+            return replace(other, transmitters=places)
+
+        changes.append(change)
+    return changes

@@ -1,0 +1,32 @@
+"""Global modes of torch, which gaigs leaves to its caller."""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+_switching = threading.Lock()
+_callers: list[Any] = []  # the default dtype that each call found
+
+
+@contextlib.contextmanager
+def usual_modes() -> Iterator[None]:
+    """Float32 as torch's default dtype, and no inference mode, while gaigs computes; also a decorator.
+
+    Threads share the default dtype: the first one in sets it, the last one out restores it. Lightning changes it.
+    """
+    import torch  # slow to import
+
+    with _switching:
+        _callers.append(torch.get_default_dtype())
+        if len(_callers) == 1:
+            torch.set_default_dtype(torch.float32)
+    try:
+        # Leaving an inference mode that is none would switch gradients on.
+        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else contextlib.nullcontext():
+            yield
+    finally:
+        with _switching:
+            if len(_callers) == 1:
+                torch.set_default_dtype(_callers[0])
+            _callers.pop()

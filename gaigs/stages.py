@@ -1,0 +1,164 @@
+"""Stages of a run: a bar with the time left of each long one, and the time limit of the whole run."""
+
+import contextlib
+import logging
+import math
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sized
+from contextvars import ContextVar
+from typing import Any
+
+import rich
+from rich.progress import BarColumn, Progress, TaskID, TimeRemainingColumn
+
+log = logging.getLogger(__name__)
+
+
+class Timekeeper:
+    """The clock of a run with a ``limit`` [s], its open stages, their bars if ``shown``, and what it has left out."""
+
+    def __init__(self, limit: float = math.inf, shown: bool = True):
+        self.limit, self.shown, self.began = limit, shown, time.monotonic()
+        self.stages: list[Stage] = []
+        self.left_out: list[str] = []
+        self.bars: Progress | None = None
+        self.lock = threading.RLock()  # bars appear in a thread of their own
+
+    def left(self, share: float = 1.0) -> float:
+        """Time until a share of the limit [s]."""
+        return self.began + share * self.limit - time.monotonic()
+
+
+class Stage:
+    """A part of a run; arguments are those of ``stage``."""
+
+    def __init__(self, keeper: Timekeeper, name: str, total: int, until: float, is_fixed: bool):
+        self.keeper, self.name, self.total, self.until, self.is_fixed = keeper, name, total, until, is_fixed
+        self.done, self.began = 0, time.monotonic()
+        self.row: TaskID | None = None
+        self.owns_bars = False
+
+    def advance(self) -> None:
+        """Ends a step."""
+        self.done += 1
+        if self.row is not None and self.keeper.bars is not None:
+            self.keeper.bars.update(self.row, completed=self.done, count=f"{self.done}/{self.total}")
+        more = (time.monotonic() - self.began) * (self.total - 1)
+        if self.is_fixed and self.done == 1 and more > max(2.0, self.keeper.left()):
+            words = "%s: %.0f s more, which cannot be shortened; max_time leaves %.0f s"
+            log.warning(words, self.name, more, max(0.0, self.keeper.left()))
+
+    def show(self) -> None:
+        """Adds the bar to those of the run."""
+        with self.keeper.lock:
+            if self not in self.keeper.stages:  # it has ended
+                return
+            if self.keeper.bars is None:
+                self.keeper.bars, self.owns_bars = make_bars(transient=True), True
+                self.keeper.bars.start()
+            fields: dict[str, Any] = {"count": f"{self.done}/{self.total}", "scores": ""}
+            self.row = self.keeper.bars.add_task(self.name, total=self.total, completed=self.done, **fields)
+
+    def close(self) -> None:
+        """Takes the bar away."""
+        with self.keeper.lock:
+            self.keeper.stages.remove(self)
+            bars = self.keeper.bars
+            if bars is not None and self.row in bars.task_ids:
+                bars.remove_task(self.row)
+            if bars is not None and self.owns_bars:
+                bars.stop()
+                self.keeper.bars = None
+
+
+_keeper: ContextVar[Timekeeper | None] = ContextVar("keeper", default=None)
+
+
+def current() -> Timekeeper:
+    """The run that is at work; outside of runs one without a limit."""
+    keeper = _keeper.get()
+    if keeper is None:
+        keeper = Timekeeper()
+        _keeper.set(keeper)
+    return keeper
+
+
+@contextlib.contextmanager
+def watched(limit: float = math.inf, shown: bool = True) -> Iterator[Timekeeper]:
+    """A run with a time limit [s]; with ``shown`` its stages have bars."""
+    token = _keeper.set(Timekeeper(limit, shown))
+    try:
+        yield current()
+    finally:
+        _keeper.reset(token)
+
+
+@contextlib.contextmanager
+def stage(name: str = "", total: int = 1, until: float = 1.0, is_fixed: bool = False) -> Iterator[Stage]:
+    """A stage of the current run.
+
+    Args:
+        name: Stands before the bar, which a terminal shows after a second; without a name there is none.
+        total: Number of its steps.
+        until: Share of the run's limit at which it has to end.
+        is_fixed: True if it cannot end early, which is logged after its first step where the time does not suffice.
+    """
+    own = Stage(current(), name, total, until, is_fixed)
+    timer = threading.Timer(1.0, own.show)
+    timer.daemon = True
+    own.keeper.stages.append(own)
+    is_main = threading.current_thread() is threading.main_thread()
+    if name and total > 1 and own.keeper.shown and is_main and rich.get_console().is_terminal:
+        timer.start()
+    try:
+        yield own
+    finally:
+        timer.cancel()
+        own.close()
+
+
+def track(items: Iterable, name: str = "", total: int | None = None, is_fixed: bool = False) -> Iterator[Any]:
+    """Goes through items, each a step of a stage; ``total`` is their number if they have no length."""
+    if total is None:
+        total = len(items) if isinstance(items, Sized) else 1
+    with stage(name, total, is_fixed=is_fixed) as own:
+        for item in items:
+            yield item
+            own.advance()
+
+
+def advance() -> None:
+    """Ends a step of the innermost stage, if there is one."""
+    for own in current().stages[-1:]:
+        own.advance()
+
+
+def left() -> float:
+    """Time until the open stages and the run have to end [s]; infinite without a limit."""
+    keeper = current()
+    return keeper.left(min([1.0, *(own.until for own in keeper.stages)]))
+
+
+def is_up() -> bool:
+    """True if an open stage has to end now."""
+    return left() <= 0
+
+
+def end_in_time(_: object) -> None:
+    """A callback of ``scipy.optimize.minimize`` that ends it with the stage."""
+    if is_up():
+        raise StopIteration
+
+
+def leave_out(what: str) -> None:
+    """Remembers and logs what has no time."""
+    current().left_out.append(what)
+    log.warning("max_time: %s", what)
+
+
+def make_bars(**options: Any) -> Progress:
+    """Bars with description, count, time left and scores in a line each."""
+    count, scores = "{task.fields[count]}", "{task.fields[scores]}"
+    columns = "{task.description}", BarColumn(None), count, TimeRemainingColumn(), scores
+    return Progress(*columns, console=rich.get_console(), expand=True, **options)

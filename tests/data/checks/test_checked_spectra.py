@@ -1,0 +1,71 @@
+"""Bright directions tell the convention of positions, orientations and pixels; sound spectra have no remark."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from invented_spectra import SIZE, room
+
+import gaigs
+
+
+@functools.cache
+def sound():
+    return room(120)
+
+
+def scaled(made):
+    low, high = made.transmitters.min(0), made.transmitters.max(0)
+    return 2 * (made.transmitters - low) / (high - low) - 1
+
+
+FAULTS = {
+    "transmitters are in cm": lambda own: {"transmitters": 100 * own.transmitters},
+    "transmitters are in mm": lambda own: {"transmitters": 1000 * own.transmitters},
+    "transmitters are in feet": lambda own: {"transmitters": own.transmitters / 0.3048},
+    "receivers are in cm": lambda own: {"position": 100 * own.position},
+    "transmitters are scaled to -1..1 along each axis": lambda own: {"transmitters": scaled(own)},
+    "transmitters are scaled to 0..1 along each axis": lambda own: {"transmitters": own.transmitters / SIZE},
+    "transmitters have x and y exchanged": lambda own: {"transmitters": own.transmitters[:, [1, 0, 2]]},
+    "transmitters have y and z exchanged": lambda own: {"transmitters": own.transmitters[:, [0, 2, 1]]},
+    "quaternions are in the order w, x, y, z": lambda own: {"quaternion": np.roll(own.quaternion, 1)},
+    "orientations turn the world into the array": lambda own: {"quaternion": own.quaternion * [-1, -1, -1, 1]},
+    "rows are upside down": lambda own: {"spectra": own.spectra[:, ::-1].copy()},
+    "the first column is at azimuth -180 degrees": lambda own: {"spectra": np.roll(own.spectra, 45, 2)},
+    "azimuths run clockwise": lambda own: {"spectra": own.spectra[:, :, -np.arange(90)]},
+    "azimuths run clockwise from the y axis": lambda own: {"spectra": own.spectra[:, :, 22 - np.arange(90)]},
+    "spectra are one row late": lambda own: {"spectra": np.roll(own.spectra, 1, 0)},
+    "spectra are sorted by name": lambda own: {"spectra": own.spectra[np.argsort([*map(str, range(1, 121))])]},
+    "are in cm and quaternions are in the order w, x, y, z": lambda own: {
+        "transmitters": 100 * own.transmitters,
+        "quaternion": np.roll(own.quaternion, 1),
+    },
+    "are upside down and the first column is at azimuth -180": lambda own: {
+        "spectra": np.roll(own.spectra[:, ::-1], 45, 2)
+    },
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_convention_of_spectra_is_named(fault):
+    made = replace(sound(), **FAULTS[fault](sound()))
+    (finding,) = (one for one in gaigs.describe(made.links()).findings if one.fault == "directions of spectra")
+    assert fault in finding.text
+    assert finding.fits > finding.read + 0.08
+    assert finding.mend
+
+
+@pytest.mark.parametrize("options", [{}, {"blocked": 0.0}, {"blocked": 1.0}, {"count": 40}, {"edge": 2}])
+def test_sound_spectra_have_no_remark(options):
+    assert gaigs.describe(room(**options).links()).findings == ()
+
+
+@pytest.mark.parametrize("order", [0, 2])
+def test_simulated_spectra_have_no_remark(order):
+    assert gaigs.describe(gaigs.links("synthetic", transmitters=60, order=order)).findings == ()
+
+
+def test_measured_spectra_have_no_remark(measured):
+    links = gaigs.links("nerf2_spectrum", root=str(measured("rfid-s23-200")))
+    assert gaigs.describe(links).findings == ()
