@@ -4,12 +4,13 @@
     python benchmarks/soak.py --faults kill --repeats 40 --seed 1
     python benchmarks/soak.py +experiment=mirrored data.transmitters=30 trainer.max_steps=60 --faults kill
     python benchmarks/soak.py --markdown docs/results/faults.md
+    python benchmarks/soak.py --writers --minutes 1
 
 Overrides are those of ``python -m gaigs``; without any it is a short run of GAI-GS with kriging. Each run is the
 command line in a process of its own, forked once the packages are imported, so that random moments fall into the work.
 Moments are in processor time, so that other work on the machine does not move them. Linux only. Disks are filled in a
-small file system, which needs root. The page is written anew after each fault. The exit code is 1 where anything was
-lost.
+small file system, which needs root. The page is written anew after each fault. With ``--writers`` no run is disturbed:
+two processes export, save and load the same files. The exit code is 1 where anything was lost.
 """
 
 import argparse
@@ -30,10 +31,12 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import torch
 
+import gaigs
 from gaigs import __main__ as command_line
 from gaigs import checkpoint, runs  # noqa: F401, imported before the forks
 from gaigs.io.files import write_text
@@ -155,9 +158,9 @@ class Process:
 
     @property
     def messages(self) -> list[str]:
-        """Messages on stderr, without the lines that Hydra puts around each."""
+        """Messages on stderr, without the line that Hydra puts before that of a sweep."""
         lines = self.says.read_text().splitlines()
-        return [line for line in lines if line and not line.startswith(("Error executing job", "Set the environment"))]
+        return [line for line in lines if line and not line.startswith("Error executing job")]
 
     @property
     def end(self) -> str:
@@ -369,7 +372,7 @@ class Soak:
             trial = self.judge(process, "training, kriging", None, (143, -number))
             again = Process(words, self.top / top.name)
             again.wait()
-            trial.wrong += [f"going on: exit code {again.code}, {' '.join(again.told)}"] if again.code else []
+            trial.wrong += [f"going on: exit code {again.code}, {' '.join(again.messages)}"] if again.code else []
             self.fault = kind
             self.go_on(top / "0", trial)
 
@@ -383,6 +386,65 @@ FAULTS = {
     "multirun": (Soak.kill_multirun, 1),
 }
 """Faults and how often each is tried, in turns; ``kill`` and ``multirun`` with each of two signals."""
+
+
+def shared_files(seconds: float, top: Path) -> int:
+    """Two processes export, save and load the same files of two models; the number of those that were mixed or failed.
+
+    A file must be that of one model or of the other, to the byte.
+    """
+    links, rooms, maps = gaigs.links("synthetic_rssi", transmitters=60), [], []
+    options = {"max_steps": 1, "kriging": False, "order": 1, "enable_progress_bar": False}
+    for number in (0, 1):
+        rooms.append(gaigs.train("mirrored", links, planes=6 + number, obstacles=0, **options))
+        maps.append(gaigs.train("path_loss", gaigs.links("synthetic_rssi", transmitters=60 + number)))
+    names = ("floor.tif", "floor.geojson", "floor.nc", "places.csv")
+    places = links.query.transmitters[:40]
+
+    def write(number: int, folder: Path) -> None:
+        folder.mkdir(exist_ok=True)
+        for name in names:
+            gaigs.export(maps[number], folder / name, places if name == "places.csv" else None, pitch=1.0)
+        for name in ("room.glb", "room.obj", "room.xml"):
+            gaigs.export(rooms[number], folder / name)
+        rooms[number].save(folder / "room.ckpt")
+        gaigs.radio_map(maps[number], 1.0).save(folder / "floor.npz")
+
+    def digests(folder: Path) -> dict[str, bytes]:
+        """A scene counts with its meshes."""
+        found = {name: (folder / name).read_bytes() for name in (*names, "room.glb", "room.obj", "room.xml")}
+        found["room.xml"] += b"".join(map(Path.read_bytes, scene_files(folder / "room.xml")))
+        with np.load(folder / "floor.npz") as floor:
+            found["floor.npz"] = floor["values_dbm"].tobytes()
+        weights = gaigs.load(folder / "room.ckpt").state_dict()
+        return found | {"room.ckpt": b"".join(value.numpy().tobytes() for value in weights.values())}
+
+    for number in (0, 1):
+        write(number, top / str(number))
+    expected = [digests(top / str(number)) for number in (0, 1)]
+    shared, end, turns = top / "shared", time.monotonic() + seconds, 0
+    write(0, shared)
+    child, wrong = os.fork(), 0
+    torch.set_num_threads(1)
+    while time.monotonic() < end:
+        try:
+            write(int(child == 0), shared)
+            mixed = [name for name, part in digests(shared).items() if part not in [one[name] for one in expected]]
+        except (OSError, ValueError) as error:
+            mixed = [str(error)]
+        if mixed:
+            print("mixed or failed:", *mixed, flush=True)
+        wrong, turns = wrong + len(mixed), turns + 1
+    print(f"{turns} turns of {len(expected[0])} files, {wrong} mixed or failed", flush=True)
+    if child == 0:
+        os._exit(min(wrong, 255))
+    return wrong + os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def scene_files(file: Path) -> list[Path]:
+    """The meshes of a scene."""
+    names = ElementTree.parse(file).getroot().iterfind("shape/string")
+    return [file.parent / one.get("value", "") for one in names]
 
 
 def untimed(metrics: dict) -> dict:
@@ -431,11 +493,14 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=math.inf, help="after which nothing more is tried")
     parser.add_argument("--seed", type=int, default=0, help="of the random moments")
     parser.add_argument("--markdown", type=Path, help="page to write")
+    parser.add_argument("--writers", action="store_true", help="two processes that write the same files")
     options = parser.parse_intermixed_args()
     torch.set_num_threads(1)
     start = time.monotonic()
     style.DPI = 40  # figures are drawn in less time
     with tempfile.TemporaryDirectory(prefix="soak") as top:
+        if options.writers:
+            raise SystemExit(shared_files(60 * min(options.minutes, 1000), Path(top)) > 0)
         soak = Soak(options.overrides or RUN, Path(top), random.Random(options.seed))
         most = {name: options.repeats or FAULTS[name][1] for name in options.faults}
         turns = [name for turn in range(max(most.values())) for name in most if turn < most[name]]

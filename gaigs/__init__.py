@@ -101,7 +101,7 @@ def run(configuration: Mapping, folder: str | Path, overrides: Sequence[str] = (
         TypeError, ValueError: The configuration does not fit the data, or the folder holds another run.
         ImportError: A component needs a package that is not installed.
         OSError: A file cannot be read or written; no partial file is left.
-        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it and SIGTERM within a training.
+        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it, SIGTERM and SIGHUP within a training.
 
     Example:
         >>> configuration = gaigs.compose("model=knn", "data.transmitters=40", "data.order=0", baselines=["mean"])

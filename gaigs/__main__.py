@@ -1,21 +1,28 @@
 """The command line: ``python -m gaigs +experiment=spectrum``."""
 
-import logging
-import os
-import signal
 import sys
-import traceback
-from pathlib import Path
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
-from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+try:
+    import contextlib
+    import logging
+    import os
+    import shutil
+    import signal
+    import traceback
+    from pathlib import Path
 
-import gaigs
-from gaigs import configuration, processes
-from gaigs.report import at_end
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.errors import CompactHydraException
+    from hydra.types import RunMode
+    from omegaconf import DictConfig, OmegaConf
+
+    import gaigs
+    from gaigs import configuration, processes
+    from gaigs.report import at_end
+except KeyboardInterrupt:
+    print("gaigs: stopped", file=sys.stderr)
+    raise SystemExit(130) from None
 
 log = logging.getLogger("gaigs")
 
@@ -23,8 +30,8 @@ log = logging.getLogger("gaigs")
 def run(config: DictConfig) -> float | None:
     """One job: ``gaigs.run`` in Hydra's run folder; returns the validation score for sweepers.
 
-    An error that a user can mend becomes one message, which Hydra prints; ``hydra.verbose=true`` prints the traceback
-    first. A signal ends the process with 128 and the signal's number, as in shells.
+    An error that a user can mend becomes one message; ``hydra.verbose=true`` prints the traceback first. A signal ends
+    the process with 128 and the signal's number, as in shells. Without a result there is no folder.
     """
     settings = HydraConfig.get()
     is_sweep, launcher = settings.mode is RunMode.MULTIRUN, settings.launcher["_target_"].rpartition(".")[2]
@@ -56,14 +63,22 @@ def run(config: DictConfig) -> float | None:
         raise SystemExit(128 + number) from None
     except Exception as error:
         message = processes.advice(error, folder, goes_on)
-        if settings.verbose:
+        if settings.verbose or (message is None and not is_sweep):
             traceback.print_exc()
-        if is_sweep:
-            # Hydra prints the first failure only: each job writes its own, in one line of its log.
-            log.error("gaigs: %s", " ".join((message or str(error) or repr(error)).split()))
+        if not is_sweep:  # exits here, as Hydra would print a line of its own first
+            if isinstance(error, BrokenPipeError):
+                raise SystemExit(141) from None
+            if message is not None:
+                print(f"gaigs: {message}", file=sys.stderr)
+            raise SystemExit(1) from None
+        # Hydra prints the first failure only: each job writes its own, in one line of its log.
+        log.error("gaigs: %s", " ".join((message or str(error) or repr(error)).split()))
         if message is None:
             raise
         raise CompactHydraException(f"gaigs: {message}") from error
+    finally:
+        if not is_sweep:
+            remove_without_result(folder)
     return None if metrics is None else metrics["validation_score"]
 
 
@@ -80,6 +95,16 @@ def note_task(words: list[str], config: dict) -> None:
             log.warning("+experiment=%s is for task %s; labels of data=%s are of %s", name, min(others), data, task)
 
 
+def remove_without_result(folder: Path) -> None:
+    """Removes a run folder with nothing but what Hydra and the start of a run write, unless a run is at work there."""
+    begun = {".hydra", "gaigs.log", "config.yaml", "software.json"}
+    with contextlib.suppress(OSError, ValueError), processes.only_run(folder):
+        names = {path.name for path in folder.iterdir()}
+        is_ours = "config.yaml" not in names or "software.json" in names  # a run writes both
+        if names <= begun and is_ours and not Path.cwd().is_relative_to(folder):
+            shutil.rmtree(folder)
+
+
 def compose_and_run() -> None:
     """Lets Hydra read the command line and run its jobs; exits with 1 after the message of an error."""
     if message := configuration.wrong_flag():
@@ -92,6 +117,8 @@ def compose_and_run() -> None:
     except Exception as error:
         if full_error == "1":
             raise
+        if isinstance(error, BrokenPipeError) and not configuration.is_multirun():  # launchers have other pipes
+            raise SystemExit(141) from None
         message = configuration.explain(error) or processes.advice(error, Path.cwd(), "the same command goes on")
         if message is None:
             traceback.print_exc()
@@ -111,11 +138,12 @@ def main() -> None:
     def stop(number: int, _) -> None:
         """Jobs in other processes save and end; this one waits for them."""
         signals.append(number)
+        processes.hang_up(number)
         processes.forward_to_children(number)
         if not configuration.is_multirun():
             raise processes.Stopped("stopped", number)
 
-    handler = signal.signal(signal.SIGTERM, stop)
+    handlers = {number: signal.signal(number, stop) for number in processes.STOPPING[1:]}
     try:
         compose_and_run()
         at_end.write()
@@ -127,7 +155,13 @@ def main() -> None:
         print("gaigs: stopped", file=sys.stderr)
         raise SystemExit(128 + getattr(stop, "number", signal.SIGINT)) from None
     finally:
-        signal.signal(signal.SIGTERM, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:  # nobody reads it any more, as behind | head
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            signals.append(13)  # SIGPIPE
         if signals:
             sys.exit(128 + signals[0])
 

@@ -80,9 +80,9 @@ def run(config: dict, folder: Path) -> None:
     rows, remarks = on_split(agreement, links, random, config["baselines"])
     remarks = [f"data {name}, {len(links):,} links, seed {config['seed']}", *_remarks(agreement), *remarks]
     folder.mkdir(parents=True, exist_ok=True)
-    console, cells = Console(), agreement.cells(task.compared_by)
-    console.print(Markdown(write(folder, task, cells, rows, links.split.name, remarks)))
-    console.print(f"results: {folder}", soft_wrap=True)
+    cells = agreement.cells(task.compared_by)
+    Console().print(Markdown(write(folder, task, cells, rows, links.split.name, remarks)))
+    print(f"results: {folder}")
 
 
 def measure(

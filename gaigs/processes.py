@@ -6,6 +6,7 @@ import ctypes
 import gc
 import os
 import signal
+import stat
 import sys
 import sysconfig
 import threading
@@ -17,14 +18,19 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gaigs.io.files import file_message
 
-STOPPING = (signal.SIGINT, signal.SIGTERM)
-"""Signals at which a run saves and stops: Ctrl-C, and the one that schedulers send before they kill."""
+STOPPING = [signal.SIGINT, signal.SIGTERM]
+"""Signals at which a run saves and stops: Ctrl-C, that of schedulers, and that of a closed terminal."""
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup sets it
+    STOPPING.append(signal.SIGHUP)
 
 THREADS = ("OMP_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 """Environment variables that limit threads of OpenMP and of PoCL's OpenCL, up to version 3 and later."""
 
 AGAIN = 0.05
 """Delay before an ignored signal is sent again [s]."""
+
+if hasattr(os, "register_at_fork"):  # a forked process lacks the threads of torch, and would wait for them for ever
+    os.register_at_fork(after_in_child=lambda: "torch" in sys.modules and sys.modules["torch"].set_num_threads(1))
 
 received: list[int] = []
 """Signals that have stopped runs of this process: a launcher's worker starts no further run."""
@@ -140,8 +146,11 @@ def is_first() -> bool:
 
 
 @contextlib.contextmanager
-def only_run(folder: Path) -> Iterator[None]:
-    """Locks a run folder, at most until this process ends; writes nothing there."""
+def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
+    """Locks a folder, at most until this process ends; writes nothing there.
+
+    Where another one holds it, it ``waits``, or raises a ``ValueError``.
+    """
     try:
         import fcntl
     except ImportError:  # Windows has no such locks
@@ -150,7 +159,7 @@ def only_run(folder: Path) -> Iterator[None]:
     handle = os.open(folder, os.O_RDONLY)
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
         except BlockingIOError:
             advice = "wait, or choose another folder (hydra.run.dir)"
             raise ValueError(f"another run is at work in {folder}\n{advice}") from None
@@ -159,12 +168,24 @@ def only_run(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
+def hang_up(number: int) -> None:
+    """At SIGHUP drops the output to the closed terminal, and ignores further ones: the shell sends one, too."""
+    if number != getattr(signal, "SIGHUP", None):
+        return
+    signal.signal(number, signal.SIG_IGN)
+    null = os.open(os.devnull, os.O_WRONLY)
+    for output in (1, 2):
+        with contextlib.suppress(OSError):
+            if stat.S_ISCHR(os.fstat(output).st_mode) and not os.isatty(output):
+                os.dup2(null, output)
+
+
 @contextlib.contextmanager
 def stopping(waits: bool = False) -> Iterator[None]:
-    """Lets SIGTERM stop a run as Ctrl-C does, and restores the handlers.
+    """Lets the signals ``STOPPING`` stop a run as Ctrl-C does, and restores the handlers.
 
     Python ignores errors that are raised while it destroys an object; such a signal is sent again. A process that
-    ``waits`` for another run afterwards ignores SIGTERM then, as its launcher would wait for it forever.
+    ``waits`` for another run afterwards ignores them then, as its launcher would wait for it forever.
     """
     if threading.current_thread() is not threading.main_thread():  # other threads may not set handlers
         yield
@@ -174,6 +195,7 @@ def stopping(waits: bool = False) -> Iterator[None]:
     def stop(number: int, _) -> None:
         for timer in timers:  # no second signal while the run stops
             timer.cancel()
+        hang_up(number)
         raise Stopped("stopped", number)
 
     timers, hook = [], sys.unraisablehook
@@ -182,11 +204,15 @@ def stopping(waits: bool = False) -> Iterator[None]:
         if not isinstance(lost.exc_value, KeyboardInterrupt):
             hook(lost)
             return
-        timers.append(threading.Timer(AGAIN, os.kill, (os.getpid(), getattr(lost.exc_value, "number", signal.SIGINT))))
+        number = getattr(lost.exc_value, "number", signal.SIGINT)
+        if number != signal.SIGINT:
+            signal.signal(number, stop)  # a second SIGHUP is ignored
+        timers.append(threading.Timer(AGAIN, os.kill, (os.getpid(), number)))
         timers[-1].daemon = True
         timers[-1].start()
 
-    signal.signal(signal.SIGTERM, stop)
+    for number in STOPPING[1:]:
+        signal.signal(number, stop)
     sys.unraisablehook = repeat
     try:
         if received:  # between two runs of a process that waits
@@ -201,8 +227,8 @@ def stopping(waits: bool = False) -> Iterator[None]:
         sys.unraisablehook = hook
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        if waits:
-            signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
+        for number in STOPPING[1:] if waits else ():
+            signal.signal(number, lambda number, _: received.append(number))
 
 
 def forward_to_children(number: int) -> None:

@@ -271,6 +271,12 @@ class Query:
         x, y, z = (self.transmitters.detach().cpu().float() + 0.0).contiguous().view(torch.int32).long().unbind(1)
         return (x * 1_000_003 + y) * 1_000_003 + z  # past 64 bits it wraps; + 0.0 makes -0 the same as 0
 
+    @property
+    def votes(self) -> Float[Tensor, " b"]:
+        """1 over the number of links of the same place, receiver and carrier: repeated readings have one vote."""
+        _, which = self.unique(with_receivers=True)
+        return which.bincount().double().reciprocal()[which]
+
     def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
         """The different links, sorted by position, frequency and receiver; and the index of each link among them.
 

@@ -3,6 +3,7 @@
 import functools
 import logging
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex, Float
@@ -18,6 +19,29 @@ from gaigs.task import Task
 from gaigs.task.csi import Csi
 
 log = logging.getLogger(__name__)
+
+
+class FlatAxis(NamedTuple):
+    """A world axis, 0 to 2, along which all transmitters have one coordinate [m], and all receivers' elements one.
+
+    A plane across it and its mirror image half-way between the two reflect paths of the same length. ``is_common`` is
+    true if both stand at the same coordinate.
+    """
+
+    axis: int
+    transmitters: float
+    receivers: float
+    is_common: bool
+
+    def __str__(self) -> str:
+        name = ("x", "y", "height")[self.axis]
+        if self.is_common:
+            return f"{name} not seen: all places at {self.transmitters:.2f} m"
+        both = self.transmitters + self.receivers
+        return (
+            f"{name} seen from either side: places at {self.transmitters:.2f} m, receivers at {self.receivers:.2f} m; "
+            f"a plane across it at h may stand at {both:.2f} m - h"
+        )
 
 
 @dataclass(frozen=True)
@@ -65,6 +89,22 @@ class Scene:
         """Diagonal of this box [m]."""
         lower, upper = self.box
         return (upper - lower).norm().item()
+
+    @functools.cached_property
+    def flat_axes(self) -> list[FlatAxis]:
+        """World axes along which all training transmitters, and all elements, stand within a centimetre."""
+        elements = []
+        for receiver in self.receivers:
+            elements.append(receiver.pose.to(self.lower).world(receiver.array.elements.to(self.lower)))
+        least = 0.01  # [m]; tripods are set up no better
+        transmitters, receivers = torch.stack((self.lower, self.upper)), torch.cat(elements)
+        found = []
+        for axis in range(3):
+            own, other = transmitters[:, axis], receivers[:, axis]
+            if own.max() - own.min() < least and other.max() - other.min() < least:
+                middles = own.mean().item(), other.mean().item()
+                found.append(FlatAxis(axis, *middles, abs(middles[0] - middles[1]) < least))
+        return found
 
     @property
     def height(self) -> float:

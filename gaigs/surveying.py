@@ -1,7 +1,5 @@
 """Survey planning: where to measure next, and which measured places could have been left out."""
 
-import csv
-import io
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,8 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from gaigs.geometry import Frame, even_places
-from gaigs.io.files import write_text
-from gaigs.io.tables import read_points
+from gaigs.io.tables import read_points, write_csv
 from gaigs.kriging.kernel import LIMIT, Process, kernel
 from gaigs.kriging.links import chance_to_hear, coordinates, distances
 from gaigs.model import Model, call_optional
@@ -91,11 +88,10 @@ class SurveyPlan:
 
         With a ``frame`` it has easting and northing too. Without a model errors are empty.
         """
-        table, frame = io.StringIO(), self.frame
-        rows = csv.writer(table, lineterminator="\n")
-        rows.writerow(["use", "x", "y", "z", *([] if frame is None else ["easting", "northing"]), "mean_error"])
+        frame = self.frame
+        rows = [["use", "x", "y", "z", *([] if frame is None else ["easting", "northing"]), "mean_error"]]
         on_map = lambda x, y, z: () if frame is None else (frame.x + x, frame.y + y)
-        row = lambda use, place, word: rows.writerow([use, *(f"{x:.3f}" for x in (*place, *on_map(*place))), word])
+        row = lambda use, place, word: rows.append([use, *(f"{x:.3f}" for x in (*place, *on_map(*place))), word])
         words = [""] * len(self.places)
         if self.errors is not None:
             words = [f"{error:.6g}" for error in self.errors[1:].tolist()]
@@ -104,7 +100,7 @@ class SurveyPlan:
         known, losses = self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist()
         for place, loss in zip(known, losses, strict=True):
             row("leave out", place, f"{self.known_error + loss:.6g}")
-        write_text(Path(path), table.getvalue())
+        write_csv(Path(path), rows)
 
 
 @torch.no_grad()

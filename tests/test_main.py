@@ -21,7 +21,7 @@ import yaml
 import gaigs
 from gaigs import __main__ as command_line
 from gaigs import agreement, runs
-from gaigs.processes import Stopped
+from gaigs.processes import Stopped, only_run
 from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
 
@@ -197,8 +197,11 @@ def test_a_wrong_word_gives_one_message(overrides, message, run):
     assert code == 1
     assert message in err
     assert "Traceback" not in err
+    if "-m" not in words:  # of a sweep Hydra names the job first
+        assert err.startswith("gaigs: ")
     text = err[err.index("gaigs: ") :].rstrip("\n")
     assert text.count("\n") <= 1, text
+    assert not Path("run").exists(), "a folder without a result"
 
 
 @pytest.mark.parametrize(
@@ -260,7 +263,7 @@ def test_devices_are_listed_whatever_the_rest_of_the_configuration(run, tmp_path
     monkeypatch.setattr(runs, "run", None)
     assert run("command=devices", "data=nerf2_spectrum", "seed=${sed}", *HERE) == (0, "")
     assert run.out == f"Maker: GPU (GPU)\nMaker: CPU (CPU){mark}\n"
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {".hydra", "gaigs.log"}
+    assert not (tmp_path / "run").exists()
     monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "gpu")
     assert run("command=devices", *HERE) == (0, "")
     assert run.out == f"Maker: GPU (GPU){mark}\nMaker: CPU (CPU)\n"
@@ -276,6 +279,36 @@ def test_devices_that_are_not_there(run, devices, monkeypatch):
     assert code == 1
     assert "gaigs: rasterizer 'opencl' needs an OpenCL driver: pip install 'pyopencl[pocl]'" in err
     assert "Traceback" not in err
+
+
+def test_a_folder_of_another_run_or_of_other_files_stays(run, tmp_path):
+    (tmp_path / "run").mkdir()
+    with only_run(tmp_path / "run"):
+        code, err = run(*SMALL, *HERE)
+        assert code == 1
+        assert "another run is at work in" in err
+        assert (tmp_path / "run" / "gaigs.log").exists()
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    assert run("command=devices", *HERE)[0] in (0, 1)
+    assert (tmp_path / "run" / "notes.txt").read_text() == "mine"
+
+
+def test_output_that_nobody_reads_is_no_error(tmp_path):
+    read, write = os.pipe()
+    os.close(read)
+    environment = os.environ | {"PYTHONPATH": str(Path(gaigs.__path__[0]).parent)}
+    command = [sys.executable, "-m", "gaigs", "--help"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_ctrl_c_while_packages_are_imported_is_one_line(tmp_path):
+    (tmp_path / "hydra.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n")
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(gaigs.__path__[0]).parent}"}
+    command = [sys.executable, "-m", "gaigs"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "gaigs: stopped\n")
 
 
 def test_labels_are_compared(run, tmp_path):

@@ -1,5 +1,6 @@
 """Several processes that train together, signals that stop a run, and the resources that runs share."""
 
+import contextlib
 import json
 import os
 import signal
@@ -14,6 +15,7 @@ import torch
 import gaigs
 from gaigs import processes
 from gaigs.report.curves import read_curves
+from gaigs.training.checkpoints import KeepLast
 
 SMALL = (
     "+experiment=spectrum", "data.transmitters=36", "data.order=1", "training.thinning.stride=8",
@@ -129,6 +131,34 @@ def test_a_signal_that_python_ignores_stops_a_run_all_the_same(number):
         work()
     assert getattr(stop.value, "number", signal.SIGINT) == number
     assert sys.unraisablehook is hook
+
+
+@pytest.mark.parametrize("trains", [False, True])
+def test_the_second_signal_of_a_closed_terminal_is_ignored(trains, tmp_path):
+    """The system and the shell each send one; at a second signal of another kind a training does not save."""
+    before = signal.getsignal(signal.SIGHUP)
+    keep = KeepLast(tmp_path / "last.ckpt", every=0)
+    try:
+        with contextlib.suppress(processes.Stopped), processes.stopping():
+            if trains:
+                signal.signal(signal.SIGHUP, keep.interrupt)
+            try:
+                signal.raise_signal(signal.SIGHUP)
+            finally:
+                signal.raise_signal(signal.SIGHUP)
+                saved = True
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert saved
+    assert keep.received == (signal.SIGHUP if trains else None)
+
+
+def test_nohup_is_heeded():
+    code = "import signal; from gaigs import processes; print(signal.SIGHUP in processes.STOPPING)"
+    environment = os.environ | {"PYTHONPATH": str(Path(gaigs.__path__[0]).parent)}
+    for words, expected in ((["nohup"], "False"), ([], "True")):
+        done = subprocess.run([*words, sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+        assert done.stdout.strip() == expected
 
 
 def test_an_ignored_signal_at_the_very_end_counts():

@@ -24,12 +24,14 @@ from gaigs import checkpoint, configuration, runs
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.geometry import Pose
+from gaigs.io.files import atomic_write
 from gaigs.placement.mirrored.channel_search import SLABS, ChannelSearch
 from gaigs.processes import Stopped, stopping
 from gaigs.radio_maps import RadioMap
 from gaigs.registry import registry
 from gaigs.report.curves import read_curves
 from gaigs.runs import evaluation
+from gaigs.runs.folder import claim
 from gaigs.testing import example_links
 from gaigs.training.descent import Descent
 
@@ -325,6 +327,30 @@ def test_a_folder_without_a_checkpoint_is_free(tmp_path):
     (tmp_path / "config.yaml").write_text("seed: 5\nmodel: {name: knn}\ndata: {name: synthetic}\n")
     runs.run(configure("trainer.max_steps=1"), tmp_path)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text())["seed"] == 0
+
+
+@pytest.mark.parametrize("name", ["[bold]x", "runs[/red]"])
+def test_the_name_of_a_folder_is_no_markup(name, tmp_path, capsys):
+    runs.run(configure("model=mean"), tmp_path / name)
+    assert capsys.readouterr().out.endswith(f"results: {tmp_path / name}\n")
+
+
+def test_the_name_of_a_split_is_no_markup():
+    task = gaigs.links("synthetic_rssi", transmitters=10, order=0).task
+    scores = {"mean": task.scores(torch.zeros(3), torch.ones(3))}
+    assert "on split folder[/red]." in str(evaluation.Evaluation(task, "folder[/red]", scores, "cpu"))
+
+
+def test_files_that_a_killed_writer_left_are_removed(tmp_path):
+    config = configure("trainer.max_steps=1")
+    claim(tmp_path, config)
+    for place in (tmp_path / "figures", tmp_path / "members" / "1"):
+        place.mkdir(parents=True)
+    for name in ("last.ckpt", "figures/loss.png", "members/1/best.ckpt"):
+        writer = atomic_write(tmp_path / name)
+        writer.__enter__().write_bytes(b"cut")
+        claim(tmp_path, config)
+        assert not [*tmp_path.rglob("*.part*")]
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "predictions.npz", "figures"])

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import torch
 
 from gaigs import configuration
-from gaigs.io.files import atomic_write, write_text
+from gaigs.io.files import write_text
+from gaigs.io.tables import original, write_csv
 from gaigs.registry import check_type
 from gaigs.report.table import markdown
 from gaigs.runs.evaluation import device_name
@@ -106,10 +107,7 @@ class Benchmark(ABC):
             for row in self.measure(cell, context):
                 texts = {column: text_of(row.get(column)) for column in columns}
                 rows[identity(texts)] = texts | {"status": texts["status"] or MEASURED}
-            with atomic_write(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
-                writer = csv.DictWriter(opened, columns)
-                writer.writeheader()
-                writer.writerows(rows.values())
+            write_csv(file, [columns, *([row[column] for column in columns] for row in rows.values())])
             longest = max(longest, time.monotonic() - begin)
             log.info("%s %d/%d: %.1f s", self.name, number_of_cell + 1, len(left), time.monotonic() - begin)
         measured = [row for row in rows.values() if row["status"] == MEASURED]
@@ -133,7 +131,7 @@ def read_rows(file: Path, columns: Sequence[str]) -> list[Row]:
             f"{file} must be CSV with the columns {', '.join(columns)}; move it elsewhere, or choose another folder "
             "(hydra.run.dir=DIR)"
         )
-    return rows
+    return [{column: original(text) for column, text in row.items()} for row in rows]
 
 
 def text_of(value: object) -> str:

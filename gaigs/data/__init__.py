@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gaigs.antenna import Receiver, lacking
 from gaigs.data.checks import check
+from gaigs.data.checks.subcarriers import constant_sentence, constant_subcarriers
 from gaigs.data.gateways import estimate_place
 from gaigs.data.maps import check_metres
 from gaigs.geometry import Frame, Pose
@@ -197,6 +198,9 @@ def divide(links: Links, split: Mapping) -> Links:
     Raises:
         ValueError: An option of the split has a defect, two of its parts share a link, or all spectra are constant.
     """
+    if isinstance(links.task, Csi) and isinstance(links.labels, Tensor):
+        check_elements(links)
+        links = without_constant(links)
     parts = registry("split").build(split, links=links)
     given = [*parts.parts().values()]
     numbers, is_whole = torch.cat(given), all(part.dtype == torch.long for part in given)
@@ -210,8 +214,6 @@ def divide(links: Links, split: Mapping) -> Links:
     links = replace(links, split=parts)
     if links.frame is None:
         check_metres("transmitters", links.query.transmitters.unique(dim=0).double().numpy())
-    if isinstance(links.task, Csi):
-        check_elements(links)
     if links.uncertainties is not None:
         links = with_places(only_trained(links))
     remarks, phase = [links.remarks], getattr(links.task, "phase", "known")
@@ -241,6 +243,50 @@ def check_elements(links: Links) -> None:
                 f"labels must be 0 at elements that an array lacks; that of link {int(part[link])} is not at element "
                 f"{element}, and {links.receivers[int(own[link])].name} has {sizes[int(own[link])]} elements"
             )
+
+
+def without_constant(links: Links) -> Links:
+    """Channels without the subcarriers, and then the links, that have no channel; remarks and a warning count them.
+
+    The same holds for the subcarriers that are held out. If all subcarriers of the links are so, they stay.
+
+    Raises:
+        ValueError: All subcarriers that are held out are so.
+    """
+    both, remarks = [], [links.remarks]
+    for part in filter(None, (links, links.held_out)):
+        constant = constant_subcarriers(part)
+        if constant.all() and part is not links:
+            raise ValueError("all subcarriers to test on have one value in every link; choose another data.band_test")
+        if constant.any() and not constant.all():
+            task: Any = part.task
+            remarks.append(constant_sentence(constant, task.frequencies).format("and are left out"))
+            log.warning("%s", remarks[-1])
+            task = Csi(task.elements, task.frequencies[~constant], task.phase)
+            part = replace(part, labels=part.labels[..., ~constant], task=task)
+        both.append(part)
+    if len(remarks) == 1:
+        return links
+    heard = torch.stack([part.labels.abs().amax((1, 2)) > 0 for part in both]).all(0)
+    if silent := int((~heard).sum()):
+        remarks.append(f"{silent} links with no other subcarrier are left out")
+        both = [kept_links(part, heard) for part in both]
+    return replace(both[0], held_out=both[1] if len(both) > 1 else None, remarks="; ".join(filter(None, remarks)))
+
+
+def kept_links(links: Links, kept: Bool[Tensor, " n"]) -> Links:
+    """Some of the links, before a split; receivers stay."""
+    number = kept.cumsum(0) - 1
+    given = links.official
+    official = None if given is None else lambda: tuple(number[part[kept[part]]] for part in given())
+    return replace(
+        links,
+        query=links.query[kept],
+        labels=links.labels[kept],
+        rows=None if links.rows is None else links.rows[kept],
+        noises=None if links.noises is None else links.noises[kept],
+        official=official,
+    )
 
 
 def only_trained(links: Links) -> Links:

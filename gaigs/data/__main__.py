@@ -13,6 +13,7 @@ from gaigs.data.sionna.meshes import wavefront_obj
 from gaigs.data.synthetic.image_source import bounces, trace
 from gaigs.io.files import write_text
 from gaigs.io.tables import check_empty, number_places
+from gaigs.processes import only_run
 from gaigs.propagation import free_space
 
 
@@ -45,12 +46,14 @@ def main() -> None:
             geometry = None
         folder.mkdir(parents=True, exist_ok=True)
         writers = {"spectrum": nerf2_spectrum.write, "rssi": rssi_csv.write, "csi": csi_npz.write}
-        if arguments.deepmimo:
-            write_paths(folder, links, options.get("order", 2))
-        else:
-            writers[links.task.name](folder, links)
-        if geometry is not None:
-            write_text(folder / "geometry.obj", geometry)
+        with only_run(folder):
+            check_empty(folder)  # another process may have begun to write it
+            if arguments.deepmimo:
+                write_paths(folder, links, options.get("order", 2))
+            else:
+                writers[links.task.name](folder, links)
+            if geometry is not None:
+                write_text(folder / "geometry.obj", geometry)
     except (ValueError, TypeError, OSError, ImportError, RuntimeError, OmegaConfBaseException) as error:
         parser.error(str(error))
     print(f"{folder}: {len(links.split.train)} training and {len(links.split.test)} test labels")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gaigs.data import Links
+from gaigs.data import Links, kept_links
 from gaigs.query import check_carrier
 from gaigs.task.csi import Csi
 
@@ -33,11 +33,10 @@ def hold_out_band(links: Links, band_train: Sequence[float] | None, band_test: S
         raise ValueError(f"data.band_train={[*band_train]} leaves no subcarrier to test on; choose a narrower band")
     own, rest = task.frequencies[chosen], task.frequencies[others]
     heard = [part.abs().amax((1, 2)) > 0 for part in (links.labels[..., chosen], links.labels[..., others])]
-    kept = (heard[0] & heard[1]).nonzero()[:, 0]
-    if silent := len(links) - len(kept):
+    kept = heard[0] & heard[1]
+    if silent := int((~kept).sum()):
         remarks = "; ".join(filter(None, (links.remarks, f"{silent} that are zero in a band are left out")))
-        rows = None if links.rows is None else links.rows[kept]
-        links = replace(links, query=links.query[kept], labels=links.labels[kept], rows=rows, remarks=remarks)
+        links = replace(kept_links(links, kept), remarks=remarks)
     carriers = torch.full((len(links),), (own.min() + own.max()).item() / 2)
     links = replace(links, query=replace(links.query, frequencies=carriers))
     part = lambda which, some: replace(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.constants import speed_of_light
@@ -107,7 +108,9 @@ def simulate_channels(
     rows, task = torch.arange(transmitters), Csi(len(receiver.array), frequency + offsets, phase)
     labels = torch.cat([*room.respond(places, receiver, frequency, offsets)])
     if phase != "known":
-        generator = torch.Generator().manual_seed(hash((seed, 2)) % 2**63)  # the places use ``seed`` itself
+        sequence = np.random.SeedSequence((seed % 2**64, 2))  # the places use ``seed`` itself
+        (state,) = sequence.generate_state(1, np.uint64)
+        generator = torch.Generator().manual_seed(int(state) % 2**63)
         angles, delays, gains = 2 * torch.rand(3, transmitters, 1, 1, generator=generator, dtype=torch.float64) - 1
         angles = math.pi * angles
         if phase == "per_link_and_delay":

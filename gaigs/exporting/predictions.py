@@ -1,10 +1,9 @@
 """Files of predictions of any task: CSV and NetCDF."""
 
-import csv
 import itertools
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from torch import Tensor
 from gaigs.antenna import lacking
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
-from gaigs.io.files import atomic_write
+from gaigs.io import tables
 from gaigs.io.netcdf import Variable, write_netcdf
 from gaigs.kriging.intervals import Estimate
 from gaigs.model import Model
@@ -149,14 +148,14 @@ def write_csv(file: Path, variables: Mapping[str, Variable], absent: Bool[np.nda
     shown = lambda value, digits=7: value if isinstance(value, str) else f"{value:.{digits}g}"
     digits = [10 if name in ("easting", "northing") else 7 for name in links]
     places = [*itertools.product(*([f"{number:.10g}" for number in axis] for axis in axes.values()))]
-    with atomic_write(file) as part, part.open("w", encoding="utf-8", newline="") as text:
-        rows = csv.writer(text, lineterminator="\n")
-        rows.writerow([*links, *axes, *values])
+
+    def rows() -> Iterator[Sequence[str]]:
+        yield [*links, *axes, *values]
         for number, link in enumerate(zip(*links.values(), strict=True)):
             start = [*map(shown, link, digits)]
             own = (map(shown, part[number].ravel().tolist()) for part in values.values())
-            numbers = zip(places, zip(*own, strict=True), strict=True)
-            kept = ~absent[number].ravel()
-            rows.writerows(
-                [*start, *place, *row] for (place, row), is_kept in zip(numbers, kept, strict=True) if is_kept
-            )
+            for place, row, is_absent in zip(places, zip(*own, strict=True), absent[number].ravel(), strict=True):
+                if not is_absent:
+                    yield [*start, *place, *row]
+
+    tables.write_csv(file, rows())

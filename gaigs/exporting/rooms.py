@@ -2,10 +2,12 @@
 
 import base64
 import cmath
+import hashlib
 import json
 import math
 import re
 import struct
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +28,7 @@ from gaigs.placement.learnt_room import LearntPlane
 from gaigs.placement.mirrored import export
 from gaigs.placement.mirrored.materials import Material, materials
 from gaigs.placement.mirrored.sheets import Sheet, fit_sheets
+from gaigs.processes import only_run
 from gaigs.query import check_carrier
 from gaigs.registry import name_of
 
@@ -73,7 +76,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
         return [file]
     chosen = materials(own.placement, own.traced, frequency)
     bsdfs = [itu_bsdf(chosen[plane.number], frequency) for plane in planes] + [*map(sheet_bsdf, sheets)]
-    comments = [f"Materials for {frequency:.7g} Hz."]
+    comments = [f"Materials for {frequency:.7g} Hz.", *map(str, own.scene.flat_axes)]
     if own.scene.task.dtype.is_complex:
         for receiver, gain in zip(own.scene.receivers, traced_gains(own, rest).tolist(), strict=True):
             turned = f"{abs(gain):.4g}, turned by {math.degrees(cmath.phase(gain)):.2f} degrees"
@@ -151,22 +154,26 @@ def write_scene(file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comme
             kind, text = ("string", value) if isinstance(value, str) else ("float", f"{value:.6g}")
             ElementTree.SubElement(element, kind, name=name, value=text)
     folder, files = file.with_name(f"{file.stem}_meshes"), [file]
-    with atomic_write(file) as part:
-        folder.mkdir(exist_ok=True)
-        for old in (*folder.glob("plane_*.ply"), *folder.glob("obstacle_*.ply")):
-            old.unlink()
+    folder.mkdir(exist_ok=True)
+    with only_run(folder, waits=True):
         for mesh, bsdf in zip(meshes, bsdfs, strict=True):
-            files.append(folder / f"{mesh.name}.ply")
             vertices = np.array([*mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"])
             faces = np.array([(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))])
             elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-            PlyData(elements, byte_order="<").write(str(files[-1]))
+            # Named by content: a scene that is read meanwhile never has another scene's meshes.
+            digest = hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest()[:8]
+            files.append(folder / f"{mesh.name}-{digest}.ply")
+            with atomic_write(files[-1]) as part:
+                PlyData(elements, byte_order="<").write(str(part))
             shape = ElementTree.SubElement(scene, "shape", type="ply", id=f"mesh-{mesh.name}")
             ElementTree.SubElement(shape, "string", name="filename", value=f"{folder.name}/{files[-1].name}")
             ElementTree.SubElement(shape, "boolean", name="face_normals", value="true")
             ElementTree.SubElement(shape, "ref", id=bsdf.name, name="bsdf")
         ElementTree.indent(scene)
-        part.write_text(ElementTree.tostring(scene, encoding="unicode") + "\n", encoding="utf-8")
+        write_text(file, ElementTree.tostring(scene, encoding="unicode") + "\n")
+        for old in {*folder.glob("plane_*.ply"), *folder.glob("obstacle_*.ply")} - {*files}:
+            if old.stat().st_mtime < time.time() - 60:  # the scene before may still be read
+                old.unlink()
     return files
 
 

@@ -14,6 +14,7 @@ from gaigs.exporting.rooms import mirrored_of
 from gaigs.io.tables import check_empty, number_places
 from gaigs.model import Model
 from gaigs.placement.mirrored import export
+from gaigs.processes import only_run
 from gaigs.query import Query
 
 log = logging.getLogger(__name__)
@@ -56,7 +57,9 @@ def write_scenario(model: Model, folder: Path, places: object, frequency: float 
         bounces = export.trace_paths(own.placement, query).bounces[:, :, ::-1].astype(float)  # from the receiver on
         stations.append((receiver.pose.position.double().numpy(), gains, bounces))
     folder.mkdir(parents=True, exist_ok=True)
-    deepmimo.write(folder, carrier.item(), users.double().numpy(), stations)
+    with only_run(folder):
+        check_empty(folder)  # another process may have begun to write it
+        deepmimo.write(folder, carrier.item(), users.double().numpy(), stations)
     names = ", ".join(f"t000_tx{number:03} = {one.name}" for number, one in enumerate(own.scene.receivers))
     log.info("%s: base stations %s", folder, names)
     return [folder]

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,13 +12,14 @@ from pathlib import Path
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path with the same ending, which replaces the file once it is written and on the disk.
 
-    If writing fails or is interrupted, the temporary file is removed and the old file stays.
+    Each writer has a path of its own: of several the last replaces the file. If writing fails or is interrupted, the
+    temporary file is removed and the old file stays.
 
     Raises:
         OSError: The file cannot be written; with the ``errno`` of the cause.
     """
     path = Path(path)
-    part = path.with_name(f"{path.stem}.part{path.suffix}")
+    part = path.with_name(f"{path.stem}.gaigs-{secrets.token_hex(4)}.part{path.suffix}")
     try:
         if not path.parent.is_dir():  # some writers would create a folder that was removed
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
@@ -36,6 +38,12 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             raise
         message = _unwritten(path, error)
         raise (OSError(message) if error.errno is None else OSError(error.errno, message)) from error
+
+
+def remove_parts(folder: Path) -> None:
+    """Removes the temporary files that killed writers have left in a folder."""
+    for part in folder.glob("*.gaigs-????????.part*"):
+        part.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:

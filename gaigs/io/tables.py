@@ -7,7 +7,7 @@ import os
 import re
 import reprlib
 import sys
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gaigs.geometry import FAR, WITHIN
+from gaigs.io.files import atomic_write
 
 Rows = Mapping[int, Sequence[str]]
 """Cells of each line of a table, by the line's number from 1."""
@@ -208,6 +209,27 @@ class Table(NamedTuple):
         if name not in self.names:
             raise ValueError(f"{self.file}, line 1: expected a column {quote(name)}, got {shortened(self.names)}")
         return self.names.index(name)
+
+
+def write_csv(file: Path, rows: Iterable[Sequence]) -> None:
+    """Writes rows as a CSV table; texts as ``inert`` gives them."""
+    with atomic_write(file) as part, part.open("w", encoding="utf-8", newline="") as opened:
+        writer = csv.writer(opened, lineterminator="\n")
+        writer.writerows([inert(cell) if isinstance(cell, str) else cell for cell in row] for row in rows)
+
+
+def inert(text: str) -> str:
+    """A text that no spreadsheet takes for a formula: before =, +, -, @, a tab or a return it has an apostrophe more.
+
+    Numbers stay as they are.
+    """
+    starts = text.lstrip("'").startswith(("=", "+", "-", "@", "\t", "\r"))
+    return f"'{text}" if starts and text != "-inf" and math.isnan(to_number(text)) else text
+
+
+def original(text: str) -> str:
+    """The text of which ``inert`` gives this one."""
+    return text[1:] if text.startswith("'") and inert(text[1:]) == text else text
 
 
 def read_table(file: Path, content: str) -> Table:

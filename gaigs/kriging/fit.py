@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.kriging.kernel import Process, kernel, kriging_weights
-from gaigs.kriging.links import PART, coordinates, distances, known_links, scale_bounds, scaled
+from gaigs.kriging.links import PART, coordinates, distances, known_links, scale_bounds, scaled, single_readings
 from gaigs.query import Query, evenly
 from gaigs.scene import Scene
 from gaigs.stages import end_in_time
@@ -119,7 +119,8 @@ def fit_hyperparameters(
 
 
 FEWEST = 10
-"""Fewest validation links that choose hyperparameters, or whether paths are kriged: fewer ones overfit."""
+"""Fewest validation links that choose hyperparameters, or whether paths are kriged, repeated readings as one: fewer
+ones overfit."""
 
 AROUND = 64
 """Training links that predict each held-out link while hyperparameters are fitted."""
@@ -139,7 +140,7 @@ def hold_out(
     out one by one, each with all that share its place.
     """
     split, query = links.split, links.query
-    validation = split.validation if len(split.validation) >= FEWEST else split.validation[:0]
+    validation = split.validation if len(single_readings(links, split.validation)) >= FEWEST else split.validation[:0]
     receiver = query.receivers[known[0]]
     train, held = (part[query.receivers[part] == receiver] for part in (split.train, validation))
     train = train if len(train) else known

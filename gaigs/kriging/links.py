@@ -56,6 +56,69 @@ def folds_of(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " k"]:
     return (order % FOLDS)[group]
 
 
+def without_gross_errors(links: Links, size: float = 6.0) -> Links:
+    """Links of one number each without known levels that no room explains: one of them moves a whole fit.
+
+    Levels fall with the logarithm of the distance to their receiver. A level is left out if its error by this law is
+    more than ``size`` standard deviations, and as far from those of the five nearest levels of its receiver: what
+    neighbours share is a part of the room. So is what more than one in twenty have. The line has Cauchy's weights, so
+    few levels do not move it. The deviation is 1.48 times the median error, the larger one of the receiver and of all
+    receivers, 1 dB or more. Fewer than 20 known links keep all.
+
+    Source: Maronna, Martin and Yohai, Robust Statistics, 2006, sections 4.4 and 5.2.
+    """
+    index = links.split.known
+    if len(index) < 20:
+        return links
+    query, labels, positions = links.query[index], links.labels[index].double(), links.scene.positions(links.labels)
+    lengths = (query.transmitters - positions[query.receivers]).norm(dim=1).clamp_min(0.1)
+    errors = torch.zeros_like(labels)
+    for receiver in query.receivers.unique():
+        own = query.receivers == receiver
+        errors[own] = law_errors(lengths[own].double().log10(), labels[own])
+    usual = deviation(errors)
+    kept = torch.ones_like(index, dtype=torch.bool)
+    for receiver in query.receivers.unique():
+        own = (query.receivers == receiver).nonzero()[:, 0]
+        most = size * torch.maximum(usual, deviation(errors[own]))
+        far = own[errors[own].abs() > most]
+        if len(own) > 5 and len(far):
+            apart = distances(query.transmitters[far], query.transmitters[own])
+            around = own[apart.masked_fill(far[:, None] == own, math.inf).topk(5, largest=False).indices]
+            alone = (errors[far, None] - errors[around]).abs().amin(1) > most
+            kept[far] = ~alone | (alone.sum() > max(1, len(own) // 20))
+    parts = links.split.parts()
+    train, validation = (parts[name][torch.isin(parts[name], index[kept])] for name in ("train", "validation"))
+    return replace(links, split=Split(links.split.name, train, validation, parts["test"], links.split.groups))
+
+
+def law_errors(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+    """Levels less those of a line over the logarithm of the distance, by least squares with Cauchy's weights."""
+    weights = torch.ones_like(levels)
+    for _ in range(20):
+        shares = weights / weights.sum()
+        steps, errors = decades - shares @ decades, levels - shares @ levels
+        slope = shares @ (steps * errors) / (shares @ steps.square()).clamp_min(1e-6)
+        errors = errors - slope * steps
+        weights = 1 / (1 + (errors / (2 * deviation(errors))).square())
+    return errors
+
+
+def deviation(errors: Float[Tensor, " k"]) -> Float[Tensor, ""]:
+    """Standard deviation of normal errors by their median size, at least 1 in the label's unit."""
+    return (1.4826 * errors.abs().median()).clamp_min(1.0)
+
+
+def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
+    """Some links with one random reading of each place, receiver and carrier: those of one place err together."""
+    if not len(index):
+        return index
+    _, which = links.query[index].unique(with_receivers=True)
+    order = torch.randperm(len(index), generator=torch.Generator().manual_seed(0))
+    last = order.new_zeros(int(which.max()) + 1).index_copy(0, which[order], order)
+    return index[last.sort().values]
+
+
 def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tensor, "b d"]:
     """Points whose Euclidean distance is the distance of links, d² = |dx|² + (scale d ln f)²; float64.
 

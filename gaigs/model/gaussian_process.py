@@ -10,7 +10,16 @@ from torch import Tensor, nn
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
 from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
-from gaigs.kriging.links import PART, at_directions, coordinates, distances, folds_of, known_links, thinned
+from gaigs.kriging.links import (
+    PART,
+    at_directions,
+    coordinates,
+    distances,
+    folds_of,
+    known_links,
+    thinned,
+    without_gross_errors,
+)
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, build_trend
 from gaigs.query import Batch, Query, evenly, thin_labels
@@ -89,6 +98,8 @@ class GaussianProcess(LookUp):
 
     @torch.no_grad()
     def _fit(self, links: Links, chooses: bool) -> None:
+        if self.scalar:
+            links = without_gross_errors(links)
         self.links, self.known = links, known_links(links)
         for trend in self.trends if chooses else (self.trend,):
             trend.fit(links)

@@ -16,7 +16,7 @@ from gaigs.data import Links
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters
 from gaigs.kriging.kernel import LIMIT, Process
-from gaigs.kriging.links import PART, coordinates, folds_of, scaled, thinned
+from gaigs.kriging.links import PART, coordinates, folds_of, scaled, single_readings, thinned, without_gross_errors
 from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, Wrapper, call_optional
@@ -108,13 +108,16 @@ class Kriging(Wrapper):
         If not ``is_final``, only the validation model is fitted, without a word. ``by_paths`` says if strengths of
         paths are kriged, or whole labels; None: ``FEWEST`` validation links or more choose.
         """
+        if self.is_scalar:
+            links = without_gross_errors(links)
         count, links = len(links.split.known), thinned(links, self._most(links))
         if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
         values, held = predicted(self.trend, links, links.split.known), links.split.validation
         self.fallback.fit(links)
         has_paths = getattr(self.trend, "has_margins", False)
-        if by_paths or (has_paths and by_paths is None and len(held) < FEWEST):
+        is_few = len(single_readings(links, held)) < FEWEST
+        if by_paths or (has_paths and by_paths is None and is_few):
             return self._krige_paths(links, values, is_final)
         if has_paths and by_paths is None:
             models = self._krige_labels(links, values, False), self._krige_paths(links, values, is_final)
@@ -227,7 +230,8 @@ class Kriging(Wrapper):
                 strengths = field(query.transmitters[row : row + 1].double(), process)[0]
                 margins = trend.margins(query[row : row + 1].to(device)).cpu()[0]
                 kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), margins, 1)
-        helps = len(held) >= FEWEST and is_surely_better(*self._validation_scores(links, (kriged, plain)), errors=1.5)
+        enough = len(single_readings(links, split.validation)) >= FEWEST
+        helps = enough and is_surely_better(*self._validation_scores(links, (kriged, plain)), errors=1.5)
         for model in (self, validation_model) if is_final else (validation_model,):
             model.trend_weight.fill_(1)
             model.weight.fill_(helps)

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.kriging.links import known_links
+from gaigs.kriging.links import known_links, without_gross_errors
 from gaigs.model import Model, Prediction
 from gaigs.query import Batch
 from gaigs.registry import register
@@ -38,8 +38,9 @@ class PathLoss(Model):
         self.register_buffer("exponents", torch.full((len(scene.receivers),), torch.nan))  # gamma
 
     def fit(self, links: Links) -> None:
-        """Fits level and exponent of each receiver."""
+        """Fits level and exponent of each receiver; see ``without_gross_errors`` for levels that do not count."""
         lines = []
+        links = without_gross_errors(links)
         for index in known_links(links):
             labels = links.labels[index].double()
             decades = self._decades(links.query.transmitters[index].double(), links.query.receivers[index])

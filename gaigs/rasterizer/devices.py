@@ -16,6 +16,17 @@ def default_device() -> str:
     return name_of(_choose(os.environ.get("GAIGS_OPENCL_DEVICE")))
 
 
+@functools.cache
+def _process() -> int:
+    """The process that uses OpenCL first."""
+    return os.getpid()
+
+
+def is_forked() -> bool:
+    """True in a process forked from one that uses OpenCL: it lacks the driver's threads, and would wait for ever."""
+    return _process() != os.getpid()
+
+
 def _devices() -> list:
     """The devices of all drivers. A broken driver is an error only where no other lists a device."""
     found, causes = [], []
@@ -41,6 +52,11 @@ def name_of(device) -> str:
 
 def open_queue(name: str | None) -> cl.CommandQueue:
     """The queue of a device, made once; the name is as for ``OpenCLRasterizer``."""
+    if is_forked():
+        raise RuntimeError(
+            "rasterizer 'opencl' does not work in a process forked from one that has used it\n"
+            "start processes by multiprocessing.get_context('spawn'), or use rasterizer=torch"
+        )
     return _open(name or os.environ.get("GAIGS_OPENCL_DEVICE"))
 
 

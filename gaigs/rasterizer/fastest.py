@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 @register("rasterizer", "fastest")
 class FastestRasterizer:
-    """``opencl`` for float32 on the CPU where a driver builds kernels, else ``torch``; the log says which.
+    """``opencl`` for float32 on the CPU where a driver builds kernels, else ``torch``, also in a forked process.
 
     The two agree to 2e-6 of the image's maximum, so a checkpoint may be rendered by either.
     """

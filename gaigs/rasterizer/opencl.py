@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gaigs.projection import Plane, Splats
 from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
-from gaigs.rasterizer.devices import cause_of, find_fault, name_of, open_queue
+from gaigs.rasterizer.devices import cause_of, find_fault, is_forked, name_of, open_queue
 from gaigs.registry import register
 
 ROWS, COLUMNS = 16, 8
@@ -60,10 +60,10 @@ class OpenCLRasterizer:
     def takes(
         self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
     ) -> bool:
-        """True if dtypes, devices and counts suit."""
+        """True if dtypes, devices and counts suit, and OpenCL works in this process."""
         floats = splats.means2d, splats.factors, splats.depths, signal, opacities, attenuations, plane.u, plane.v
         suits = (x is None or (x.dtype == torch.float32 and x.device.type == "cpu") for x in floats)
-        return all(suits) and signal.shape[2] >= 1 and signal.shape[1] < SPLATS
+        return not is_forked() and all(suits) and signal.shape[2] >= 1 and signal.shape[1] < SPLATS
 
     def __call__(
         self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane

@@ -21,7 +21,7 @@ def main() -> None:
             tables = report(given.folder)
     except (FileNotFoundError, ValueError) as error:
         parser.error(str(error))
-    Console().print(tables)
+    Console(emoji=False).print(tables)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ def write() -> None:
 
         try:
             with figure_formats(formats):
-                Console().print(report(folder))
+                Console(emoji=False).print(report(folder))
         except Exception as error:  # a failed report must not look like a failed job
             print(f"gaigs: no report: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr)
         else:

@@ -1,6 +1,5 @@
 """Tables for terminals, Markdown and CSV; the scores of a run beside those of its baselines."""
 
-import csv
 import itertools
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from gaigs.io.files import atomic_write
+from gaigs.io import tables
 from gaigs.registry import registry
 from gaigs.task import Metric, Task
 
@@ -78,13 +77,12 @@ def write_csv(file: Path, rows: Sequence[Mapping], spread: Sequence[str] = ()) -
     wide = {column for row in rows for column, value in row.items() if isinstance(value, Spread)}
     ends = lambda column: ["", *spread] if column in wide else [""]
     columns = [f"{column}{end}" for column in columns_of(rows) for end in ends(column)]
-    with atomic_write(file) as part, open(part, "w", newline="", encoding="utf-8") as opened:
-        writer = csv.DictWriter(opened, columns)
-        writer.writeheader()
-        for row in rows:
-            cells = {column: value if isinstance(value, Spread) else (value,) for column, value in row.items()}
-            parts = {f"{c}{end}": v for c, values in cells.items() for end, v in zip(ends(c), values, strict=False)}
-            writer.writerow(parts)
+    lines = [columns]
+    for row in rows:
+        cells = {column: value if isinstance(value, Spread) else (value,) for column, value in row.items()}
+        parts = {f"{c}{end}": v for c, values in cells.items() for end, v in zip(ends(c), values, strict=False)}
+        lines.append([parts.get(column, "") for column in columns])
+    tables.write_csv(file, lines)
 
 
 def terminal(

@@ -61,10 +61,10 @@ def run(config: dict, folder: Path) -> dict | None:
                 if not is_configuration(folder / "config.yaml"):  # loggers make a removed folder again
                     store(config, folder)
                 write_text(finished, json.dumps(metrics, indent=2) + "\n")
-    console = Console()
+    console = Console(emoji=False)
     console.print(metrics_table(metrics))
-    console.print(verdict(metrics))
-    console.print(f"results: {folder}", soft_wrap=True)
+    console.print(verdict(metrics), markup=False)
+    print(f"results: {folder}")
     return metrics
 
 

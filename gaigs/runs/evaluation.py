@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Int
 from rich.console import Console, Group
 from rich.jupyter import JupyterMixin
+from rich.markup import escape
 from torch import Tensor
 
 from gaigs import stages
@@ -25,7 +26,7 @@ from gaigs.data import Links, with_places
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
 from gaigs.kriging.intervals import Calibration, fewest, holds, interval_scores, nearest, summarise_intervals, thinned
-from gaigs.kriging.links import folds_of
+from gaigs.kriging.links import folds_of, single_readings
 from gaigs.model import Model, call_optional
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging, predicted
@@ -130,12 +131,13 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
     A look-up is fitted anew without each fold of the known links; so are estimated places of receivers. A trained model
     has the validation links; the step of its training stays the one chosen on all of them. Kriging is fitted anew to
     the training links, and its weights and hyperparameters are chosen for each half of the validation links by the
-    other half; one group alone chooses, too. The time limit of a run leaves later folds out.
+    other half; one group alone chooses, too. Of repeated readings one calibrates, see ``single_readings``. The time
+    limit of a run leaves later folds out.
     """
     split, validation, receivers = links.split, links.split.validation, links.query.receivers
     if not (is_trained(model) or isinstance(model, Kriging)):
         index = split.known
-        folds, asked = folds_of(links, index) % CALIBRATION_FOLDS, evenly(index, MOST)
+        folds, asked = folds_of(links, index) % CALIBRATION_FOLDS, evenly(single_readings(links, index), MOST)
         for fold in range(CALIBRATION_FOLDS):
             if stages.is_up():
                 return
@@ -154,20 +156,20 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
                 (copied.refit if hasattr(copied, "refit") else copied.fit)(rest)
                 yield copied, part, known
         return
-    halves = folds_of(links, validation) % 2
-    parts = validation[halves == 0], validation[halves == 1]
-    if not isinstance(model, Kriging):
-        if len(validation):
-            yield model, validation, split.train
-        return
     if not len(validation):
         return
+    if not isinstance(model, Kriging):
+        yield model, single_readings(links, validation), split.train
+        return
+    halves = folds_of(links, validation) % 2
+    parts = validation[halves == 0], validation[halves == 1]
     for own, other in (parts, parts[::-1]) if all(map(len, parts)) else ((validation, validation),):
         if stages.is_up():
             return
         kriged = Kriging(links.scene, model.trend, model.fallback_options).to(model.device)
         kind = {"is_final": False, "by_paths": model.by_paths}
-        yield kriged.krige(replace(links, split=split.choosing(own)), **kind), other, split.train
+        kriged = kriged.krige(replace(links, split=split.choosing(own)), **kind)
+        yield kriged, single_readings(links, other), split.train
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,7 @@ class Evaluation(JupyterMixin):
 
     def __rich__(self) -> Group:
         facts = {"task": self.task.name, "split": self.split, "device": self.device, "models": self.models}
-        return Group(metrics_table(facts), verdict(facts))
+        return Group(metrics_table(facts), escape(verdict(facts)))
 
     def __str__(self) -> str:
         text = io.StringIO()

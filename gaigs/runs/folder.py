@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.data.matching import are_alike
-from gaigs.io.files import atomic_write, write_text
+from gaigs.io.files import atomic_write, remove_parts, write_text
 from gaigs.registry import digests
 from gaigs.version import __version__
 
@@ -32,6 +32,8 @@ def claim(folder: Path, config: dict) -> None:
     there = [name for name in (*names, "figures", "last.ckpt", "metrics.json") if (folder / name).exists()]
     if there and not is_configuration(file):
         raise ValueError(f"{folder} holds {', '.join(there)} of something else\n{ANOTHER}")
+    for place in (folder, folder / "figures", *folder.glob("members/*")):
+        remove_parts(place)
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         store(config, folder)
         return

@@ -1,7 +1,12 @@
-"""Splits of links into training, validation and test; only official parts may separate links of one row."""
+"""Splits of links into training, validation and test; only official parts may separate links of one row.
+
+Fractions count places, not readings: all links of one place, receiver and carrier together count as one.
+"""
+
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.data import Links, Split
@@ -12,14 +17,27 @@ def rows_of(links: Links) -> Int[Tensor, " n"]:
     return torch.arange(len(links)) if links.rows is None else links.rows
 
 
+def places_of(links: Links) -> Int[Tensor, " n"]:
+    """First row at each link's place: a place that is measured in several rows is one group."""
+    rows = rows_of(links)
+    found = rows.new_full((len(rows),), int(rows.max()))
+    # Links of one row stay together, even at several places.
+    for numbers in (links.query.place_keys, rows):
+        _, which = numbers.unique(return_inverse=True)
+        first = found.scatter_reduce(0, which, rows, "amin")
+        rows = first[which]
+    return rows
+
+
 def part(
     name: str,
     links: Links,
     groups: Int[Tensor, " n"],
     test: float,
-    validation: float,
+    validation: float | None,
     seed: int,
     train: int | None = None,
+    rows: Int[Tensor, " n"] | None = None,
 ) -> Split:
     """Holds out whole groups of links, first for the test and then in the same way for validation.
 
@@ -28,55 +46,91 @@ def part(
         links: All links.
         groups: Number of each link's group.
         test: Fraction of the links to test on; 0 for none.
-        validation: Fraction of the training links to validate on; 0 for none.
+        validation: Fraction of the training links to validate on; 0 for none. None: 0.1, and of few links as many more
+            as intervals of 90 % need, see ``hold_out``.
         seed: Seed of all random numbers.
         train: Groups to train and validate on; None for all that do not test.
+        rows: As of ``drawn``.
 
     Raises:
         ValueError: An option is out of range, or there are too few groups.
     """
     check("test", test, 0 <= test < 1, "in [0, 1)")
-    check("validation", validation, 0 <= validation < 1, "in [0, 1)")
-    generator = generator_of(seed)
-    training, testing = hold_out("test", torch.arange(len(links)), groups, test, generator)
+    check_validation(validation)
+    generator, votes = generator_of(seed), links.query.votes
+    training, testing, _ = hold_out("test", torch.arange(len(links)), groups, votes, test, generator, rows=rows)
     if train is not None:
-        present = groups[training].unique()
-        check("train", train, 1 <= train <= len(present), f"in 1..{len(present)}, the rows that do not test")
-        chosen = present[torch.randperm(len(present), generator=generator)[:train]]
-        training = training[torch.isin(groups[training], chosen)]
-    training, validating = hold_out("validation", training, groups, validation, generator)
-    words = [name, f"test {test:g}", *([f"validation {validation:g}"] if validation else []), f"seed {seed}"]
+        order = drawn(groups, training, generator, rows)
+        check("train", train, 1 <= train <= len(order), f"in 1..{len(order)}, the places that do not test")
+        training = training[torch.isin(groups[training], order[:train])]
+    training, validating, share = hold_out("validation", training, groups, votes, validation, generator, rows=rows)
+    words = [name, f"test {test:g}", *([f"validation {share:g}"] if share else []), f"seed {seed}"]
     return Split(", ".join(words), training, validating, testing, groups)
+
+
+def drawn(
+    groups: Int[Tensor, " n"],
+    links: Int[Tensor, " k"],
+    generator: torch.Generator,
+    rows: Int[Tensor, " n"] | None = None,
+) -> Int[Tensor, " g"]:
+    """Groups of some links in random order.
+
+    With ``rows``, whose numbers are those of groups, it is the order of rows: a repeated place changes no other draw.
+    """
+    present = groups[links] if rows is None else torch.cat((groups[links], rows[links]))
+    present = present.unique()
+    order = present[torch.randperm(len(present), generator=generator)]
+    return order[torch.isin(order, groups[links])]
+
+
+class Parted(NamedTuple):
+    """Ascending links that are kept and held out, and the fraction to call the latter by."""
+
+    kept: Int[Tensor, " k"]
+    held: Int[Tensor, " h"]
+    fraction: float
 
 
 def hold_out(
     name: str,
     links: Int[Tensor, " k"],
     groups: Int[Tensor, " n"],
-    fraction: float,
+    votes: Float[Tensor, " n"],
+    fraction: float | None,
     generator: torch.Generator,
     at_most: bool = False,
-) -> tuple[Int[Tensor, " kept"], Int[Tensor, " held"]]:
+    rows: Int[Tensor, " n"] | None = None,
+) -> Parted:
     """Holds out random whole groups, as near to a fraction of some ascending links as possible.
 
     With ``at_most`` it is not more than the fraction, if one group is not. The groups are those of all links of the
-    data; there must be two or more. An error calls the fraction ``name``.
+    data; there must be two or more. Links count by their ``votes``. Without a fraction it is 0.1, but the nine links
+    that intervals of 90 % need where these are no more than 0.3. An error calls the fraction ``name``.
     """
-    if not fraction:
-        return links, links[:0]
-    present, sizes = torch.unique(groups[links], return_counts=True)
-    if len(present) < 2:
+    if fraction == 0:
+        return Parted(links, links[:0], 0.0)
+    usual = 0.1 if fraction is None else fraction
+    order = drawn(groups, links, generator, rows)
+    if len(order) < 2:
         without = ", or set split.validation=0" if name == "validation" else ""
         raise ValueError(
-            f"split.{name}={fraction:g} holds out whole rows, runs or cubes, so there must be two of them or more, got "
-            f"{len(present)} with {len(links)} links; choose smaller runs or cubes, add measurements{without}"
+            f"split.{name}={usual:g} holds out whole places, runs or cubes, so there must be two of them or more, got "
+            f"{len(order)} with {len(links)} links; choose smaller runs or cubes, add measurements{without}"
         )
-    order = torch.randperm(len(present), generator=generator)
-    surplus = sizes[order].cumsum(0)[:-1] - fraction * len(links)
+    _, numbers = torch.cat((order, groups[links])).unique(return_inverse=True)
+    sizes = votes.new_zeros(len(order)).index_add(0, numbers[len(order) :], votes[links])
+    # Single precision: sums of thirds are whole numbers but for rounding.
+    filled = sizes[numbers[: len(order)]].cumsum(0).float()
+    total, filled = filled[-1].item(), filled[:-1]
+    surplus = filled - usual * total
     count = max(1, int((surplus <= 0).sum())) if at_most else int(surplus.abs().argmin()) + 1
-    chosen = present[order[:count]]
-    held = torch.isin(groups[links], chosen)
-    return links[~held], links[held]
+    if fraction is None and filled[count - 1] < 9:
+        enough = int((filled < 9).sum())
+        if enough < len(filled) and filled[enough] <= 0.3 * total:
+            count, usual = enough + 1, round(filled[enough].item() / total, 2)
+    held = torch.isin(groups[links], order[:count])
+    return Parted(links[~held], links[held], usual)
 
 
 def generator_of(seed: int) -> torch.Generator:
@@ -92,7 +146,12 @@ def runs_of(links: Links, length: int) -> Int[Tensor, " n"]:
     return rows // min(length, int(rows.max()) + 1)  # the length may exceed int64
 
 
-def check(name: str, value: float, holds: bool, bounds: str) -> None:
+def check_validation(validation: float | None) -> None:
+    """Raises a ``ValueError`` unless the fraction of validation links is None or in [0, 1)."""
+    check("validation", validation, validation is None or 0 <= validation < 1, "in [0, 1)")
+
+
+def check(name: str, value: float | None, holds: bool, bounds: str) -> None:
     """Raises a ``ValueError`` for an option out of its bounds."""
     if not holds:
         raise ValueError(f"split.{name} must be {bounds}, got {value}")

@@ -8,7 +8,7 @@ from gaigs.split import check, part
 
 
 @register("split", "blocks")
-def blocks(links: Links, edge: float, test: float = 0.2, validation: float = 0.1, seed: int = 0) -> Split:
+def blocks(links: Links, edge: float, test: float = 0.2, validation: float | None = None, seed: int = 0) -> Split:
     """Random cubes test: places where nothing was measured.
 
     Args:

@@ -2,17 +2,18 @@
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
-from gaigs.split import check, generator_of, hold_out, rows_of, runs_of
+from gaigs.split import check, check_validation, generator_of, hold_out, places_of, rows_of, runs_of
 
 
 @register("split", "official")
-def official(links: Links, length: int = 1, validation: float = 0.1, seed: int = 0) -> Split:
+def official(links: Links, length: int = 1, validation: float | None = None, seed: int = 0) -> Split:
     """The data's own training and test links; validation links are drawn from the training links.
 
     Args:
         length: Rows in a run that validates; more than 1 if the test is a separate run. Runs are shorter where fewer
             than four would validate.
-        validation: Fraction of the training links to validate on, with runs the most; 0 for none.
+        validation: Fraction of the training links to validate on, with runs the most; 0 for none. None: 0.1, and of
+            few links more, see ``gaigs.split.hold_out``.
 
     Raises:
         ValueError: The data have no such parts, or an option is out of range.
@@ -20,13 +21,18 @@ def official(links: Links, length: int = 1, validation: float = 0.1, seed: int =
     if links.official is None:
         raise ValueError("this data has no official split; choose split=random, sparse, runs or blocks")
     check("length", length, length >= 1, "a whole number of rows, at least 1")
-    check("validation", validation, 0 <= validation < 1, "in [0, 1)")
+    check_validation(validation)
     generator = generator_of(seed)
     train, test = (part.sort().values for part in links.official())
-    length = min(length, max(1, int(validation * len(rows_of(links)[train].unique()) / 4)))
-    runs = runs_of(links, length)
-    train, validating = hold_out("validation", train, runs, validation, generator, at_most=length > 1)
+    rows, usual = rows_of(links), 0.1 if validation is None else validation
+    length = min(length, max(1, int(usual * len(rows[train].unique()) / 4)))
+    has_runs = length > 1
+    groups = runs_of(links, length) if has_runs else places_of(links)
+    drawn_by = {"at_most": True} if has_runs else {"rows": rows}
+    train, validating, share = hold_out(
+        "validation", train, groups, links.query.votes, validation, generator, **drawn_by
+    )
     words = ["official"]
-    if validation:
-        words += [f"validation {validation:g}{f' in runs of {length}' if length > 1 else ''}", f"seed {seed}"]
-    return Split(", ".join(words), train, validating, test, runs)
+    if share:
+        words += [f"validation {share:g}{f' in runs of {length}' if has_runs else ''}", f"seed {seed}"]
+    return Split(", ".join(words), train, validating, test, groups)

@@ -1,14 +1,14 @@
-"""Single rows are held out."""
+"""Single places are held out."""
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
-from gaigs.split import part, rows_of
+from gaigs.split import part, places_of, rows_of
 
 
 @register("split", "random")
-def random(links: Links, test: float = 0.2, validation: float = 0.1, seed: int = 0) -> Split:
-    """Random rows test: interpolation, since a neighbour on a dense trajectory is always near.
+def random(links: Links, test: float = 0.2, validation: float | None = None, seed: int = 0) -> Split:
+    """Random places test: interpolation, since a neighbour on a dense trajectory is always near.
 
     Options and errors are those of ``gaigs.split.part``.
     """
-    return part("random", links, rows_of(links), test, validation, seed)
+    return part("random", links, places_of(links), test, validation, seed, rows=rows_of(links))

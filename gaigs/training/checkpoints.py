@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import Checkpoint
 
 from gaigs import checkpoint
 from gaigs.io.files import atomic_write
-from gaigs.processes import STOPPING
+from gaigs.processes import STOPPING, hang_up
 from gaigs.training import MeanScores
 
 
@@ -81,7 +81,7 @@ class KeepBest(Checkpoint):
 
 
 class KeepLast(Checkpoint):
-    """Writes the checkpoint to go on from: at intervals [s], at Ctrl-C or SIGTERM, and at the end.
+    """Writes the checkpoint to go on from: at intervals [s], at a signal that stops a run, and at the end.
 
     It writes between two steps, after a due validation and the other callbacks, so that a training goes on as if it had
     never stopped. At the first signal the training stops there, at the second at once. Several processes follow the
@@ -107,6 +107,7 @@ class KeepLast(Checkpoint):
         if self.received is not None:
             raise Interrupted("stopped within a step", number)
         self.received = number
+        hang_up(number)
 
     def on_train_start(self, trainer, module) -> None:
         self.saved = time.monotonic()
@@ -142,7 +143,7 @@ class KeepLast(Checkpoint):
 
 
 class Interrupted(Exception):
-    """Ctrl-C or SIGTERM; at a KeyboardInterrupt Lightning would end the process."""
+    """A signal that stops a run; at a KeyboardInterrupt Lightning would end the process."""
 
     def __init__(self, message: str, number: int):
         super().__init__(message)

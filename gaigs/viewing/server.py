@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -13,7 +14,10 @@ log = logging.getLogger(__name__)
 
 
 def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServer:
-    """A server of the page at ``/`` and of answers at ``/answer``, ``/slice`` and ``/comparison``; not started."""
+    """A server of the page at ``/`` and of answers at ``/answer``, ``/slice`` and ``/comparison``; not started.
+
+    It answers to names of this machine alone: a page of a foreign name that is made to lead here reads nothing.
+    """
 
     def respond(path: str, asked: dict[str, Any]) -> str:
         own = contents[int(asked["run"])]
@@ -33,7 +37,10 @@ def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServe
         def do_GET(self) -> None:
             url = urlsplit(self.path)
             kind, status = "application/json", HTTPStatus.OK
-            if url.path == "/":
+            if not re.fullmatch(r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", self.headers.get("Host", "").lower()):
+                kind, status = "text/plain; charset=utf-8", HTTPStatus.FORBIDDEN
+                text = "this server answers to the names localhost and 127.0.0.1 alone\n"
+            elif url.path == "/":
                 kind, text = "text/html; charset=utf-8", page
             else:
                 try:

@@ -53,6 +53,18 @@ def test_rows_table_and_unavailable_rows(tmp_path):
     )
 
 
+def test_names_that_a_spreadsheet_takes_for_formulas_are_read_as_they_were(tmp_path):
+    class Named(Squares):
+        def cells(self, context):
+            return [[{"kind": "=1+1", "side": "2"}]]
+
+    Named([]).run(tmp_path)
+    assert "a cpu,'=1+1,2,4,measured" in (tmp_path / "squares.csv").read_text()
+    again = Named([])
+    again.run(tmp_path)
+    assert not again.measured
+
+
 def test_a_stopped_benchmark_goes_on(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         Squares([1, 2, 3], fails_at=3).run(tmp_path)

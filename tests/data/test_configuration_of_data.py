@@ -36,4 +36,4 @@ def test_a_data_set_brings_its_options_task_and_split(configured, name):
 def test_a_split_on_the_command_line_precedes_the_datas_own(configured):
     config = configured("data=nerf2_rssi", "split=blocks", "split.edge=0.5")
     assert config.task.name == "rssi"
-    assert config.split == {"name": "blocks", "edge": 0.5, "test": 0.2, "validation": 0.1, "seed": 0}
+    assert config.split == {"name": "blocks", "edge": 0.5, "test": 0.2, "validation": None, "seed": 0}

@@ -99,6 +99,15 @@ def test_the_command_writes_each_label_in_its_layout(request, tmp_path, monkeypa
     np.testing.assert_allclose(*places, atol=1e-5)
 
 
+def test_random_phases_follow_from_the_seed_on_any_machine():
+    known, *others = (
+        load({"name": "synthetic_csi", "transmitters": 4, "order": 0, "phase": phase, "seed": seed}, OFFICIAL).labels
+        for phase, seed in (("known", 0), ("per_link", 0), ("per_link", -1))
+    )
+    assert (others[0] / known)[:3, 0, 0].angle().tolist() == pytest.approx([1.0502, 0.4209, -1.8601], abs=1e-4)
+    assert not torch.equal(*others), "any seed that torch takes"
+
+
 def test_the_command_writes_several_carriers(tmp_path, monkeypatch, capsys):
     command(monkeypatch, tmp_path / "room", "synthetic", "frequency=[5e9,3.1e9]", "transmitters=3", "order=0")
     assert "4 training and 2 test labels" in capsys.readouterr().out

@@ -142,6 +142,13 @@ def test_places_are_heard_by_each_receiver(rssi, tmp_path):
         assert float(table[5][name]) == pytest.approx(value.item(), rel=1e-5)
 
 
+def test_a_receivers_name_is_no_formula(on_map, tmp_path):
+    first, *others = on_map.scene.receivers
+    on_map.scene = replace(on_map.scene, receivers=(replace(first, name="=HYPERLINK(A1)"), *others))
+    gaigs.export(on_map, tmp_path / "places.csv", [[1.25, 2.0, 1.5]])
+    assert rows(tmp_path / "places.csv")[0]["receiver"] == "'=HYPERLINK(A1)"
+
+
 def test_places_on_a_map_have_easting_and_northing(on_map, tmp_path):
     gaigs.export(on_map, tmp_path / "places.csv", [[1.25, 2.0, 1.5]])
     assert [rows(tmp_path / "places.csv")[0][name] for name in ("x", "easting", "northing")] == [

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 import struct
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -87,6 +88,19 @@ def test_a_carrier_outside_the_tables_has_numbers(tmp_path):
     )
 
 
+def test_a_scene_that_is_read_while_another_replaces_it_keeps_its_meshes(tmp_path):
+    material = [itu_bsdf(Material("concrete", 0.2), 6e9)]
+    wall = replace(WALL, name="plane_0")
+    other = replace(wall, vertices=tuple((x, y + 1, z) for x, y, z in wall.vertices))
+    _, mesh = write_scene(tmp_path / "room.xml", [wall], material)
+    file, another = write_scene(tmp_path / "room.xml", [other], material)
+    assert positions(read_ply(mesh)[0])[:, 1].tolist() == [4.0] * 4
+    assert f"room_meshes/{another.name}" in file.read_text()
+    os.utime(mesh, (0, 0))
+    write_scene(tmp_path / "room.xml", [other], material)
+    assert [*mesh.parent.iterdir()] == [another], "meshes of older scenes are removed"
+
+
 @pytest.mark.parametrize("frequency", [0.92e9, 6e9])
 def test_the_ray_tracer_reflects_at_the_material(frequency, tracer, tmp_path):
     file, _ = write_scene(tmp_path / "room.xml", [WALL], [itu_bsdf(Material("concrete", 1.0), frequency)])
@@ -148,5 +162,5 @@ def test_materials_need_a_carrier(tmp_path):
     with pytest.raises(ValueError, match="materials depend on the carrier"):
         gaigs.export(rssi, tmp_path / "room.xml")
     assert len(gaigs.export(rssi, tmp_path / "room.xml", frequency=2.4e9)) > 1
-    with pytest.raises(FileNotFoundError, match="could not be written"):
+    with pytest.raises(FileNotFoundError, match="missing/room_meshes"):
         gaigs.export(rssi, tmp_path / "missing/room.xml", frequency=2.4e9)

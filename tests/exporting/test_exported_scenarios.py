@@ -8,6 +8,7 @@ from scipy.constants import speed_of_light
 
 import gaigs
 from gaigs.data import deepmimo
+from gaigs.processes import only_run
 
 
 def test_a_scenario_gives_the_channels_of_the_model(tmp_path):
@@ -28,6 +29,9 @@ def test_a_scenario_gives_the_channels_of_the_model(tmp_path):
         model.pooling.strength.fill_(1.3)
     kriging = gaigs.registries["model"].build({"name": "kriging", "trend": model}, scene=scene)
     users = links.query.transmitters
+    (tmp_path / "room.deepmimo").mkdir()
+    with pytest.raises(ValueError, match="another run is at work"), only_run(tmp_path / "room.deepmimo"):
+        gaigs.export(kriging, tmp_path / "room.deepmimo", users)
     (folder,) = gaigs.export(kriging, tmp_path / "room.deepmimo", torch.cat((users, users[:2])))
     found = deepmimo.read(folder, elements=[1, 1], bandwidth=20e6, subcarriers=5)
     assert len(found) == 24

@@ -25,6 +25,18 @@ def test_a_file_replaces_the_old_one_when_complete(tmp_path):
     assert [*tmp_path.iterdir()] == [path]
 
 
+def test_two_writers_of_a_file_never_meet(tmp_path):
+    path = tmp_path / "scores.npz"
+    with atomic_write(path) as one:
+        one.write_text("one")
+        with atomic_write(path) as two:
+            two.write_text("another")
+        assert path.read_text() == "another"
+        assert one.read_text() == "one"
+    assert path.read_text() == "one"
+    assert [*tmp_path.iterdir()] == [path]
+
+
 @pytest.mark.parametrize("error", [FULL, ValueError("no"), KeyboardInterrupt()], ids=["disk", "value", "ctrl-c"])
 @pytest.mark.parametrize("begun", [True, False])
 def test_where_writing_fails_all_is_as_before(error, begun, tmp_path):

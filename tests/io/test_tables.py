@@ -1,5 +1,6 @@
 """Text files of numbers: files that cannot be read, defects with their lines, and numbers in plain decimals only."""
 
+import csv
 import os
 
 import pytest
@@ -8,10 +9,13 @@ from gaigs.io.tables import (
     check_empty,
     find_file,
     find_folder,
+    inert,
+    original,
     read_lines,
     read_parts,
     read_points,
     to_index,
+    write_csv,
 )
 
 
@@ -83,6 +87,18 @@ def test_a_folder_to_write_is_empty_or_missing(tmp_path):
     for place in (tmp_path, file):
         with pytest.raises(FileExistsError, match="must be an empty folder or missing"):
             check_empty(place)
+
+
+def test_no_text_of_a_written_table_is_a_formula_and_numbers_stay(tmp_path):
+    texts = ['=HYPERLINK("http://example.com")', "+1-2", "-a", "@sum", "\tx", "'=1+1", "''-x"]
+    plain = ["hall", "", "'hall", "a=b", "-70.5", "+3e-2", "-inf"]
+    write_csv(tmp_path / "names.csv", [["name", *texts], [-1.5, *plain]])
+    with open(tmp_path / "names.csv", newline="") as file:
+        (_, *written), (number, *others) = csv.reader(file)
+    assert written == [f"'{text}" for text in texts]
+    assert (number, others) == ("-1.5", plain)
+    assert [original(text) for text in written + others] == texts + plain
+    assert inert("\rx") == "'\rx"
 
 
 @pytest.mark.parametrize(

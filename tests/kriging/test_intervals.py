@@ -190,6 +190,27 @@ def test_readings_of_one_place_count_as_one_where_they_err_together():
     assert error(torch.ones(1600)) == pytest.approx(0.3 / 20)  # no scatter is no certainty
 
 
+def test_each_place_calibrates_once_however_often_it_is_read():
+    """A robot's run of 60 places, with half of the readings at one of them, and shadowing of each place."""
+    held = []
+    for seed in range(12):
+        generator = torch.Generator().manual_seed(seed)
+        places = 10 * torch.rand(260, 3, generator=generator)
+        shadows = 6 * torch.randn(260, generator=generator) - 60
+        readings = torch.ones(60, dtype=torch.long).index_fill(0, torch.randint(60, (1,), generator=generator), 60)
+        place = torch.arange(60).repeat_interleave(readings)
+        levels = shadows[place] + torch.randn(len(place), generator=generator)
+        links = gaigs.links(
+            task="rssi", transmitters=places[place], receivers=[0, 0, 3], labels=levels, split="random", seed=seed
+        )
+        model = gaigs.train("mean", links)
+        assert model.calibration.counts.sum() == len(links.query[links.split.known].place_keys.unique())
+        found = model.predict(places[60:], interval=0.9)
+        held.append(((found.lower <= shadows[60:]) & (shadows[60:] <= found.upper)).double().mean().item())
+    assert min(held) > 0.75
+    assert np.mean(held) > 0.87
+
+
 def test_the_places_of_test_links_are_theirs():
     links = gaigs.links("synthetic_rssi", transmitters=100, order=0)
     assert len(links.receivers) > 1

@@ -1,3 +1,6 @@
+import os
+import signal
+
 import pytest
 import torch
 
@@ -54,3 +57,27 @@ def test_shapes_that_do_not_fit_are_an_error_and_no_reason_to_take_torch():
     assert FastestRasterizer().opencl.takes(splats, signal, opacities[:, 1:], *others)
     with pytest.raises(ValueError, match=r"opacities must be \(3, 12\)"):
         opencl._check(splats, signal, opacities[:, 1:], *others)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no forks")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")
+def test_a_forked_process_renders_by_torch_though_drivers_have_their_threads_elsewhere():
+    """Without a time limit of its own the child would wait for them for ever."""
+    fastest, own = FastestRasterizer(), opencl.OpenCLRasterizer()
+    expected = fastest(*scene())[0]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    torch.rand(10**6).exp()  # starts the threads of torch
+    child = os.fork()
+    if child == 0:
+        signal.alarm(120)
+        try:
+            with pytest.raises(RuntimeError, match="forked from one that has used it\nstart processes by"):
+                own(*scene())
+            torch.rand(10**6).exp()
+            torch.testing.assert_close(fastest(*scene())[0], expected, rtol=0, atol=1e-5)
+            os._exit(int(fastest.used != "torch"))
+        finally:
+            os._exit(2)
+    torch.set_num_threads(threads)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -42,6 +42,15 @@ def test_overrides_are_read_as_they_were_typed(tmp_path):
     assert (tmp_path / "speed_against_error.png").exists()
 
 
+def test_names_of_runs_are_no_formulas_and_no_markup(tmp_path):
+    for name in ("@[bold]one", "@two[/red]"):
+        write_run(tmp_path / name, [], scores(0.9))
+    text = "\n".join(terminal(report(tmp_path)))
+    assert [row["run"] for row in read(tmp_path / "ablation.csv")][:2] == ["'@[bold]one", "'@two[/red]"]
+    assert "@[bold]one" in text
+    assert "@two[/red]" in text
+
+
 def test_unfinished_runs_stay_and_baselines_come_once(tmp_path):
     common = ["+experiment=spectrum", "data=rfid"]
     write_run(tmp_path / "0", [*common, "tokenizer=ga", "seed=1"], scores(0.91), seed=1)

@@ -106,7 +106,7 @@ def test_cubes_stay_whole(seed, edge, far):
     [
         ({"name": "official", "validation": 0.1}, "official, validation 0.1, seed 0"),
         ({"name": "official", "length": 4}, "official, validation 0.1 in runs of 4, seed 0"),
-        ({"name": "sparse", "train": 60}, "sparse 60, test 0.2, validation 0.1, seed 0"),
+        ({"name": "sparse", "train": 60}, "sparse 60, test 0.2, validation 0.15, seed 0"),
         ({"name": "runs", "length": 20, "test": 0.3}, "runs of 20, test 0.3, validation 0.1, seed 0"),
         ({"name": "blocks", "edge": 0.25, "validation": 0}, "blocks 0.25 m, test 0.2, seed 0"),
     ],
@@ -184,6 +184,47 @@ def test_official_runs_are_short_enough_for_four_to_validate(rows, length, expec
     assert len(result.validation) % expected == 0
     assert len((result.validation // expected).unique()) == len(result.validation) / expected >= min(4, 0.1 * rows)
     assert (f"runs of {expected}" in result.name) == (expected > 1)
+
+
+# --- repeated readings ---
+
+
+@pytest.mark.parametrize("has_rows", [True, False])
+@pytest.mark.parametrize("options", [{"name": "random"}, {"name": "sparse", "train": 40}])
+def test_fractions_count_places_not_readings(options, has_rows):
+    """A robot stands at one of 60 places for half of its readings."""
+    readings = torch.ones(60, dtype=torch.long).index_fill(0, torch.tensor(17), 60)
+    place = torch.arange(60).repeat_interleave(readings)
+    links = links_at(torch.rand(60, 3)[place], place if has_rows else None)
+    for seed in range(10):
+        split = part(links, validation=0.1, seed=seed, **options)
+        places = [set(place[some].tolist()) for some in split.parts().values()]
+        train = 43 if options["name"] == "random" else 36
+        assert [len(own) for own in places] == [train, 48 - train if train == 43 else 4, 12]
+        assert len(set.union(*places)) == sum(map(len, places))
+
+
+@each_split
+def test_a_place_that_is_read_again_changes_no_other_draw(links, options):
+    if options["name"] in ("runs", "blocks"):
+        pytest.skip("runs and cubes are drawn as such")
+    again = replace(links, query=replace(links.query, transmitters=links.query.transmitters.clone()))
+    again.query.transmitters[200] = again.query.transmitters[100]
+    for before, after in zip(
+        part(links, **options).parts().values(), part(again, **options).parts().values(), strict=True
+    ):
+        assert len(set(before.tolist()) ^ set(after.tolist())) <= 2
+
+
+@pytest.mark.parametrize(
+    ("count", "validating", "name"), [(20, 2, 0.1), (36, 3, 0.1), (40, 9, 0.28), (100, 9, 0.11), (400, 32, 0.1)]
+)
+def test_few_links_leave_enough_for_intervals(count, validating, name):
+    split = part(links_at(torch.rand(count, 3)), name="random")
+    assert len(split.validation) == validating
+    assert split.name == f"random, test 0.2, validation {name}, seed 0"
+    asked = part(links_at(torch.rand(count, 3)), name="random", validation=0.1)
+    assert len(asked.validation) == round(0.1 * round(0.8 * count))
 
 
 # --- configuration ---

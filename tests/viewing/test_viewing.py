@@ -9,7 +9,7 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.error import HTTPError
-from urllib.request import urlopen
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -146,6 +146,18 @@ def test_the_server_answers_and_says_what_is_wrong(levels):
             urlopen(f"{url}answer?run=0&place=nan,1,1&receiver=0")
         assert error.value.code == 400
         assert "must be finite" in json.load(error.value)["error"]
+
+
+def test_the_server_answers_to_names_of_this_machine_alone(levels):
+    """A page of another name, which its owner makes lead to this machine, must read nothing."""
+    with serving(View([Contents(levels)])) as url:
+        for host in ("localhost", "LOCALHOST:80", "127.0.0.1:8080", "[::1]:8080"):
+            assert urlopen(Request(url, headers={"Host": host})).status == 200
+        for host in ("evil.example", "localhost.evil.example:8080", "127.0.0.1.evil.example", "[", ""):
+            with pytest.raises(HTTPError) as error:
+                urlopen(Request(f"{url}answer?run=0&place=1,1,1&receiver=0", headers={"Host": host}))
+            assert error.value.code == 403
+            assert error.value.read() == b"this server answers to the names localhost and 127.0.0.1 alone\n"
 
 
 def test_a_port_in_use_is_named(levels):

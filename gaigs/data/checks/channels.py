@@ -1,37 +1,81 @@
-"""Checks of complex channels: phases that do not follow the geometry."""
+"""Checks of complex channels: conventions under which geometry explains them, and phases that it does not."""
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
+from gaigs.data.checks.conventions import conventions
 from gaigs.data.checks.finding import Finding
+from gaigs.data.checks.hypotheses import Sample, sample_at
+from gaigs.data.checks.subcarriers import check_constant_subcarriers, order_of_subcarriers
+from gaigs.data.checks.waves import aligned_likeness, coherence, has_extent, level_share, likeness, without_geometry
 from gaigs.phases import MANY, phase_sign, strange_parts, unknown_phase
+from gaigs.query import evenly
 from gaigs.scene import Scene, direct_waves
+
+
+class Measure(NamedTuple):
+    """A measure of how well geometry explains channels.
+
+    Attributes:
+        measure: Share from 0 to 1 of a sample.
+        least: Smallest share that tells a convention.
+        enough: Share above which the data need no other convention.
+        sentence: What the share means, with a place for it.
+        meaning: The same in short.
+    """
+
+    measure: Callable[[Sample], float]
+    least: float
+    enough: float
+    sentence: str
+    meaning: str
 
 
 def check_channels(links: Any) -> Iterator[Finding]:
     """Findings about complex channels."""
-    yield from check_phases(links)
+    yield from check_constant_subcarriers(links)
+    known = torch.arange(len(links)) if links.split is None else links.split.train
+    every = links.query.receivers[known]
+    parts = [evenly(known[every == receiver], 64) for receiver in range(len(links.receivers))]
+    train = torch.cat(parts)
+    sample = sample_at(links, train)
+    order = order_of_subcarriers(sample)
+    yield from [order] if order is not None else check_phases(links, train, sample)
 
 
-def check_phases(links: Any) -> Iterator[Finding]:
+def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterator[Finding]:
     """Findings if phases of channels do not follow the geometry, or disagree with those that are declared."""
     task = links.task
-    if task.phase == "per_link_and_delay":
-        return
-    train = torch.arange(len(links)) if links.split is None else links.split.train
-    every = links.query.receivers[train]
-    own = (train[every == receiver] for receiver in range(len(links.receivers)))
-    train = torch.cat([part[:: max(1, len(part) // 64)] for part in own])
-    receivers, labels = links.query.receivers[train], links.labels[train].to(torch.complex128)
+    few = sample.some(192)
+    is_known, has_gain = task.phase == "known", task.phase != "per_link_and_delay"
+    receivers, labels = sample.receivers, sample.labels
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     waves = direct_waves(everywhere, links.query[train], task.frequencies)
-    is_known, strange = task.phase == "known", {}
     sign = phase_sign(labels, waves, receivers) if is_known else 0
-    if sign:
-        strange = strange_parts(labels, waves, receivers, task.frequencies, sign)
+    coherent = Measure(coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links")
+    each = likeness if has_gain else aligned_likeness
+    within = Measure(each, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link")
+    level = Measure(level_share, 0.4, 0.5, "distance explains {} of the levels' variance", "of the variance of levels")
+    for score in (coherent,) * is_known + (within,) * (not sign):
+        found = best_convention(few, score)
+        if found is not None:
+            yield found
+            return
+    if not has_gain:
+        return
+    strange = strange_parts(labels, waves, receivers, task.frequencies, sign) if sign else {}
+    if strange:  # unless another convention explains as much with a calibrated array
+        found = best_convention(few, coherent._replace(measure=partial(coherence, is_calibrated=True)))
+        if found is not None and found.fits > 0.7 * coherence(few):
+            yield found
+            return
     is_fixed = any(elements or delay is not None for elements, _, delay in strange.values())
+    is_enough = len(train) >= MANY * len(receivers.unique())
     if not is_fixed and (phase := unknown_phase(labels, waves, receivers, task.frequencies, task.phase)):
         common = "phase" if is_known else "delay"
         yield Finding(
@@ -40,7 +84,9 @@ def check_phases(links: Any) -> Iterator[Finding]:
             f"set data.phase={phase}, or check units, axes and order of tx, rx and elements",
         )
         strange = {}
-    elif is_known and not sign and len(train) >= MANY * len(receivers.unique()):
+    elif not sign and (found := best_convention(few, level)):
+        yield found
+    elif is_known and not sign and is_enough:
         yield Finding(
             "phases without geometry",
             "phases of the channels do not follow the direct distance",
@@ -62,3 +108,35 @@ def check_phases(links: Any) -> Iterator[Finding]:
             yield Finding(
                 "phases of subcarriers", f"the subcarriers of {links.receivers[receiver].name} {unexplained}", late
             )
+
+
+def best_convention(sample: Sample, score: Measure) -> Finding | None:
+    """A finding about the conventions by which geometry explains the channels best, if it is clearly better so.
+
+    Conventions that explain them equally well are named together.
+    """
+    read = score.measure(sample)
+    if read > score.enough or len(sample.labels) < MANY:
+        return None
+    few, tried = sample.some(64), []
+    for one in conventions(few, score.measure):
+        changed = one.change(few)
+        share = score.measure(changed)
+        # Channels that are alike at all links fit any convention under which distances hardly differ.
+        is_telling = share > max(read, score.least / 2) and has_extent(changed)
+        if is_telling and share > 1.1 * score.measure(without_geometry(changed)) + 0.02:
+            tried.append((share, one))
+    likely = sorted((share for share, _ in tried), reverse=True)[:8]
+    if not likely:
+        return None
+    fitting = [(score.measure(one.change(sample)), one) for share, one in tried if share >= likely[-1]]
+    fits = max(share for share, _ in fitting)
+    is_better = fits > 1.5 * read + 0.05 or 1 - fits < (1 - read) / 2
+    if fits < score.least or not is_better:
+        return None
+    best = [one for share, one in fitting if share > 0.98 * fits]
+    names = list(dict.fromkeys(one.name for one in best))[:3]
+    mends = list(dict.fromkeys(one.mend for one in best))[:3]
+    text = score.sentence.format(f"{fits:.0%}")
+    text += f" in place of {max(read, 0):.0%} if {' or '.join(names)}"
+    return Finding(names[0], text, " or ".join(mends), read=read, fits=fits, score=f"share {score.meaning}")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gaigs.data.checks.distance import decades, fit_law
 from gaigs.data.checks.finding import Finding
-from gaigs.data.checks.hypotheses import Hypothesis, Sample, best_fit, sample_of
+from gaigs.data.checks.hypotheses import Sample, sample_of
 from gaigs.data.checks.receivers import check_power, check_receivers, sample_of_given
 from gaigs.data.readings import marks_of
 from gaigs.io.tables import shortened
@@ -45,9 +45,7 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
     if high > 100 * max(low, 1e-300) or levels.max() < 0.1:
         yield _linear_unit(known, text, math.log10(np.median(levels)))
         return
-    without_sign = Hypothesis("sign", _negated, "levels = -levels")
-    fit = best_fit(known[0], [without_sign], explained) if known else None
-    if fit is None or fit.fits >= fit.read:
+    if known is None or explained(replace(known[0], labels=-known[0].labels)) >= explained(known[0]):
         yield Finding("sign of levels", text, "was a sign lost, or are they path losses? levels = -levels")
         return
     mend = "percent, scaled, dB over the noise, or dBuV? levels = levels - 107 of dBuV at 50 ohm"
@@ -188,10 +186,6 @@ def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
         if len(own) >= 10:
             scales[number] = 1.4826 * own.abs().median()
     return scales
-
-
-def _negated(sample: Sample) -> Sample:
-    return replace(sample, labels=-sample.labels)
 
 
 def _decibels(sample: Sample) -> Sample:

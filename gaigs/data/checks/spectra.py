@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from gaigs.data.checks.conventions import of_axes, of_orientations, of_units
 from gaigs.data.checks.finding import Finding
-from gaigs.data.checks.hypotheses import Hypothesis, Sample, axis_changes, sample_of, unit_changes
+from gaigs.data.checks.hypotheses import Hypothesis, Sample, sample_of
 from gaigs.geometry import Grid, from_spherical, to_spherical
 from gaigs.task.spectrum import SSIM_WINDOW
 
@@ -99,9 +99,9 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
     sample = replace(sample, labels=directions.rareness)
     read = directions.scores(sample)
     groups = [
-        axis_changes(),
-        unit_changes(),
-        orientation_changes(sample),
+        [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])],
+        [*of_units([("tx",), ("rx",)])],  # in any unit of both, directions are the same
+        [*of_orientations(sample)],
         [Hypothesis("rows are upside down", _upside_down, "spectra = spectra[:, ::-1]")],
         column_changes(directions.grid),
     ]
@@ -182,13 +182,7 @@ def _best(
     read: Float[Tensor, " n"],
 ) -> tuple[Convention, Float[Tensor, " n"]]:
     """The candidate that is best at every ``step``-th link, and its excess over ``read`` at all links."""
-    some = replace(
-        sample,
-        index=sample.index[::step],
-        transmitters=sample.transmitters[::step],
-        receivers=sample.receivers[::step],
-        labels=sample.labels[::step],
-    )
+    some = sample.at(torch.arange(0, len(read), step))
     means = [directions.scores(_changed(some, changes)).mean().item() for changes in candidates]
     changes = candidates[max(range(len(means)), key=means.__getitem__)]
     scores = directions.scores(_changed(sample, changes))
@@ -229,31 +223,6 @@ def column_changes(grid: Grid) -> list[Hypothesis]:
     return changes
 
 
-def orientation_changes(sample: Sample) -> list[Hypothesis]:
-    """Other readings of the receivers' quaternions."""
-    quaternions = Rotation.from_matrix(sample.rotations.numpy()).as_quat()  # (r, 4), x, y, z, w
-    # A file with w, x, y, z that was read as x, y, z, w has w where x was read.
-    exchanged = quaternions[:, [1, 2, 3, 0]]
-    conjugate = [-1, -1, -1, 1]
-    readings = {
-        "quaternions are in the order w, x, y, z": (exchanged, "write them as x, y, z, w"),
-        "orientations turn the world into the array": (
-            quaternions * conjugate,
-            "negate x, y, z of the quaternions",
-        ),
-        "quaternions are in the order w, x, y, z and turn the world into the array": (
-            exchanged * conjugate,
-            "write them as -x, -y, -z, w",
-        ),
-    }
-    changes = []
-    for name, (values, mend) in readings.items():
-        rotations = torch.from_numpy(Rotation.from_quat(values).as_matrix())
-        change = lambda own, rotations=rotations: replace(own, rotations=rotations)
-        changes.append(Hypothesis(name, change, mend))
-    return changes
-
-
 def order_changes(links: Any, sample: Sample) -> list[Hypothesis]:
     """Other orders of transmitters and receivers."""
     total = len(links)
@@ -284,7 +253,7 @@ def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
     margin = 0.15 * (1 - lower)  # places seldom reach the walls of the room that was scaled
     if low < lower or low > lower + margin or not 1 - margin <= high <= 1:
         return []
-    name = f"transmitters are scaled to {lower:g}..1 along each axis"
+    name = f"tx are scaled to {lower:g}..1 along each axis"
     mend = "undo it, such as tx = centre + half_extent * tx" if lower else "undo it, such as tx = low + extent * tx"
     return [Hypothesis(name, change, mend) for change in _unscaled(sample, grid)]
 

@@ -101,8 +101,10 @@ def trace_paths(placement: Mirrored, query: Query) -> TracedPaths:
     return TracedPaths(*(part.cpu().numpy() for part in parts))
 
 
-def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
+def facts(placement: Mirrored, query: Query) -> dict[str, list]:
     """Tables of planes, strongest first, and of paths by their number of bounces, for ``metrics.json``.
+
+    ``unseen`` has a sentence for each axis that places do not span, see ``Scene.flat_axes``.
 
     Shares are those of the kept paths in the received power, means over the links of the query.
     """
@@ -120,13 +122,27 @@ def facts(placement: Mirrored, query: Query) -> dict[str, list[dict]]:
         }
         for number, share in shares.items()
     ]
+    for plane in planes:
+        other = other_offset(placement.scene, all_planes, plane["number"])
+        if other is not None:
+            plane["other_offset_m"] = round(other, 4)
     counts = (found.sequences >= 0).sum(1)
     means = found.shares.mean(0)
     paths = []
     for bounces in range(found.sequences.shape[1] + 1):
         own = counts == bounces
         paths.append({"bounces": bounces, "kept": int(own.sum()), "share": round(means[own].sum().item(), 5)})
-    return {"planes": planes, "paths": paths}
+    unseen = [str(flat) for flat in placement.scene.flat_axes]
+    return {"planes": planes, "paths": paths} | ({"unseen": unseen} if unseen else {})
+
+
+def other_offset(scene: Scene, planes: Planes, number: int) -> float | None:
+    """Offset at which a plane would reflect paths of the same lengths [m]; None without one, see ``FlatAxis``."""
+    normal = planes.normals[number]
+    for flat in scene.flat_axes:
+        if abs(normal[flat.axis]) > 0.99:
+            return float(normal[flat.axis] * (flat.transmitters + flat.receivers) - planes.offsets[number])
+    return None
 
 
 @torch.no_grad()
@@ -295,13 +311,16 @@ def wavefront_obj(placement: Mirrored, found: TracedPaths, sheets: Sequence[Shee
     lines = [
         "# Planes learnt by gaigs; coordinates in metres, z up, the world frame of the data.",
         "# loss: of a reflection at normal incidence; share: of the plane's paths in the received power.",
+        *(f"# {flat}" for flat in placement.scene.flat_axes),
     ]
     count = 0
     for plane in outlines(placement, found):
         k = plane.number
         normal = " ".join(f"{part:.4f}" for part in plane.normal)
+        other = other_offset(placement.scene, planes, k)
+        words = "" if other is None else f" or {other:.3f} m"
         lines += [
-            f"# normal {normal}, offset {planes.offsets[k]:.3f} m, loss {planes.losses[k]:.1f} dB",
+            f"# normal {normal}, offset {planes.offsets[k]:.3f} m{words}, loss {planes.losses[k]:.1f} dB",
             f"# share {100 * plane.share:.2f} %",
             f"o plane_{k}",
             *("v " + " ".join(f"{part:.4f}" for part in corner) for corner in plane.corners),

@@ -35,7 +35,7 @@ from gaigs.scene import Scene, carriers
 log = logging.getLogger(__name__)
 
 BOX = 6
-"""Planes at the start: one beyond each face of the box that holds transmitters and receivers."""
+"""Planes at the start: one beyond each face of the box that holds transmitters and receivers, if it has this side."""
 
 MARGIN = 0.04
 """Distance of these planes from the box [diagonals]."""
@@ -165,7 +165,10 @@ class Mirrored(Placement):
         self.register_buffer("step", torch.ones(()))
         sequences = all_sequences(planes, order)
         self.register_buffer("sequences", sequences, persistent=False)
-        self.register_buffer("kept", (sequences < BOX).all(1))
+        # Nothing says how far faces are beyond places that all stand at one height, or on one line.
+        unseen = torch.tensor([flat.axis for flat in scene.flat_axes if flat.is_common], dtype=torch.long)
+        blind = torch.isin(torch.arange(BOX) % 3, unseen).nonzero()[:, 0]
+        self.register_buffer("kept", (sequences < BOX).all(1) & ~torch.isin(sequences, blind).any(1))
         self.register_buffer("most", self.kept.sum())
         self.register_buffer("coherent", torch.tensor(False))
         self.register_buffer("is_bare", torch.tensor(False), persistent=is_complex)

@@ -1,0 +1,199 @@
+"""Conventions of places, arrays and channels, with what mends data that were written under them."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+
+import torch
+from jaxtyping import Complex, Float
+from scipy.constants import speed_of_light
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from gaigs.data.checks.hypotheses import Hypothesis, Sample
+from gaigs.data.checks.waves import direct_distances
+from gaigs.geometry import from_spherical, to_spherical
+
+Move = Callable[[Tensor], Tensor]
+
+
+def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
+    """All other conventions of a sample; of equal ones the first is the likeliest fault.
+
+    The order of receivers is the best one by a measure of the geometry, such as ``coherence``.
+    """
+    ends: list[tuple[str, ...]] = [("tx",), ("rx",), ("tx", "rx")]
+    yield from of_subcarriers(sample)
+    if any(array.any() for array in sample.elements):
+        ends = [("tx",), ("rx",), ("elements",), ("tx", "rx"), ("tx", "rx", "elements")]
+        yield from of_arrays(sample)
+    yield from of_axes(sample, ends)
+    yield from of_angles()
+    yield from of_units(ends)
+    yield from of_receivers(sample, measure)
+
+
+def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
+    """Orders and units of subcarriers, and phases that lack a part."""
+    if len(sample.frequencies) > 1:
+        name = "subcarriers are in reversed order, or path coefficients are conjugate"
+        mend = "h = h[..., ::-1], or of conjugate coefficients h = h.conj()[..., ::-1]"
+        yield _changing(name, ["labels"], lambda labels: labels.flip(2), mend)
+    for unit, factor in {"kHz": 1e3, "MHz": 1e6}.items():
+        mend = f"frequencies = {factor:g} * frequencies"
+        yield _changing(f"frequencies are in {unit}", ["frequencies"], partial(torch.mul, other=factor), mend)
+    is_constant = sample.labels.sgn().mean(0).abs() > 0.9999  # (e, s), the phase of all links
+    is_relative = is_constant[:, 0].any() and not is_constant[:, -1].any()
+    if is_relative or is_constant.all():
+        return  # phases were taken off, or never stored
+    name = "the carrier's phase over the delay is missing"
+    mend = "multiply each path by np.exp(-2j * np.pi * carrier * tau) before the sum"
+    for at_elements in (False, True)[: sample.labels.shape[1]]:
+        yield Hypothesis(name, partial(_with_carrier, at_elements=at_elements), mend)
+
+
+def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
+    """Orders and units of elements, and orientations."""
+    yield _changing("elements are in reversed order", ["labels"], lambda labels: labels.flip(1), "h = h[:, ::-1]")
+    count = sample.labels.shape[1]
+    for rows in range(2, count // 2 + 1):
+        if count % rows == 0:
+            mend = f"h = h.reshape(len(h), {rows}, {count // rows}, -1).swapaxes(1, 2).reshape(h.shape)"
+            name = "elements are in another order of rows and columns"
+            yield _changing(name, ["labels"], partial(_transposed, rows=rows), mend)
+    wavelength = speed_of_light / sample.frequencies.mean().item()
+    yield _scaled(["elements"], "wavelengths", wavelength)
+    yield _scaled(["elements"], "half wavelengths", wavelength / 2)
+    yield from of_orientations(sample)
+
+
+def of_orientations(sample: Sample) -> Iterator[Hypothesis]:
+    """Other readings of the receivers' rotations; none if all look along the world's axes."""
+    if torch.allclose(sample.rotations, torch.eye(3).to(sample.rotations)):
+        return
+    for name, move, mend in (
+        ("rotations lead from the world to the array", lambda turns: turns.mT, "rotation = rotation.T"),
+        ("elements have the world's axes", lambda turns: turns.mT @ turns, "rotation = np.eye(3)"),
+        ("quaternions have the order w, x, y, z", partial(_rolled, by=-1), "quaternion = np.roll(quaternion, -1)"),
+        ("quaternions have the order x, y, z, w", partial(_rolled, by=1), "quaternion = np.roll(quaternion, 1)"),
+    ):
+        yield _changing(name, ["rotations"], move, mend)
+
+
+def of_axes(sample: Sample, ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
+    """Axes that are exchanged or point the other way."""
+    exchanged = {"x and y": [1, 0, 2], "y and z": [0, 2, 1], "x and z": [2, 1, 0]}
+    points = torch.cat((sample.transmitters, sample.positions))
+    # A wall or floor in a plane of the axes reflects as if that axis were negated.
+    has_wall = (points >= 0).all(0) | (points <= 0).all(0)
+    for own in ends:
+        subject = " and ".join(own)
+        for name, order in exchanged.items():
+            mend = f"[:, {order}]"
+            yield _everywhere(own, f"{subject} have {name} exchanged", mend, torch.eye(3)[:, order])
+        for axis, name in enumerate("xyz"):
+            signs = [1, 1, 1]
+            signs[axis] = -1
+            if own == ("elements",) or not has_wall[axis]:
+                yield _everywhere(own, f"{subject} have {name} negated", f" * {signs}", torch.tensor(signs).diag())
+    for own in ("tx",), ("rx",):
+        for name, order in {"y, z, x": [2, 0, 1], "z, x, y": [1, 2, 0]}.items():
+            yield _everywhere(own, f"{own[0]} have the order {name}", f"[:, {order}]", torch.eye(3)[:, order])
+
+
+def of_angles() -> Iterator[Hypothesis]:
+    """Places computed from angles, about their receiver or the origin."""
+    polar, other = "elevations taken for polar angles, or the reverse", "elevation = np.pi / 2 - elevation"
+    for name, move, mend in (
+        ("azimuths clockwise from north", lambda points: points[:, [1, 0, 2]], "azimuth = np.pi / 2 - azimuth"),
+        (polar, _tilted, other),
+        (polar, lambda points: -_tilted(points), other),  # below the horizon the azimuth is turned by half a circle
+        ("radians taken for degrees", _widened, "angles = np.rad2deg(angles)"),
+    ):
+        yield Hypothesis(f"tx are of {name}", partial(_about_receivers, move=move), mend)
+        yield _changing(f"tx are of {name} about the origin", ["transmitters"], move, mend)
+
+
+def of_units(ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
+    """Places and elements in other units than metres."""
+    for own in sorted(ends, key=len, reverse=True):
+        for unit, factor in {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "km": 1e3}.items():
+            yield _scaled(own, unit, factor)
+
+
+def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
+    """The order of receivers by which the links of each fit one's place best; shifted by one if there are many."""
+    count = len(sample.positions)
+    own = torch.arange(count)
+    orders = [own.roll(1), own.roll(-1)][: count - 1]
+    if 2 < count <= 8:
+        fits = torch.zeros(count, count)  # links of one receiver at the place of another
+        for receiver in sample.receivers.unique().tolist():
+            links = sample.at((sample.receivers == receiver).nonzero()[:, 0])
+            for place in range(count):
+                fits[receiver, place] = measure(replace(links, receivers=torch.full_like(links.receivers, place)))
+        orders.append(torch.from_numpy(linear_sum_assignment(-fits.numpy())[1]))
+    for order in orders:
+        is_shift = len((order - own).remainder(count).unique()) == 1
+        name = "rows of rx are exchanged" + ", as by numbers from 1" * is_shift
+        yield _changing(name, ["receivers"], order.__getitem__, f"rx = rx[{order.tolist()}]")
+
+
+def _changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothesis:
+    return Hypothesis(name, partial(_changed, parts=parts, move=move), mend)
+
+
+def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hypothesis:
+    """Points of some ends times a matrix, which ``mend`` writes in numpy."""
+    parts = {"tx": "transmitters", "rx": "positions", "elements": "elements"}
+    lines = "; ".join(f"{end} = {end}{mend}" for end in ends)
+    return _changing(name, [parts[end] for end in ends], partial(torch.matmul, other=matrix.double()), lines)
+
+
+def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
+    subject = ", ".join(ends[:-1]) + " and " * (len(ends) > 1) + ends[-1]
+    return _everywhere(ends, f"{subject} are in {unit}", f" * {factor:.4g}", factor * torch.eye(3))
+
+
+def _changed(sample: Sample, parts: Sequence[str], move: Move) -> Sample:
+    values = {name: getattr(sample, name) for name in parts}
+    moved = {name: tuple(map(move, own)) if isinstance(own, tuple) else move(own) for name, own in values.items()}
+    return replace(sample, **moved)
+
+
+def _about_receivers(sample: Sample, move: Move) -> Sample:
+    stands = sample.positions[sample.receivers]
+    return replace(sample, transmitters=stands + move(sample.transmitters - stands))
+
+
+def _transposed(labels: Complex[Tensor, "n e s"], rows: int) -> Complex[Tensor, "n e s"]:
+    return labels.unflatten(1, (rows, -1)).transpose(1, 2).flatten(1, 2)
+
+
+def _rolled(rotations: Float[Tensor, "r 3 3"], by: int) -> Float[Tensor, "r 3 3"]:
+    """Rotations of quaternions whose four numbers are rolled."""
+    quaternions = Rotation.from_matrix(rotations.numpy()).as_quat()
+    return torch.from_numpy(Rotation.from_quat(torch.from_numpy(quaternions).roll(by, 1).numpy()).as_matrix())
+
+
+def _tilted(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Points with their angle from the z axis as elevation."""
+    azimuths, elevations, distances = to_spherical(points)
+    return distances[:, None] * from_spherical(azimuths, math.pi / 2 - elevations)
+
+
+def _widened(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Points at 180 / pi times their azimuth and elevation."""
+    azimuths, elevations, distances = to_spherical(points)
+    return distances[:, None] * from_spherical(math.degrees(1) * azimuths, math.degrees(1) * elevations)
+
+
+def _with_carrier(sample: Sample, at_elements: bool) -> Sample:
+    """Channels times the direct wave's phase at the middle of the band, alike at all elements or not."""
+    distances = direct_distances(sample)
+    if not at_elements:
+        distances = distances.mean(1, keepdim=True)
+    phases = -2 * math.pi * sample.frequencies.mean() / speed_of_light * distances
+    return replace(sample, labels=sample.labels * torch.polar(torch.ones_like(phases), phases)[..., None])

@@ -1,0 +1,88 @@
+"""Checks of subcarriers without geometry: those that are no channel, and their order."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gaigs.antenna import lacking
+from gaigs.data.checks.finding import Finding
+from gaigs.data.checks.hypotheses import Sample
+from gaigs.io.tables import shortened
+from gaigs.query import evenly
+
+
+def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
+    """True for each subcarrier at which all links have one value, or none: a guard or null subcarrier.
+
+    An element may have another value than others. Fewer than five links tell nothing.
+    """
+    count = len(links.task.frequencies)
+    chosen = torch.arange(count)
+    few = evenly(torch.arange(len(links)), 64)
+    for index in (few, torch.arange(len(links))):  # most subcarriers are channels, which few links show
+        values = links.labels[index]
+        absent = lacking(links.receivers, links.query.receivers[index], values.shape[1])  # (n, e)
+        strengths = values.abs().amax((1, 2))[:, None, None]
+        values = values[..., chosen]
+        first = values[absent.int().argmin(0), torch.arange(values.shape[1])]  # (e, k), of a link with the element
+        is_same = ((values == first) | absent[..., None]).all(0).all(0)
+        is_faint = (values.abs() <= 1e-6 * strengths).all(0).all(0)  # 0 but for rounding
+        chosen = chosen[is_same | is_faint]
+        if not len(chosen) or len(index) < 5:
+            return torch.zeros(count, dtype=torch.bool)
+    return torch.zeros(count, dtype=torch.bool).index_fill(0, chosen, True)
+
+
+def constant_sentence(constant: Bool[Tensor, " s"], frequencies: Float[Tensor, " s"]) -> str:
+    """What was found about constant subcarriers."""
+    named = shortened([f"{carrier / 1e9:.6g}" for carrier in frequencies[constant].tolist()])
+    return f"{int(constant.sum())} of {len(constant)} subcarriers have one value in every link, {{}}: {named} GHz"
+
+
+def check_constant_subcarriers(links: Any) -> Iterator[Finding]:
+    """A finding about subcarriers that are no channel."""
+    constant = constant_subcarriers(links)
+    if constant.any() and not constant.all():
+        text = constant_sentence(constant, links.task.frequencies)
+        yield Finding("constant subcarriers", text.format("as guard or null subcarriers"), "leave them out")
+
+
+def order_of_subcarriers(sample: Sample) -> Finding | None:
+    """A finding if channels jump within the band, and go on from its last to its first subcarrier.
+
+    The correlation of neighbouring subcarriers tells, for which each link may have a phase and a delay of its own.
+    """
+    order = sample.frequencies.argsort()
+    count = len(order)
+    values = sample.labels[:, :8, order]
+    if count < 8 or values.shape[:2].numel() < 64:
+        return None
+    powers = values.abs().square().mean((1, 2), keepdim=True)
+    values = values / torch.where(powers > 0, powers, 1).sqrt()
+    steps = values.roll(-1, 2) * values.conj()  # (n, e, s), the last from the band's end to its start
+    turn = steps.sum((1, 2), keepdim=True).sgn().conj()
+    # Where a subcarrier is left out between two, the phase turns twice as far.
+    likeness = torch.stack([(steps * turn**power).sum((0, 1)).abs() for power in (1, 2)]).amax(0)
+    likeness = likeness / steps.abs().sum((0, 1)).clamp_min(1e-300)
+    usual, around = likeness.median().item(), likeness[-1].item()
+    least, jump = (part.item() for part in likeness[:-1].min(0))
+    bound = min(usual, around) - 0.3
+    if not (usual > 0.6 and around > 0.6 and (likeness < bound).sum() == 1 and least < bound):
+        return None
+    after = jump + 1
+    mend = f"h = np.roll(h, {-after}, axis=-1)"
+    if after == math.ceil(count / 2):
+        mend = "h = np.fft.fftshift(h, axes=-1)"
+    elif after == count // 2:
+        mend = "h = np.fft.ifftshift(h, axes=-1)"
+    if not torch.equal(order, torch.arange(count)):
+        mend = "frequencies = np.sort(frequencies)"
+    text = (
+        f"channels jump at subcarrier {after} of {count}, with a correlation of {least:.2f}, and go on from the last "
+        f"subcarrier to the first, with {around:.2f}: FFT order?"
+    )
+    return Finding("order of subcarriers", text, mend, read=least, fits=around, score="correlation of subcarriers")
