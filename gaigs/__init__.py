@@ -4,7 +4,7 @@
 >>> links = gaigs.links("synthetic")  # any registered reader
 >>> model = gaigs.train("mirrored", links, max_steps=300)  # any registered model
 >>> print(gaigs.evaluate(model, links))  # beside the task's baselines
->>> spectra = model.predict([[1.0, 2.0, 1.5]])  # positions [m]
+>>> spectra = model.predict([[1.0, 2.0, 1.5]])  # positions [m] -> (places, receivers, rows, columns)
 >>> model.save("room.ckpt")
 >>> model = gaigs.load("room.ckpt")
 
@@ -153,6 +153,10 @@ def _execute(config: dict, folder: Path) -> dict | None:
             with processes.limited_threads(config["threads"]):
                 viewing.run(config)
         case unknown:
-            known = "train, agreement, describe, survey, locate, export, view or devices"
-            raise ValueError(f"command must be {known}, got {unknown!r}")
+            from gaigs.registry import suggest
+
+            if unknown == "report":
+                raise ValueError("there is no command 'report'; python -m gaigs.report FOLDER makes its tables")
+            known = "train", "agreement", "describe", "survey", "locate", "export", "view", "devices"
+            raise ValueError(f"command must be one of {', '.join(known)}, got {suggest(unknown, known)}")
     return None

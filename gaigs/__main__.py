@@ -106,6 +106,9 @@ def remove_without_result(folder: Path) -> None:
 
 def compose_and_run() -> None:
     """Lets Hydra read the command line and run its jobs; exits with 1 after the message of an error."""
+    if message := configuration.wrong_flag():
+        print(f"gaigs: {message}", file=sys.stderr)
+        raise SystemExit(2)
     full_error = os.environ.get("HYDRA_FULL_ERROR", "")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:

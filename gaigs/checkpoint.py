@@ -87,10 +87,11 @@ def save(model: nn.Module, path: str | Path) -> None:
     """Writes a model with its configuration and scene; see ``gaigs.Model.save``."""
     state = model.state_dict()
     if not state:
-        raise ValueError(f"model {name_of(model)!r} is a look-up without a state; keep its links, and fit it again")
+        raise ValueError(f"model {name_of(model)!r} has no state: keep what it learns in buffers, or use model.LookUp")
     part = {"version": VERSION, "scene": model.scene.state(), **described(model)}
     part["plugins"] = digests(part["model"], part["scene"]["task"])
-    write({KEY: part, "state_dict": {f"model.{key}": value.cpu() for key, value in state.items()}}, Path(path))
+    weights = {f"model.{key}": value.cpu() if isinstance(value, Tensor) else value for key, value in state.items()}
+    write({KEY: part, "state_dict": weights}, Path(path))
 
 
 def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Module:
@@ -105,7 +106,8 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
         _check_finite("scene", scene)
         with only_recorded(None if trust else {**recorded, **content[KEY].get("plugins", {})}):
             model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(scene))
-        unset = {name for name, value in model.state_dict().items() if not value.isfinite().all()}
+        fresh = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+        unset = {name for name, value in fresh.items() if not value.isfinite().all()}
         model.load_state_dict(weights)
         _check_finite("weights", {name: value for name, value in weights.items() if name not in unset})
         model.calibrate(content[KEY].get("calibration"))

@@ -13,6 +13,7 @@ from typing import Any
 
 import hydra
 from hydra import initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -24,7 +25,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
-from gaigs.registry import KINDS, check_type, listed, registry, storable, suggest
+from gaigs.registry import KINDS, check_type, listed, registry, similar, storable, suggest
 from gaigs.registry.holders import plugin_packages
 
 log = logging.getLogger(__name__)
@@ -241,7 +242,14 @@ def resolve(config: DictConfig) -> dict:
         if key in words and config.model.name in ("kriging", "ensemble"):
             message = f"model {config.model.name!r} is made from trained models; set {words[key]}, with any model"
             raise ValueError(message) from None
-        raise ValueError(f"{key} must be given, as it has no default; add {key}=...") from None
+        examples = {"split.edge": "1.0, the edge of a cube [m]", "split.length": "50, the samples of a run"}
+        examples |= {
+            "split.train": "100, the training places",
+            "data.root": "/path/to/folder",
+            "data.file": "/path/to/file",
+        }
+        example = examples.get(key, "...")
+        raise ValueError(f"{key} must be given, as it has no default; add {key}={example}") from None
     except OmegaConfBaseException as error:
         raise ValueError(f"the configuration is not complete: {' '.join(str(error).split())}") from error
     if isinstance(plain.get("baselines"), list):
@@ -311,6 +319,24 @@ def _options(config: Mapping, parts: Iterable[str], prefix: str = "") -> Iterato
             yield f"{prefix}{part}"
 
 
+def nearest(word: str, config: Mapping) -> str:
+    """Full keys of the options with the name most similar to a word, joined by or; empty if none is similar."""
+    parts = config.keys() - {"hydra", "survey", "locate", "export", "view", "benchmark"}
+    keys = {key: key.rpartition(".")[2] for key in (*parts, *_options(config, parts))}
+    near = similar(word, {*keys.values()} - {"name"})
+    found = [key for key in near if key in config] or sorted(key for key, name in keys.items() if name in near)
+    return " or ".join(found)
+
+
+def wrong_flag() -> str | None:
+    """The message for a flag on the command line that Hydra does not have; None if it has all."""
+    _, unknown = get_args_parser().parse_known_args()
+    for flag in (word.partition("=")[0] for word in unknown if word.startswith("-")):
+        near = nearest(flag.lstrip("-").replace("-", "_"), composed([], {})) or "trainer.max_steps"
+        return f"there is no flag {flag}; options have no dashes, such as {near}=..."
+    return None
+
+
 def explain(error: Exception) -> str | None:
     """The message of an error of a job or of a command line that Hydra cannot compose; None for any other error."""
     is_known = isinstance(error, HydraException | OmegaConfBaseException | ValueError)
@@ -325,10 +351,8 @@ def explain(error: Exception) -> str | None:
             has = [str(name) for name in cause.parent_node]
             part = f"{place} {cause.parent_node['name']!r}" if "name" in has else place or "the configuration"
             plain: Any = OmegaConf.to_container(cause.parent_node)
-            parts = () if place else plain.keys() - {"hydra", "survey", "locate", "export", "view"}
-            inner = sorted(full for full in _options(plain, parts) if full.rpartition(".")[2] == word)
-            if inner and word != "name":
-                return f"{part} has no key {word!r}; did you mean {' or '.join(inner)}?"
+            if not place and (near := nearest(word, plain)):
+                return f"{part} has no key {word!r}; did you mean {near}?"
             hint = f"\nin a sweep write ++{key}=... for a key that only the swept {place} has" if is_multirun() else ""
             return f"{part} has no key {suggest(word, has)}; it has: {listed(sorted(has))}{hint}"
         case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:

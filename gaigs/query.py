@@ -218,16 +218,17 @@ class Query:
 
         Args:
             positions: Positions (..., 3) [m], anything that becomes a float tensor; or a whole query.
-            receiver: Name or index of the receiver, or an index for each position.
+            receiver: Name or index of the receiver, or of that of each position; None: all receivers.
             frequency: Carrier, one for all or one for each position [Hz]; None is the known one.
             names: Names of the scene's receivers.
             known: Different carriers of the training links, ascending [Hz]; empty if unknown.
 
         Returns:
-            The links in the order of ``positions.reshape(-1, 3)``, and the leading axes of the positions.
+            The links in the order of ``positions.reshape(-1, 3)``, and their axes: the leading ones of the positions,
+            and a last one of all receivers if none is given.
         """
         if isinstance(positions, Query):
-            if frequency is not None or not isinstance(receiver, int) or receiver:
+            if frequency is not None or receiver is not None:
                 raise ValueError("a query has its own receivers and frequencies; leave receiver and frequency out")
             receiver, frequency, positions = positions.receivers, positions.frequencies, positions.transmitters
         points = as_positions("transmitters", positions)
@@ -240,9 +241,14 @@ class Query:
             return values.expand(shape).reshape(-1)
 
         points = points.reshape(-1, 3)
-        receivers = spread("receivers", as_receivers(receiver, names)).to(points.device)
+        receivers = spread("receivers", as_receivers(0 if receiver is None else receiver, names)).to(points.device)
         frequencies = as_frequencies(frequency, known.cpu().float())
-        return cls(points, receivers, None if frequencies is None else spread("frequencies", frequencies)), shape
+        query = cls(points, receivers, None if frequencies is None else spread("frequencies", frequencies))
+        if receiver is not None:
+            return query, shape
+        query = query[torch.arange(len(points)).repeat_interleave(len(names))]
+        query.receivers = torch.arange(len(names), device=points.device).repeat(len(points))
+        return query, (*shape, len(names))
 
     def __len__(self) -> int:
         return len(self.transmitters)

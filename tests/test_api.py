@@ -342,8 +342,10 @@ def test_mirrored_gaussians_have_parts_that_suit_them():
 
 
 def test_models_that_cannot_be_stored_are_refused(spectra, tmp_path):
-    with pytest.raises(ValueError, match="model 'knn' is a look-up without a state"):
-        gaigs.train("knn", spectra).save(tmp_path / "knn.ckpt")
+    with pytest.raises(ValueError, match="model 'knn' has no links to save; fit it first"):
+        gaigs.registries["model"].build("knn", scene=spectra.scene).save(tmp_path / "knn.ckpt")
+    with pytest.raises(ValueError, match="model 'Model' has no state: keep what it learns in buffers"):
+        Model(spectra.scene).save(tmp_path / "stateless.ckpt")
 
     class Own(EuclideanTokenizer):
         pass

@@ -61,7 +61,7 @@ sys.modules["hydra"] = None  # cannot be imported
 import gaigs
 
 model = gaigs.load(sys.argv[1])
-torch.save(model.predict(torch.load(sys.argv[2])), sys.argv[3])
+torch.save(model.predict(torch.load(sys.argv[2]), 0), sys.argv[3])
 """
     with np.load(folder / "predictions.npz") as file:
         stored = dict(file)
@@ -103,7 +103,7 @@ def test_many_spectra_go_to_a_file_as_the_page_shows(folder, tmp_path, monkeypat
     names = {}
     exec(code.replace("100_000", "5").replace("batch_size=16", "batch_size=2"), names)
     stored = np.load("spectra.npy", mmap_mode="r")
-    assert torch.equal(torch.tensor(stored), names["model"].predict(names["positions"], batch_size=2))
+    assert torch.equal(torch.tensor(stored), names["model"].predict(names["positions"], 0, batch_size=2))
 
 
 def test_missing_files_and_other_types_are_refused(tmp_path):

@@ -1,6 +1,7 @@
 """Names in the documentation exist, its commands compose, and its plug-ins train by its commands."""
 
 import contextlib
+import csv
 import functools
 import json
 import os
@@ -196,6 +197,16 @@ def test_commands_compose(page, composed):
         composed(*together()[chosen(line)].values())
 
 
+@pytest.mark.parametrize("command", ["gaigs +experiment", "pytest"])
+def test_each_block_of_the_readme_installs_the_processors_torch_first(command):
+    """Each is complete alone; torch of PyPI would bring CUDA packages, unless the CPU build is there already."""
+    (block,) = [block for block in blocks(ROOT / "README.md") if "-m venv" in block and f".venv/bin/{command}" in block]
+    first, torch_line, install, *_ = block.splitlines()
+    assert first == "python3 -m venv .venv"
+    assert "--no-deps torch --extra-index-url https://download.pytorch.org/whl/cpu" in torch_line
+    assert all(line.startswith(".venv/bin/pip install -c constraints.txt ") for line in (torch_line, install))
+
+
 @of_today
 def test_configuration_keys_exist(page, composed, place):
     for word in spoken(page):
@@ -253,6 +264,108 @@ def test_the_first_page_lists_the_choices(kind):
 def test_the_page_on_data_describes_each_component(kind):
     first_cells = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/data.md").read_text(), re.M)
     assert choices(kind) <= {*first_cells}
+
+
+SETS = {
+    "README.md": {
+        "200 measured spectra, published split": ("rfid-s23-200", "median SSIM"),
+        "simulated room, random places": ("built-in", "median SSIM"),
+        "simulated room, held-out blocks": ("built-in-blocks", "median SSIM"),
+        "flat with Bluetooth, another run": ("ble-flat", "MAE [dB]"),
+        "simulated channels": ("built-in-csi", "median SNR [dB]"),
+    },
+    "docs/results/systems.md": {
+        "rfid-s23-200": ("rfid-s23-200", "median SSIM"),
+        "built-in": ("built-in", "median SSIM"),
+        "blocks 1 m": ("built-in-blocks", "median SSIM"),
+        "ble-flat": ("ble-flat", "MAE [dB]"),
+        "channels, SNR": ("built-in-csi", "median SNR [dB]"),
+        "channels, NMSE": ("built-in-csi", "NMSE [dB]"),
+    },
+}
+"""Columns of pages, by their heads, with the folder of docs/results that is their source, and the score."""
+
+SECTIONS = {
+    "Measured spectra, 200 samples": "rfid-s23-200",
+    "The built-in room": "built-in",
+    "Received signal strength: six Bluetooth gateways in a flat": "ble-flat",
+    "Complex channels: the built-in room": "built-in-csi",
+}
+"""Sections of docs/results.md whose baselines are those of a folder of docs/results."""
+
+
+def tables(text):
+    """Tables of a text in Markdown, each as lists of cells, without the line below the head."""
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.M):
+        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()]
+        yield [rows[0], *rows[2:]]
+
+
+@functools.cache
+def source(folder):
+    """Scores in ``systems.csv``, by system and title."""
+    with (ROOT / "docs/results" / folder / "systems.csv").open() as file:
+        return {row["system"]: row for row in csv.DictReader(file)}
+
+
+def require_score(printed, folder, system, title):
+    number = printed.strip("*")
+    digits = len(number.partition(".")[2])
+    assert round(float(source(folder)[system][title]), digits) == float(number), (folder, system, title)
+
+
+@pytest.mark.parametrize("page", SETS)
+def test_pages_have_the_scores_of_their_source(page):
+    columns, names = SETS[page], {"nearest neighbours": "knn", "Gaussian process": "gaussian_process"}
+    (table,) = [rows for rows in tables((ROOT / page).read_text()) if columns.keys() <= {*rows[0]}]
+    count = 0
+    for name, *cells in table[1:]:
+        for head, printed in zip(table[0][1:], cells, strict=True):
+            if head in columns and re.fullmatch(r"\**-?[\d.]+\**", printed):
+                folder, title = columns[head]
+                require_score(printed, folder, names.get(name, name.strip("`")), title)
+                count += 1
+    assert count >= 4 * len(columns)
+
+
+def test_the_page_of_results_has_the_scores_of_their_source():
+    text = (ROOT / "docs/results.md").read_text()
+    first, *sections = re.split(r"^##+ ", text, flags=re.M)
+    rows = {
+        "200 measured spectra, published split": ("rfid-s23-200", ["median SSIM"], ["knn", "gaussian_process"]),
+        "built-in room, spectra": ("built-in", ["median SSIM"], ["gaussian_process"]),
+        "flat with six Bluetooth gateways, another run as test": ("ble-flat", ["MAE [dB]"], ["gaussian_process"]),
+        "built-in room, complex channels": ("built-in-csi", ["median SNR [dB]", "NMSE [dB]"], ["friis"]),
+    }
+    (table,) = [table for table in tables(first) if "best baseline" in table[0]]
+    cells = {row[0]: row for row in table}
+    for row, (folder, titles, baselines) in rows.items():
+        for cell, systems in ((1, ["GAI-GS"]), (2, baselines)):
+            numbers = re.findall(r"-?\d+\.\d+", cells[row][cell])
+            for system in systems:
+                for number, title in zip(numbers, titles, strict=True):
+                    require_score(number, folder, system, title)
+    number = re.search(r"median SNR ([\d.]+) dB in the built-in room", first)[1]
+    require_score(number, "built-in-csi", "mirrored Gaussians", "median SNR [dB]")
+    for section in sections:
+        if (folder := SECTIONS.get(section.partition("\n")[0])) is None:
+            continue
+        head, *rows = next(table for table in tables(section) if table[0][0] == "model")
+        for name, *cells in rows:
+            scores = source(folder).get(name.strip("`"), {})
+            for title, printed in zip(head[1:], cells, strict=True):
+                if title in scores and printed:
+                    require_score(printed, folder, name.strip("`"), title)
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, *sorted(ROOT.glob("docs/results/*/*.md"))], ids=lambda page: str(page.relative_to(ROOT))
+)
+def test_all_that_equal_the_best_of_a_column_are_bold(page):
+    for head, *rows in tables(page.read_text()):
+        for title, *cells in zip(*(row for row in (head, *rows) if len(row) == len(head)), strict=True):
+            best = {cell.strip("*") for cell in cells if re.fullmatch(r"\*\*[-\d.,]+\*\*", cell)}
+            assert not best & {*cells}, (head[0], title)
 
 
 def test_every_page_is_in_the_navigation_and_in_the_readmes_table():

@@ -157,7 +157,10 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
     ("overrides", "message"),
     [
         ("tokenizer.widht=3", "tokenizer 'euclidean' has no key 'widht' (did you mean 'width'?); it has: "),
-        ("sede=3", "the configuration has no key 'sede' (did you mean 'seed'?); it has: baselines, command"),
+        ("sede=3", "the configuration has no key 'sede'; did you mean seed?\n"),
+        ("lr=0.01", "the configuration has no key 'lr'; did you mean training.learning_rates?\n"),
+        ("training.lr=0.01", "(did you mean 'learning_rates'?); it has: "),
+        ("xyzzy=1", "the configuration has no key 'xyzzy'; it has: baselines, command"),
         ("tokenizer=gaa", "there is no tokenizer 'gaa' (did you mean 'ga'?); there are: euclidean, "),
         ("model=gsrf", "model 'gsrf' is in the package gaigs-gsrf, which is not installed\npip install gaigs-gsrf"),
         ("+experiment=foo", "there is no experiment 'foo'; there are: claims, claims_rssi, csi, mirrored, "),
@@ -173,9 +176,12 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("baselines=[3]", "baselines, entry 0, must be a mapping, got 3"),
         ("seed=-1", "seed must be in 0..4294967295, got -1"),
         ("+thread=3", "the configuration has no key 'thread' (did you mean 'threads'?)"),
-        ("command=trian", "command must be train, agreement, describe, survey, locate, export, view or devices"),
+        ("command=trian", "command must be one of train, agreement, describe, survey, locate, export, "),
+        ("command=exprt", "devices, got 'exprt' (did you mean 'export'?)"),
+        ("command=report", "there is no command 'report'; python -m gaigs.report FOLDER makes its tables"),
+        ("split=blocks", "split.edge must be given, as it has no default; add split.edge=1.0, the edge of a cube [m]"),
         ("~command", "the configuration needs the key 'command'"),
-        ("data=nerf2_spectrum", "data.root must be given, as it has no default; add data.root=..."),
+        ("data=nerf2_spectrum", "data.root must be given, as it has no default; add data.root=/path/to/folder"),
         ("data=nerf2_spectrum data.root=nowhere", "nowhere must be the folder of a data set"),
         ("-m model=knn,mean model.k=3", "in a sweep write ++model.k=... for a key that only the swept model has"),
         ("model=kriging", "model 'kriging' is made from trained models; set kriging=true, with any model"),
@@ -195,6 +201,18 @@ def test_a_wrong_word_gives_one_message(overrides, message, run):
     text = err[err.index("gaigs: ") :].rstrip("\n")
     assert text.count("\n") <= 1, text
     assert not Path("run").exists(), "a folder without a result"
+
+
+@pytest.mark.parametrize(
+    ("words", "near"),
+    [
+        (("--epochs", "10"), "there is no flag --epochs; options have no dashes, such as trainer.max_steps=..."),
+        (("--batch-size=8",), "there is no flag --batch-size; options have no dashes, such as training.batch_size=..."),
+        (("seed=1", "--model", "knn"), "there is no flag --model; options have no dashes, such as model=..."),
+    ],
+)
+def test_a_flag_names_the_option_that_it_means(words, near, run):
+    assert run(*words) == (2, f"gaigs: {near}\n")
 
 
 UNREADABLE = {

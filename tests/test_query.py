@@ -15,7 +15,8 @@ NONE, ONE, BAND = torch.zeros(0), torch.tensor([2.437123e9]), torch.tensor([1e9,
 QUERY = Query(torch.zeros(2, 3), torch.zeros(2, dtype=torch.long))
 
 
-def ask(positions=PLACE, receiver=0, frequency=None, known=NONE):
+def ask(positions=PLACE, receiver=None, frequency=None, known=NONE):
+    receiver = 0 if receiver is None and not isinstance(positions, Query) else receiver
     return Query.from_positions(positions, receiver, frequency, ["west", "east"], known)
 
 
@@ -165,6 +166,14 @@ def test_arrays_of_any_layout_are_positions(view):
 def test_no_positions_are_an_empty_query():
     query, shape = Query.from_positions([], 0, None, ["west"], torch.zeros(0))
     assert (query.transmitters.shape, query.receivers.shape, shape) == ((0, 3), (0,), (0,))
+
+
+def test_all_receivers_have_a_last_axis():
+    query, shape = Query.from_positions(torch.arange(6.0).reshape(2, 3), None, BAND[:2], ["west", "east"], BAND)
+    assert shape == (2, 2)
+    assert query.transmitters[:, 0].tolist() == [0, 0, 3, 3]
+    assert query.receivers.tolist() == [0, 1, 0, 1]
+    assert query.frequencies.tolist() == [1e9, 1e9, 2e9, 2e9]
 
 
 def test_directions_become_float32():

@@ -363,16 +363,23 @@ def test_a_folder_of_something_else_is_left_alone(name, tmp_path):
 
 
 @pytest.mark.parametrize(("model", "others"), [("knn", ["mean"]), ("mean", ["knn"])])
-def test_look_ups_run_without_training(model, others, finished, tmp_path):
+def test_look_ups_run_without_training(model, others, finished, tmp_path, monkeypatch):
     metrics = runs.run(configure(f"model={model}"), tmp_path)
     assert list(metrics) == METRICS
     assert list(metrics["models"]) == [model, *others]
     assert metrics["models"][model] == finished[2]["models"][model], "as beside any other model"
     assert (metrics["num_gaussians"], metrics["num_gaussians_start"], metrics["num_parameters"]) == (0, 0, 0)
-    for key in ("rasterizer", "train_seconds", "render_ms", "checkpoint_bytes"):
+    for key in ("rasterizer", "train_seconds", "render_ms"):
         assert metrics[key] is None
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"config.yaml", "software.json", "predictions.npz", "metrics.json"}
+    assert names == {"config.yaml", "software.json", "best.ckpt", "predictions.npz", "metrics.json"}
+    monkeypatch.setattr("gaigs.data.load", None)  # the data are not read again
+    with np.load(tmp_path / "predictions.npz") as file:
+        found = gaigs.load(tmp_path).predict(file["transmitters"], 0)
+        np.testing.assert_allclose(found, file["prediction"], rtol=1e-3, atol=1e-3)  # stored in half precision
+    (tmp_path / "best.ckpt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"has no best\.ckpt: the run is not finished, or one of a look-up"):
+        gaigs.load(tmp_path)
 
 
 # --- refused options and data ---

@@ -87,10 +87,8 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
     elif isinstance(places, Query):
         query = places
     else:
-        points, names = as_positions("places", places).reshape(-1, 3), [receiver.name for receiver in scene.receivers]
-        receivers = torch.arange(len(names)).repeat(len(points))
-        points = points.repeat_interleave(len(names), 0)
-        query, _ = Query.from_positions(points, receivers, frequency, names, scene.frequencies)
+        points, names = as_positions("places", places), [receiver.name for receiver in scene.receivers]
+        query, _ = Query.from_positions(points, None, frequency, names, scene.frequencies)
     if not len(query):
         raise ValueError(f"{kind} take one place or more; give positions [m], or links with a test")
     return query

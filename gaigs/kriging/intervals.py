@@ -36,13 +36,14 @@ class Estimate(NamedTuple):
         lower, upper: Ends of the interval, which holds the label with the asked probability; None for channels.
         radius: Of channels, that of a disc about the value which holds the channel with this probability, in the
             label's unit; else None.
-        snr_db: Of channels, the expected signal-to-noise ratio of each link's prediction (b,) [dB]; else None.
+        snr_db: Of channels, the expected signal-to-noise ratio of each link's prediction [dB], without the axes of
+            elements and subcarriers; else None.
 
     Example:
         >>> model = gaigs.train("knn", gaigs.links("synthetic_rssi", transmitters=100))
         >>> found = model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]], interval=0.9)
-        >>> found.upper.shape, bool((found.lower < found.value).all())
-        (torch.Size([2]), True)
+        >>> found.upper.shape, bool((found.lower < found.value).all())  # places, receivers
+        (torch.Size([2, 4]), True)
     """
 
     value: Tensor

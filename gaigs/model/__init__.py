@@ -5,7 +5,7 @@ import itertools
 import math
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, overload
@@ -21,8 +21,9 @@ from gaigs.gaussians import Gaussians
 from gaigs.geometry import Directions, ExtrapolationWarning
 from gaigs.kriging.intervals import Calibration, Estimate
 from gaigs.kriging.kernel import Process
-from gaigs.query import ROUNDING, Batch, Query, as_directions, as_subcarriers
-from gaigs.registry import check_type, registry
+from gaigs.kriging.links import PART
+from gaigs.query import ROUNDING, Batch, Query, as_directions, as_receivers, as_subcarriers
+from gaigs.registry import check_type, name_of, registry
 from gaigs.registry.modes import usual_modes
 from gaigs.scene import Scene
 from gaigs.stages import track
@@ -47,8 +48,8 @@ class Prediction(NamedTuple):
 class Model(nn.Module):
     """The contract of kind ``model``: ``forward`` takes a ``Batch`` and gives a ``Prediction``.
 
-    A model with parameters is trained; its state dict has all that ``predict`` needs. A model without parameters is a
-    look-up: it learns in ``fit`` only, and is not stored. A model may also have the methods of ``OptionalMethods``.
+    The state dict has all that ``predict`` needs. A model with parameters is trained. One without is a look-up: it
+    learns in ``fit`` only, see ``LookUp``. A model may also have the methods of ``OptionalMethods``.
 
     Args:
         scene: Receivers and task.
@@ -79,8 +80,8 @@ class Model(nn.Module):
         >>> links = gaigs.links("synthetic", transmitters=20, order=0)
         >>> model = Nearest(links.scene)
         >>> model.fit(links)
-        >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape
-        torch.Size([2, 90, 360])
+        >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape  # places, receivers, rows, columns
+        torch.Size([2, 1, 90, 360])
     """
 
     trained_by = "descent"
@@ -100,7 +101,7 @@ class Model(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """The device of the model's tensors; the CPU for a look-up, which has none."""
+        """The device of the model's tensors; the CPU for a look-up without."""
         tensors = itertools.chain(self.parameters(), self.buffers())
         return next((tensor.device for tensor in tensors), torch.device("cpu"))
 
@@ -119,7 +120,7 @@ class Model(nn.Module):
         """Writes the model into one file, which ``gaigs.load`` reads anywhere, without the data.
 
         Raises:
-            ValueError: The model is a look-up, whose links are its whole state; or a part has no registered name.
+            ValueError: The model has no state, such as a look-up before its fit; or a part has no registered name.
             OSError: The file cannot be written; an earlier file stays as it was.
 
         Example:
@@ -156,30 +157,34 @@ class Model(nn.Module):
     def predict(  # type: ignore[misc]
         self,
         transmitters: object,
-        receiver: object = 0,
+        receiver: object = None,
         frequency: object = None,
         batch_size: int | None = None,
         directions: Directions | None = None,
         frequencies: object = None,
         interval: float | None = None,
-    ) -> Tensor | Estimate:
+    ) -> Tensor | Estimate | dict:
         """Values for transmitters anywhere: a query, or a point, a list of points, or a grid.
 
         Args:
-            transmitters: Positions, world frame [m], anything that becomes a float tensor; or a whole query.
-            receiver: Name or index of the receiver, or of that of each position.
+            transmitters: Positions (..., 3), world frame [m], anything that becomes a float tensor; or a whole query.
+            receiver: Name or index of the receiver, or of that of each position; None: all receivers.
             frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the training links'
                 only carrier.
-            batch_size: Links computed at a time; None: as many as have ``NUMBERS`` numbers together.
+            batch_size: Links computed at a time, of all receivers at least those of one position; None: as many as have
+                ``NUMBERS`` numbers together.
             directions: Directions to predict; None: the label's own, if it has directions.
             frequencies: Subcarriers of channels to predict (s,) [Hz], also ones that no label had; None: the label's
                 own. A model without ``any_frequency``, such as ``knn``, gives the values of its nearest subcarriers.
             interval: Probability with which an interval holds the label, between 0 and 1, e.g. 0.9; None: values alone.
 
         Returns:
-            A value of the task's shape for each position, scaled as the training labels
-            (``model.scene.task.normalisation``); on the model's device. With an interval an ``Estimate``: the value,
-            its standard deviation, and the interval's ends.
+            Values (..., receivers, *shape), of the axes of the positions, of all receivers in the order of
+            ``model.scene.receivers``, of a single one too, and of the task's shape. With ``receiver`` (..., *shape); of
+            a query (b, *shape). They are scaled as the training labels (``model.scene.task.normalisation``), on the
+            model's device. With an interval an ``Estimate``: the value, its standard deviation, and the interval's
+            ends. Where arrays have different numbers of elements, channels of all receivers are a dictionary by name,
+            and those of one have its own elements.
 
         Warns:
             ExtrapolationWarning: A position is farther from the training transmitters' box than the diagonal of this
@@ -194,52 +199,76 @@ class Model(nn.Module):
         Example:
             >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
             >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape
-            torch.Size([2, 90, 360])
+            torch.Size([2, 1, 90, 360])
             >>> few = gaigs.Grid.degrees(elevations=range(10, 90, 10), azimuths=range(0, 360, 10))
-            >>> model.predict([1.0, 2.0, 1.5], directions=few).shape
+            >>> model.predict([1.0, 2.0, 1.5], receiver=0, directions=few).shape
             torch.Size([8, 36])
             >>> channels = gaigs.train("friis", gaigs.links("synthetic_csi", transmitters=20, order=0))
             >>> channels.predict([1.0, 2.0, 1.5], frequencies=[6.8e9, 6.9e9]).shape
-            torch.Size([16, 2])
+            torch.Size([1, 16, 2])
             >>> levels = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=100))
-            >>> low, high = levels.predict([1.0, 2.0, 1.5], interval=0.9)[2:4]  # [dBm]
-            >>> bool(low < high)
-            True
+            >>> low, high = levels.predict([1.0, 2.0, 1.5], interval=0.9)[2:4]  # [dBm], of each receiver
+            >>> low.shape, bool((low < high).all())
+            (torch.Size([4]), True)
         """
-        arguments = transmitters, receiver, frequency, batch_size, directions, frequencies
-        if interval is None:
-            parts, shape = self._values(*arguments)
-            values = torch.cat([*parts])
-            return values.reshape(shape + values.shape[1:])
-        check_type("interval", interval, float)
-        if not 0 < interval < 1:
+        check_type("interval", interval, float | None)
+        if interval is not None and not 0 < interval < 1:
             raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
-        if self.calibration is None:
+        if interval is not None and self.calibration is None:
             raise ValueError(
                 "the model has no intervals: no held-out links have measured its errors\n"
                 "train it with split.validation above 0, on two places, runs or blocks or more, without data.band_train"
             )
-        estimates, shape = self._values(*arguments, float(interval))
-        join = lambda parts: torch.cat(parts) if len(parts) > 1 else parts[0]
-        parts = (None if part[0] is None else join(part) for part in zip(*estimates, strict=True))
-        return Estimate(*(None if part is None else part.reshape(shape + part.shape[1:]) for part in parts))
+        parts, shape = self._values(transmitters, receiver, frequency, batch_size, directions, frequencies, interval)
+        heard = transmitters.receivers if isinstance(transmitters, Query) else receiver
+        if interval is None:
+            return self._arranged(torch.cat([*parts]), shape, heard)
+        joined = (None if part[0] is None else torch.cat(part) for part in zip(*parts, strict=True))
+        found = [None if part is None else self._arranged(part, shape, heard) for part in joined]
+        if isinstance(found[0], dict):
+            return {name: Estimate(*(part and part[name] for part in found)) for name in found[0]}
+        return Estimate(*found)
 
     def predict_batches(
         self,
         transmitters: object,
-        receiver: object = 0,
+        receiver: object = None,
         frequency: object = None,
         batch_size: int | None = None,
         directions: Directions | None = None,
         frequencies: object = None,
-    ) -> Iterator[Tensor]:
-        """The values of ``predict`` (b, *shape) a batch at a time, each computed when it is asked for.
+    ) -> Iterator[Any]:
+        """The values of ``predict`` for a list of positions, a batch at a time, each computed when it is asked for.
 
-        Arguments, warnings and errors are those of ``predict``, and come at once. The positions of a grid are in the
-        order of ``reshape(-1, 3)``; the last batch may be smaller.
+        A batch is (b, receivers, *shape), with a receiver (b, *shape). Arguments, warnings and errors are those of
+        ``predict``, and come at once. The positions of a grid are in the order of ``reshape(-1, 3)``; the last batch
+        may be smaller.
         """
-        values, _ = self._values(transmitters, receiver, frequency, batch_size, directions, frequencies)
-        return values
+        parts, shape = self._values(transmitters, receiver, frequency, batch_size, directions, frequencies)
+        heard = transmitters.receivers if isinstance(transmitters, Query) else receiver
+        last = shape[-1:] if heard is None else ()  # the receivers
+        return (self._arranged(part, (len(part) // math.prod(last), *last), heard) for part in parts)
+
+    def _arranged(self, values: Tensor, axes: tuple[int, ...], receiver: object) -> Any:
+        """Values of links (b, ...) with the axes of ``Query.from_positions``.
+
+        Where arrays have different numbers of elements, a dictionary by receiver or, of one receiver, its own elements.
+        """
+        receivers, values = self.scene.receivers, values.reshape((*axes, *values.shape[1:]))
+        if not self.lacks_elements:
+            return values
+        is_channel = values.ndim > len(axes)
+        own = lambda part, one: part[..., : len(one.array), :] if is_channel else part
+        if receiver is None:
+            return {one.name: own(values.select(len(axes) - 1, k), one) for k, one in enumerate(receivers)}
+        number = as_receivers(receiver, [one.name for one in receivers])
+        return values if number.ndim else own(values, receivers[int(number)])
+
+    @property
+    def lacks_elements(self) -> bool:
+        """True for channels if an array has fewer elements than another one."""
+        task = self.scene.task
+        return isinstance(task, Csi) and min(len(one.array) for one in self.scene.receivers) < task.elements
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Model":
         """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
@@ -252,13 +281,14 @@ class Model(nn.Module):
 
     def _values(
         self, transmitters, receiver, frequency, batch_size, directions, frequencies, interval=None
-    ) -> tuple[Iterator, tuple[int, ...]]:
+    ) -> tuple[Iterator[Any], tuple[int, ...]]:
         """Values, or estimates of an interval, for the checked arguments of ``predict``, a batch at a time; and the
-        positions' leading axes."""
+        links' axes, see ``Query.from_positions``."""
         scene = self.scene
         directions = as_directions(directions, scene.task.directions, scene.task.name)
         names = [receiver.name for receiver in scene.receivers]
         query, shape = Query.from_positions(transmitters, receiver, frequency, names, scene.frequencies)
+        every = shape[-1] if receiver is None and not isinstance(transmitters, Query) else 1  # links of each position
         model, chosen, messages = self, None, []
         if frequencies is not None:
             if not isinstance(scene.task, Csi):
@@ -278,13 +308,14 @@ class Model(nn.Module):
             elif not is_known:
                 messages = [f"values are those of the nearest subcarriers with labels, up to {apart.max():.7g} Hz away"]
         if not isinstance(transmitters, Query):
-            for message in messages + extrapolations(query, scene):
+            for message in messages + extrapolations(query[::every], scene):
                 warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # names the line that called ``predict``
         check_type("batch_size", batch_size, int | None)
         if batch_size is None:
             batch_size = min(MOST, max(16, NUMBERS // math.prod(model.scene.task.shape)))
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
+        batch_size = max(1, batch_size // every) * every
         query, directions = query.to(self.device), None if directions is None else directions.to(self.device)
         count = math.ceil(len(query) / batch_size)
         parts = track(query.parts(batch_size), "predictions", count, is_fixed=True)
@@ -292,7 +323,7 @@ class Model(nn.Module):
         if interval is not None:
             if messages or model is not self:
                 raise ValueError("intervals are those of the labels' own subcarriers; leave frequencies out")
-            estimates = (self._estimate(batch, interval) for batch in batches)
+            estimates = (self._estimate(batch, float(interval)) for batch in batches)
             pick = lambda part: part if part is None or part.ndim < 3 or chosen is None else part[..., chosen]
             return (Estimate(*map(pick, estimate)) for estimate in estimates), shape
         values = map(model._answer, batches)
@@ -322,12 +353,12 @@ class Model(nn.Module):
         By default 1, of channels the root mean square of each link's value. It is NaN at elements that a receiver's
         array lacks, which have no error.
         """
-        found, task, receivers = call_optional(self, "deviations", batch), self.scene.task, self.scene.receivers
+        found = call_optional(self, "deviations", batch)
         if found is None and value.is_complex():
             found = value.abs().square().flatten(1).mean(1).sqrt()
         found = torch.ones(len(value), device=value.device) if found is None else found
-        if isinstance(task, Csi) and min(len(receiver.array) for receiver in receivers) < task.elements:
-            absent = lacking(receivers, batch.query.receivers, task.elements)[..., None]
+        if self.lacks_elements:
+            absent = lacking(self.scene.receivers, batch.query.receivers, value.shape[1])[..., None]
             if found.ndim == 1:  # over all numbers, of which those that are absent are 0
                 found = (found / (1 - absent.to(found).mean((1, 2))).sqrt())[:, None, None]
             found = found.expand(value.shape).masked_fill(absent, math.nan)
@@ -374,6 +405,46 @@ class OptionalMethods(Protocol):
 def call_optional(model: Model, method: str, *arguments: object) -> Any:
     """Result of a model's method of ``OptionalMethods``; None if the model has no such method."""
     return getattr(model, method)(*arguments) if hasattr(model, method) else None
+
+
+class LookUp(Model):
+    """Base of a model that keeps its known links: they are its state, with the attributes of the names ``learnt``.
+
+    It answers on the processor.
+
+    Attributes:
+        links: Links, or a batch of the known ones; None before the fit.
+        known: Numbers of each receiver's known links.
+        learnt: Names of attributes with plain values that ``fit`` sets.
+    """
+
+    links: Links | Batch | None = None
+    known: Sequence[Tensor] = ()
+    learnt: tuple[str, ...] = ()
+
+    def _apply(self, *_: Any) -> "LookUp":
+        return self
+
+    def get_extra_state(self) -> dict:
+        """Known links and ``learnt``; labels in bytes if all are 255ths from 0 to 1, as of 8-bit images."""
+        if self.links is None:
+            raise ValueError(f"model {name_of(self)!r} has no links to save; fit it first")
+        index, labels = torch.cat([*self.known]), []
+        for part in index.split(PART):
+            values = self.links.labels[part]
+            levels = (255 * values.real).round().clamp(0, 255).to(torch.uint8)
+            labels.append(levels if (levels / 255 == values).all() else values)
+        learnt = {name: getattr(self, name) for name in self.learnt}
+        return {"query": vars(self.links.query[index]), "labels": labels, **learnt}
+
+    def set_extra_state(self, state: dict) -> None:
+        """Takes the state of a fitted look-up."""
+        labels = [part / 255 if part.dtype == torch.uint8 else part for part in state["labels"]]
+        self.links = Batch(Query(**state["query"]), None, torch.cat(labels))
+        receivers = self.links.query.receivers
+        self.known = [(receivers == number).nonzero()[:, 0] for number in range(len(self.scene.receivers))]
+        for name in self.learnt:
+            setattr(self, name, state[name])
 
 
 class Wrapper(Model):

@@ -14,7 +14,7 @@ from gaigs.data import Links
 from gaigs.deformation import Deformation, Residuals
 from gaigs.gaussians import SH_DC, Gaussians, Placed
 from gaigs.geometry import Directions, magnitudes, semi_axes, spherical_harmonics
-from gaigs.model import Model, Prediction, build_trend
+from gaigs.model import LookUp, Model, Prediction, build_trend
 from gaigs.placement import Placement
 from gaigs.pooling import Pooling
 from gaigs.pooling.channels import ChannelPooling
@@ -60,8 +60,8 @@ class GaussianSplatting(Model):
         >>> links = gaigs.links("synthetic", transmitters=20, order=0)
         >>> tokenizer = EuclideanTokenizer(links.scene, width=32)
         >>> model = GaussianSplatting(links.scene, tokenizer=tokenizer, rasterizer="torch", gaussians={"count": 50})
-        >>> model.predict([[1.0, 2.0, 1.5]]).shape
-        torch.Size([1, 90, 360])
+        >>> model.predict([[1.0, 2.0, 1.5]]).shape  # places, receivers, rows, columns
+        torch.Size([1, 1, 90, 360])
     """
 
     name = "gaigs"
@@ -83,7 +83,7 @@ class GaussianSplatting(Model):
         self.trend = None
         if trend is not None:
             self.trend = build_trend(trend, scene)
-            if not self.trend.state_dict() or [*self.trend.parameters()]:
+            if isinstance(self.trend, LookUp) or not self.trend.state_dict() or [*self.trend.parameters()]:
                 raise ValueError(f"task.trend.name cannot be {name_of(self.trend)}; take mean, path_loss or friis")
             self.register_buffer("level", torch.zeros(()))  # of the untrained map, in the label's unit
         self.pooling = registry("pooling").build(self.own_pooling(scene) if pooling is None else pooling, scene=scene)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
@@ -21,7 +21,7 @@ from gaigs.kriging.links import (
     without_gross_errors,
 )
 from gaigs.kriging.scalar import ScalarProcess
-from gaigs.model import Model, Prediction, build_trend
+from gaigs.model import LookUp, Model, Prediction, build_trend
 from gaigs.query import Batch, Query, evenly, thin_labels
 from gaigs.registry import name_of, register
 from gaigs.scene import Scene
@@ -33,7 +33,7 @@ NEIGHBOURS = 300
 
 
 @register("model", "gaussian_process")
-class GaussianProcess(Model):
+class GaussianProcess(LookUp):
     """label = trend + z + noise, z a Gaussian process over places with the Matern-1/2 kernel exp(-d / l).
 
     d is the distance of transmitters. With several carriers it is the distance in place and frequency,
@@ -51,8 +51,6 @@ class GaussianProcess(Model):
     A receiver with more than ``LIMIT`` known links is predicted from the ``NEIGHBOURS`` nearest to each query (local
     kriging). Residuals of channels are limited to ``kriging.fit.LOUDEST`` times the receiver's median channel.
 
-    It is a look-up: it keeps the links, and is not stored in a checkpoint.
-
     Args:
         trend: Configuration of the model whose residuals the process describes. None: ``friis`` for channels, else each
             receiver's mean label; for labels of one real number this or ``path_loss``.
@@ -63,18 +61,31 @@ class GaussianProcess(Model):
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7 and 5.4.2.
     """
 
+    learnt = ("chosen",)
+
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
         names = ("mean", "path_loss") if scene.task.is_scalar else ("friis" if isinstance(scene.task, Csi) else "mean",)
-        # In plain sequences: their state is no state of this look-up.
         given = [{"name": name} for name in names] if trend is None else [trend]
         self.trends = tuple(build_trend(one, scene) for one in given)
         if any([*built.parameters()] for built in self.trends):
             raise ValueError(f"model.trend cannot be trained, got {trend['name']}; take mean, path_loss or friis")
         self.chosen = 0
-        self.scalar = [ScalarProcess(scene)] if scene.task.is_scalar else []
+        self.scalar = nn.ModuleList([ScalarProcess(scene)] if scene.task.is_scalar else [])
         self.factors: Tensor | None = None
         self.process = Hyperparameters()
+
+    def get_extra_state(self) -> dict:
+        trends = [dict(trend.state_dict()) for trend in self.trends]
+        return super().get_extra_state() | {"process": [*self.process], "trends": trends}
+
+    def set_extra_state(self, state: dict) -> None:
+        super().set_extra_state(state)
+        self.process = Hyperparameters(*state["process"])
+        for trend, own in zip(self.trends, state["trends"], strict=True):
+            trend.load_state_dict(own)
+        if not self.scalar:
+            self._solve_known(chooses=False)
 
     def fit(self, links: Links) -> None:
         """Fits trend and hyperparameters, and factorises the covariances."""
@@ -94,8 +105,13 @@ class GaussianProcess(Model):
             trend.fit(links)
         if self.scalar:
             self._fit_scalar(thinned(links, LIMIT), chooses)
-            return
-        self.factors = None
+        else:
+            self._solve_known(chooses)
+
+    @torch.no_grad()
+    def _solve_known(self, chooses: bool) -> None:
+        """Factorises the covariances of the known links, and takes their residuals over them."""
+        links, self.factors = self.links, None
         if self.scene.task.dtype.is_complex:
             index = torch.cat(self.known)
             residuals = torch.cat([*self._residuals(index)])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.kriging.links import at_directions, coordinates, distances, folds_of, known_links, scale_bounds
-from gaigs.model import Model, Prediction
+from gaigs.model import LookUp, Prediction
 from gaigs.query import Batch, Query, evenly
 from gaigs.registry import register
 from gaigs.scene import Scene
@@ -19,7 +19,7 @@ COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 
 
 @register("model", "knn")
-class KNearestNeighbours(Model):
+class KNearestNeighbours(LookUp):
     """The mean of the k known labels nearest to the transmitter, weighted by 1 / distance^power.
 
     Links as near as the k-th count too, so that the order of links does not matter. Channels of unknown phase are
@@ -37,6 +37,8 @@ class KNearestNeighbours(Model):
 
     Source: reference look-up of the data sets' own README; Shepard, 1968.
     """
+
+    learnt = "chosen", "scale"
 
     def __init__(self, scene: Scene, k: int | None = None, power: float | None = None):
         super().__init__(scene)

@@ -19,7 +19,7 @@ from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, coordinates, folds_of, scaled, single_readings, thinned, without_gross_errors
 from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
-from gaigs.model import Model, Prediction, Wrapper, call_optional
+from gaigs.model import LookUp, Model, Prediction, Wrapper, call_optional
 from gaigs.query import Batch, evenly, thin_labels
 from gaigs.registry import name_of, register, registry
 from gaigs.scene import Scene
@@ -75,7 +75,7 @@ class Kriging(Wrapper):
             raise ValueError(f"kriging needs a trained model, got {name_of(self.trend)}; leave kriging out")
         self.fallback_options = {"name": "mean"} if fallback is None else fallback
         self.fallback = registry("model").build(self.fallback_options, scene=scene)
-        if not self.fallback.state_dict() or [*self.fallback.parameters()]:
+        if isinstance(self.fallback, LookUp) or not self.fallback.state_dict() or [*self.fallback.parameters()]:
             name = self.fallback_options["name"]
             raise ValueError(f"kriging_fallback cannot be {name}; take mean, path_loss or friis")
         self.chunk = self.trend.chunk

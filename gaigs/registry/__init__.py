@@ -445,8 +445,14 @@ def _named(function: Callable) -> dict[str, inspect.Parameter]:
 
 def suggest(word: str, known: Iterable[str]) -> str:
     """A word in quotes, with the most similar known word."""
-    near = difflib.get_close_matches(str(word), known, n=1)
+    near = similar(word, known)
     return f"{word!r} (did you mean {near[0]!r}?)" if near else repr(word)
+
+
+def similar(word: str, known: Iterable[str]) -> list[str]:
+    """The known word that is most similar to a word, or to what other programs call by it; empty without any."""
+    others = {"lr": "learning_rates", "epoch": "max_steps", "epochs": "max_steps", "iterations": "max_steps"}
+    return difflib.get_close_matches(others.get(str(word), str(word)), known, n=1)
 
 
 def listed(words: Iterable[str]) -> str:

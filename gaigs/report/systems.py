@@ -4,7 +4,7 @@ import math
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -133,19 +133,19 @@ def _cells(systems: Sequence[System], published: Sequence[Mapping], titles: Mapp
 
 
 def _texts(rows: Sequence[Mapping], better: Mapping[str, bool], bold: str) -> list[list[str]]:
-    """Lines of a table as text, the best of each column with an entry in ``better`` in the format ``bold``."""
+    """Lines of a table as text, in the format ``bold`` all that print as the best of a column with an entry in
+    ``better``."""
     mean = lambda value: value.mean if isinstance(value, Spread) else value
     best = {}
     for title in better.keys() & rows[0].keys():
         means = [mean(row[title]) for row in rows if row[title] is not None]
-        best[title] = (max if better[title] else min)(means) if len(means) > 1 else None
-    return [
-        [
-            bold.format(written(value)) if value is not None and mean(value) == best.get(title) else written(value)
-            for title, value in row.items()
-        ]
-        for row in rows
-    ]
+        best[title] = written((max if better[title] else min)(means)) if len(means) > 1 else None
+
+    def text(title: str, value: Any) -> str:
+        is_best = value is not None and written(mean(value)) == best.get(title)
+        return bold.format(written(value)) if is_best else written(value)
+
+    return [[text(title, value) for title, value in row.items()] for row in rows]
 
 
 def write_systems(

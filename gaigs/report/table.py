@@ -152,10 +152,10 @@ def _receivers_table(receivers: Mapping, name: str, metric: Metric) -> Table:
 
 
 def _cells(models: Mapping, name: str, higher_is_better: bool) -> dict[str, str]:
-    """One metric of each model as text, the best in bold."""
-    best = (max if higher_is_better else min)(scores[name] for scores in models.values())
+    """One metric of each model as text, in bold all that print as the best."""
+    best = written((max if higher_is_better else min)(scores[name] for scores in models.values()))
     texts = {model: written(scores[name]) for model, scores in models.items()}
-    return {model: f"[bold]{text}[/bold]" if models[model][name] == best else text for model, text in texts.items()}
+    return {model: f"[bold]{text}[/bold]" if text == best else text for model, text in texts.items()}
 
 
 def verdict(metrics: Mapping) -> str:

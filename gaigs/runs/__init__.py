@@ -17,7 +17,7 @@ from gaigs.kriging.links import check_known
 from gaigs.model import Model, call_optional
 from gaigs.processes import is_first, limited_threads, only_run
 from gaigs.radio_maps import radio_map
-from gaigs.registry import check_type, only_recorded, registry
+from gaigs.registry import check_type, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store, stored_software, warn_of_changes
 from gaigs.stages import stage
@@ -71,8 +71,7 @@ def run(config: dict, folder: Path) -> dict | None:
 def load(path: str | Path, trust: bool = False) -> Model:
     """The model of a checkpoint or of a finished run, ready to predict.
 
-    A checkpoint needs neither data nor Hydra. The folder of a run with a look-up needs the data, to which it is fitted
-    anew.
+    It needs neither data nor Hydra.
 
     Args:
         path: ``best.ckpt`` or ``last.ckpt`` of a run, a file of ``Model.save``, or the folder of a run.
@@ -100,23 +99,16 @@ def load(path: str | Path, trust: bool = False) -> Model:
         loaded: Any = checkpoint.load(path, trust, {})
         return loaded
     folder, config = Path(path), configuration_of(path)
-    recorded, model = stored_software(folder), config["model"]
-    if (folder / "best.ckpt").is_file():
-        trained: Any = checkpoint.load(folder / "best.ckpt", trust, recorded)
-        if config["kriging"] and not hasattr(trained, "krige"):
-            raise ValueError(f"the run in {folder} is not finished: it lacks its kriging\nstart it again, it goes on")
-    else:
-        from gaigs.runs.training import fit
-
-        with only_recorded(None if trust else recorded):
-            links = links_of(folder)
-            built = registry("model").build(model, scene=links.scene)
-            if [*built.parameters()]:
-                raise FileNotFoundError(f"{folder} has no best.ckpt: the run is not finished; start it again")
-            fitted = fit(built, registry("loss").build(config["loss"], task=links.task), links, config, folder)
-        trained = fitted.models[model["name"]]
-    warn_of_changes(folder, model)
-    return trained
+    if not (folder / "best.ckpt").is_file():
+        raise FileNotFoundError(
+            f"{folder} has no best.ckpt: the run is not finished, or one of a look-up by gaigs 0.3\n"
+            "start it again, a finished one in another folder"
+        )
+    model: Any = checkpoint.load(folder / "best.ckpt", trust, stored_software(folder))
+    if config["kriging"] and not hasattr(model, "krige"):
+        raise ValueError(f"the run in {folder} is not finished: it lacks its kriging\nstart it again, it goes on")
+    warn_of_changes(folder, config["model"])
+    return model
 
 
 def configuration_of(folder: str | Path) -> dict:
@@ -164,7 +156,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     fitted = fit(None, loss, links, config, folder)
     if fitted is None:
         return None
-    model, is_trained = fitted.models[name], bool(fitted.unseen)
+    model, is_trained, best = fitted.models[name], bool(fitted.unseen), folder / "best.ckpt"
     own = {} if is_trained else {name: registry("model").build(config["model"], scene=scene)}
     # Shares of the run's limit; maps and figures have the rest.
     with stage(until=0.86):
@@ -184,7 +176,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "num_gaussians": count_gaussians(model),
         "num_gaussians_start": fitted.start,
         "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
-        "checkpoint_bytes": (folder / "best.ckpt").stat().st_size if is_trained else None,
+        "checkpoint_bytes": best.stat().st_size if best.is_file() else None,
         "models": {name: evaluation.summary(task, values) for name, values in scores.items()},
         "validation": {name: evaluation.summary(task, values) for name, values in validation.items()},
         "validation_score": validation[name][task.monitor].mean().item() if validation else None,

@@ -68,8 +68,8 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
     Example:
         >>> links = gaigs.links("synthetic", transmitters=40, order=0)
         >>> model = gaigs.train("gaigs", links, max_steps=1, count=20, enable_progress_bar=False)
-        >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape
-        torch.Size([2, 90, 360])
+        >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape  # places, receivers, rows, columns
+        torch.Size([2, 1, 90, 360])
     """
     if not isinstance(model, str | Model) or not isinstance(links, Links):
         raise TypeError(f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}")
@@ -158,6 +158,8 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     if not is_trained(model):
         with stages.stage(until=0.8):
             model.calibration = calibrated(model, links)
+        if is_first() and model.state_dict():
+            checkpoint.save(model, folder / "best.ckpt")
         return Fitted({name: model}, {}, start)
     with stages.stage(until=0.5 / config["ensemble"]):
         model, seconds = descend(model, loss, links, config, folder, searched)

@@ -55,7 +55,9 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
     """Predictions for a query, the same positions, grids of them and single directions."""
     task, places, receiver = links.task, query.transmitters, int(query.receivers[0])
     frequency = None if query.frequencies is None else float(query.frequencies[0])
-    predict = lambda places, **options: model.predict(places, receiver, frequency, **options)
+    # A receiver for each place: where arrays have different numbers of elements, values are padded as those of a query.
+    heard = lambda places: torch.full(places.shape[:-1], receiver)
+    predict = lambda places, **options: model.predict(places, heard(places), frequency, **options)
     values = model.train().predict(query)
     require(model.training, "predict must leave the model in the mode it was in")
     require_tensor("predictions", values, (len(places), *task.shape), task.dtype)

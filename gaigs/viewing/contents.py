@@ -138,23 +138,17 @@ class Contents:
             step: Every so many rows and columns of a spectrum.
         """
         answer: dict[str, Any] = {}
-        heard: Any = receiver
-        points = torch.tensor([place])
+        value, std, snr = self._estimate(torch.tensor([place]), None if self.kind == "level" else receiver)
         if self.kind == "level":
-            heard = torch.arange(len(self.scene.receivers))
-            points = points.expand(len(heard), 3)
-        value, std, snr = self._estimate(points, heard)
-        own = slice(len(self.scene.receivers[receiver].array))  # elements
-        if self.kind == "level":
-            answer["levels"] = plain(value)
-            answer["stds"] = None if std is None else plain(std)
+            answer["levels"] = plain(value[0])
+            answer["stds"] = None if std is None else plain(std[0])
         elif self.kind == "spectrum":
             answer["image"] = grey(value[0], step)
             answer["std"] = None if std is None else grey(std[0], 2 * step)  # it is smooth
         elif self.kind == "channel":
             answer["curves"] = {"predicted": self._curve(value[0], int(loudest(value[0])))}
-            answer["level"] = plain(level(value[:, own])[0])
-            answer["std"] = None if std is None else plain(level(std[:, own])[0])
+            answer["level"] = plain(level(value)[0])
+            answer["std"] = None if std is None else plain(level(std)[0])
             answer["snr"] = None if snr is None else plain(snr[0].clamp_max(140))
         query, _ = Query.from_positions([place], receiver, self.frequency, self._names, self.scene.frequencies)
         with self.lock:
@@ -172,8 +166,7 @@ class Contents:
         # In parts, so that a drag need not wait for the whole map.
         parts = torch.from_numpy(places.reshape(-1, 3)).split(POINTS)
         found = torch.cat([self._estimate(part, receiver)[0] for part in parts])
-        own = slice(len(self.scene.receivers[receiver].array))
-        values = level(found[:, own]) if found.is_complex() else found
+        values = level(found) if found.is_complex() else found
         return {"x": plain(x), "y": plain(y), "height": plain(height), "values": plain(values)}
 
     def comparison(self, number: int, step: int = 1) -> dict:

@@ -220,7 +220,7 @@ def test_intervals_of_the_process_hold_their_share():
 def test_labels_that_the_trend_explains_are_predicted_by_it(level):
     links = drawn()
     links.labels.fill_(level)
-    torch.testing.assert_close(fitted(links).predict(BOX * torch.rand(4, 3)), torch.full((4,), level))
+    torch.testing.assert_close(fitted(links).predict(BOX * torch.rand(4, 3), 0), torch.full((4,), level))
 
 
 def test_places_measured_often_are_predicted_by_the_mean_of_their_readings():

@@ -42,6 +42,23 @@ def test_look_ups_predict_nothing_at_missing_elements(links, name):
     assert values[is_small][:, :9].abs().min() > 0
 
 
+def test_all_receivers_are_predicted_each_with_its_own_elements(links):
+    model = gaigs.train("friis", links)
+    places, names = links.query.transmitters[:2], [receiver.name for receiver in links.receivers]
+    found = model.predict(places, interval=0.5)
+    assert {name: tuple(one.value.shape) for name, one in found.items()} == {names[0]: (2, 16, 4), "small": (2, 9, 4)}
+    for number, name in enumerate(names):
+        query = Query(places, torch.full((2,), number), links.query.frequencies[:2])
+        padded = model.predict(query)
+        assert torch.equal(found[name].value, padded[:, : len(links.receivers[number].array)])
+        assert torch.equal(found[name].value, model.predict(places, name))
+        assert torch.equal(found[name].value, model.predict(places)[name])
+        assert torch.equal(found[name].snr_db, model.predict(query, interval=0.5).snr_db)
+        assert found[name].std.isfinite().all()
+        parts = [part[name] for part in model.predict_batches(places, batch_size=1)]
+        assert torch.equal(found[name].value, torch.cat(parts))
+
+
 def test_friis_has_the_gains_that_each_receiver_has_alone(links):
     both, alone = (registry("model").build("friis", scene=own.scene) for own in (links, one(links, 1)))
     both.fit(links)

@@ -8,7 +8,7 @@ import torch
 
 import gaigs
 from gaigs.data import Split
-from gaigs.geometry import Grid, Rays
+from gaigs.geometry import ExtrapolationWarning, Grid, Rays
 from gaigs.kriging.links import distances
 from gaigs.model.knn import KNearestNeighbours
 from gaigs.model.mean import Mean
@@ -33,7 +33,7 @@ def test_where_a_training_link_stands_its_label_comes_back(links, shift, power):
     links = replace(links, query=replace(links.query, transmitters=links.query.transmitters + shift))
     model = KNearestNeighbours(links.scene, 3, power)
     model.fit(links)
-    predictions = model.predict(links.query.transmitters[:4:2])
+    predictions = model.predict(links.query.transmitters[:4:2], 0)
     torch.testing.assert_close(predictions, links.labels[:4:2], rtol=1e-5, atol=1e-5)
 
 
@@ -81,6 +81,29 @@ def test_the_number_of_neighbours_follows_from_held_out_groups():
     assert chosen[1] == 1
 
 
+@pytest.mark.parametrize("receivers", [1, 2])
+def test_all_receivers_answer_unless_one_is_named(receivers):
+    """The shape does not depend on their number: a single one has its axis too."""
+    links = gaigs.links(
+        task="rssi",
+        transmitters=[[1.0, 1.0, 1.0], [2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [2.0, 2.0, 1.0]],
+        receivers=[[0.0, 0.0, 2.0], [3.0, 3.0, 2.0]][:receivers],
+        labels=torch.tensor([[-40.0, -50.0], [-45.0, -55.0], [-50.0, -60.0], [-47.0, -58.0]])[:, :receivers],
+        test_rows=[3],
+    )
+    model = KNearestNeighbours(links.scene, 2)
+    model.fit(links)
+    places = torch.tensor([[1.0, 1.5, 1.0], [2.0, 1.2, 1.0], [90.0, 1.2, 1.0]])
+    with pytest.warns(ExtrapolationWarning, match="1 of 3 positions"):
+        found = model.predict(places, batch_size=1)
+    assert found.shape == (3, receivers)
+    assert model.predict(places[0]).shape == (receivers,)
+    assert [part.shape for part in model.predict_batches(places[:2], batch_size=receivers)] == [(1, receivers)] * 2
+    for number in range(receivers):
+        assert torch.equal(found[:2, number], model.predict(places[:2], f"rx{number}"))
+        assert torch.equal(found[:, number], model.predict(Query(places, torch.full((3,), number))))
+
+
 # --- directions ---
 
 
@@ -89,14 +112,29 @@ def test_each_direction_gets_the_nearest_row_and_column(build):
     links = example_links()  # elevations 4, 9 .. 89 deg, azimuths 0, 10 .. 350 deg
     model = build(links.scene)
     model.fit(links)
-    whole, grid = model.predict(torch.zeros(2, 3)), links.task.directions
+    whole, grid = model.predict(torch.zeros(2, 3), 0), links.task.directions
     elevations, azimuths = torch.tensor([[6, 7, 60, 90, 0.0], [4, 356, -11, 724.9, 125.1]]).deg2rad()
     assert not torch.isin(elevations, grid.elevations).any()
-    found = model.predict(torch.zeros(2, 3), directions=Rays(elevations, azimuths))
+    found = model.predict(torch.zeros(2, 3), 0, directions=Rays(elevations, azimuths))
     assert torch.equal(found, whole[:, [0, 1, 11, 17, 0], [0, 0, 35, 0, 13]])
     coarse = Grid(elevations[:3], azimuths[:4])
-    found = model.predict(torch.zeros(2, 3), directions=coarse)
+    found = model.predict(torch.zeros(2, 3), 0, directions=coarse)
     assert torch.equal(found, whole[:, [0, 1, 11]][:, :, [0, 0, 35, 0]])
+
+
+# --- state ---
+
+
+@pytest.mark.parametrize(("most", "dtype"), [(255, torch.uint8), (256, torch.float32)])
+def test_images_of_eight_bits_are_stored_in_bytes(most, dtype):
+    links = example_links()
+    links = replace(links, labels=torch.randint(most + 1, links.labels.shape).float() / most)
+    model, twin = (KNearestNeighbours(links.scene, 3) for _ in range(2))
+    model.fit(links)
+    state = model.state_dict()
+    assert {part.dtype for part in state["_extra_state"]["labels"]} == {dtype}
+    twin.load_state_dict(state)
+    assert torch.equal(twin.predict(links.query), model.predict(links.query))
 
 
 # --- several carriers ---

@@ -55,7 +55,7 @@ def answering(model, fields):
 def test_the_label_is_the_simulators_for_the_same_fields(build, seed):
     grid, array = Grid.degrees(), Array.planar(4, 4, 0.5)
     fields = torch.randn(16, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed))
-    predicted = answering(build(seen_in(grid)), fields).predict(SOMEWHERE[:1])
+    predicted = answering(build(seen_in(grid)), fields).predict(SOMEWHERE[:1], 0)
     # In units of wavelengths, at the frequency at which a wavelength is 1 m.
     expected = min_max(bartlett(fields[None, :, None], grid, array, speed_of_light)).float()
     torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-5)
@@ -65,7 +65,7 @@ def test_at_a_pitch_of_one_wavelength_lobes_repeat(build):
     # cos az cos el is 1/2 and -1/2 there: one period of the pattern, 1 / pitch, apart.
     scene = seen_in(Grid.degrees([60, 1, 90], [0, 90, 180]))
     fields = torch.randn(16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
-    spectra = [answering(build(scene, pitch=p), fields).predict(SOMEWHERE[:1])[0] for p in (1.0, 0.5)]
+    spectra = [answering(build(scene, pitch=p), fields).predict(SOMEWHERE[:1], 0)[0] for p in (1.0, 0.5)]
     apart = [abs(float(spectrum[0, 0] - spectrum[0, 2])) for spectrum in spectra]
     assert apart[0] < 1e-5 < 0.1 < apart[1]
 
@@ -97,7 +97,7 @@ def test_the_gradient_is_that_of_the_plain_formula(build):
 def test_any_directions_get_the_arrays_answer(build):
     fields = torch.randn(16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
     model = answering(build(), fields)
-    (whole,), query = model.predict(SOMEWHERE[:1]), Query(SOMEWHERE[:1], torch.tensor([0]))
+    (whole,), query = model.predict(SOMEWHERE[:1], 0), Query(SOMEWHERE[:1], torch.tensor([0]))
     chosen = torch.tensor([600, 3, 77, 3])
     (rays,) = model(Batch(query, GRID.flatten()[chosen])).value
     torch.testing.assert_close(rays, whole.flatten()[chosen], rtol=0, atol=1e-5)

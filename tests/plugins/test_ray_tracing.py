@@ -215,7 +215,7 @@ def test_places_of_the_data_are_traced_once_and_few_others_are_kept(tracer, hall
     model.predict(links.query)
     assert traced == []
     elsewhere = torch.tensor([[1.0, 1.1, 1.2], [1.3, 1.4, 1.5], [1.0, 1.1, 1.2]])
-    first = model.predict(elsewhere)
+    first = model.predict(elsewhere, 0)
     assert torch.equal(model.predict(elsewhere, receiver=0), first)
     assert traced == [2]
     model.predict(elsewhere[0] + 0.1)
@@ -283,7 +283,7 @@ def test_where_no_path_leads_a_reading_is_low_and_finite(tracer, hall):
     model = build(links.scene, calibrate=False, mesh=str(hall))
     model.fit(links)
     model.log_gains.zero_()
-    assert model.predict([2.9, 1.45, 0.3]).item() == pytest.approx(-150)  # in the chest
+    assert model.predict([2.9, 1.45, 0.3], 0).item() == pytest.approx(-150)  # in the chest
 
 
 # --- calibration ---
@@ -469,4 +469,4 @@ def test_a_run_stores_the_materials(tracer, tmp_path):
     assert metrics["materials"].keys() == set(model.known)
     assert metrics["num_parameters"] == 2 * len(model.known) + 2
     with np.load(tmp_path / "run/predictions.npz") as kept:
-        np.testing.assert_allclose(model.predict(kept["transmitters"]), kept["prediction"], atol=1e-7)
+        np.testing.assert_allclose(model.predict(kept["transmitters"], 0), kept["prediction"], atol=1e-7)

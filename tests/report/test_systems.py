@@ -164,6 +164,14 @@ def test_runs_of_one_model_are_no_table_of_systems(tmp_path):
     assert not [*tmp_path.glob("systems*")]
 
 
+def test_all_systems_that_print_as_the_best_are_bold(tmp_path):
+    for model, score in (("gaigs", 0.97712), ("mlp", 0.97708), ("fire", 0.9764)):
+        write_system(tmp_path, model, score)
+    report(tmp_path)
+    lines = (tmp_path / "systems.md").read_text().splitlines()
+    assert [line.split(" | ")[0].strip("| ") for line in lines if "**0.977**" in line] == ["MLP", "GAI-GS"]
+
+
 def test_other_settings_have_rows_of_their_own_without_published_figures(tmp_path):
     for model in ("gaigs", "mlp"):
         for width in (8, 16):

@@ -57,6 +57,10 @@ def test_best_of_each_metric_is_bold():
     assert "\x1b[1m3.250\x1b[0m" in errors
     assert "\x1b[1m6.250\x1b[0m" not in errors
     assert errors.count("\x1b[1m14.0\x1b[0m") == 2  # a tie
+    nearly = printed(
+        metrics_table(run("spectrum", gaigs=spectrum(0.97712, 0.04), knn=spectrum(0.97708, 0.05))), styles=True
+    )
+    assert nearly.count("\x1b[1m0.977\x1b[0m") == 2, "equal as printed"
 
 
 def test_table_says_where_the_numbers_come_from():

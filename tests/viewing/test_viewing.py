@@ -61,7 +61,7 @@ def content(page):
 def test_a_spectrum_and_its_paths_are_the_models(mirrored):
     place = [1.0, 1.2, 1.1]
     answer = Contents(mirrored).answer(place, 0, step=2)
-    expected = mirrored.predict([place])[0, ::2, ::2].clamp(0, 1)
+    expected = mirrored.predict([place])[0, 0, ::2, ::2].clamp(0, 1)
     np.testing.assert_allclose(pixels(answer["image"]) / 255, expected, atol=0.5 / 255 + 1e-6)
     strongest, *others = answer["paths"]
     assert others
