@@ -321,7 +321,7 @@ def _options(config: Mapping, parts: Iterable[str], prefix: str = "") -> Iterato
 
 def nearest(word: str, config: Mapping) -> str:
     """Full keys of the options with the name most similar to a word, joined by or; empty if none is similar."""
-    parts = config.keys() - {"hydra", "survey", "locate", "export", "view", "benchmark"}
+    parts = config.keys() - {"hydra", "survey", "locate", "export", "view"}
     keys = {key: key.rpartition(".")[2] for key in (*parts, *_options(config, parts))}
     near = similar(word, {*keys.values()} - {"name"})
     found = [key for key in near if key in config] or sorted(key for key, name in keys.items() if name in near)
