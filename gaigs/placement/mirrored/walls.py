@@ -27,7 +27,8 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
     Args:
         file: ``.csv`` with consecutive vertices x,y of a floor plan [m], whose walls are upright, or ``.obj`` with the
             faces of a mesh [m].
-        lower, upper: Corners of the box of transmitters and receivers, with floor and ceiling of a floor plan.
+        lower, upper: Corners of the box of transmitters and receivers, with floor and ceiling of a floor plan unless
+            all stand at one height.
     """
     if not file.is_file():
         raise FileNotFoundError(f"no walls at {file}; set placement.walls to a .csv or .obj, or to null")
@@ -38,6 +39,8 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
         lengths = along.norm(dim=1)
         normals = torch.stack((along[:, 1], -along[:, 0], 0 * lengths), 1)
         level = torch.tensor([[0.0, 0.0, 1.0, upper[2]], [0.0, 0.0, -1.0, -lower[2]]])
+        if upper[2] - lower[2] < 0.01:  # [m]; floor and ceiling would hold all places
+            level = level[:0]
         walls = _merged(normals[lengths > SHORTEST], ends[lengths > SHORTEST, 0], lengths[lengths > SHORTEST])
         # A room has floor and ceiling before a fifth wall.
         planes = torch.cat((walls[:4], level, walls[4:])) if len(walls) else walls

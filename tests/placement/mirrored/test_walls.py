@@ -35,6 +35,8 @@ def test_a_floor_plan_has_upright_walls_by_length_then_floor_and_ceiling_of_the_
     assert {*found[:2]} == {(0, -1, 0, 0), (0, 1, 0, 3)}
     assert {*found[2:4]} == {(1, 0, 0, 4), (-1, 0, 0, 0)}
     assert {*found[4:]} == {(0, 0, 1, 2.2), (0, 0, -1, -0.4)}
+    flat = read_planes(tmp_path / "plan.csv", LOWER, torch.tensor([3.5, 2.5, LOWER[2]]))
+    assert torch.equal(flat, planes[:4])
 
 
 def test_walls_at_any_angle_hold_their_own_ends(tmp_path):
