@@ -17,6 +17,8 @@ FILES = {
     for file in (ROOT / "gaigs").rglob("*.py")
 }
 LONGEST_CHAIN = 12
+LIMITS = {"lines of gaigs/": 31_450, "lines of a file": 950}
+"""Raised only with a reason. The checks of data against geometry (``data/checks``) took 1,700 lines."""
 
 
 @pytest.fixture(scope="module")
@@ -113,3 +115,9 @@ def test_a_components_name_is_its_files(kind):
 def test_class_names_are_unique():
     names = [node.name for tree in FILES.values() for node in tree.body if isinstance(node, ast.ClassDef)]
     assert sorted(name for name in {*names} if names.count(name) > 1) == []
+
+
+def test_the_package_keeps_its_size():
+    lines = [len(file.read_text().splitlines()) for file in (ROOT / "gaigs").rglob("*.py")]
+    assert sum(lines) <= LIMITS["lines of gaigs/"]
+    assert max(lines) <= LIMITS["lines of a file"]
