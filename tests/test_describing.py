@@ -48,9 +48,9 @@ FAULTS = {
     ),
     "centimetres": (
         {"gateways": 100 * GATEWAYS},
-        "if the receivers' coordinates are times 0.01",
+        "if rx are in cm",
     ),
-    "axes": ({"gateways": GATEWAYS[:, [1, 0, 2]]}, "to .* dB instead of .* if the receivers' x and y are exchanged"),
+    "axes": ({"gateways": GATEWAYS[:, [1, 0, 2]]}, "to .* dB instead of .* if rx have x and y exchanged"),
     "far": (
         {"places": PLACES + np.array([5e4, 0, 0])},
         "receivers are .* m from all places",

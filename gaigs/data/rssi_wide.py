@@ -425,5 +425,5 @@ def _to_world(
     if far.any():
         file = table.file if far[:count].any() else gateways
         found = ", ".join(f"{x:g}" for x in points[far][0])
-        raise ValueError(f"{file}: expected places within 100 km of each other, got one at ({found}) m")
+        raise ValueError(f"{file}: expected places within 100 km of each other, got one at ({found}) m; in mm or cm?")
     return points, Frame(utm, *origin.tolist()) if utm else None, remark

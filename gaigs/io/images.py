@@ -46,7 +46,8 @@ class GreyImages:
             with _opened(self.files[k]) as image:
                 image.verify()  # compares the checksums, which decoding does not
             with _opened(self.files[k]) as image:
-                grey = _grey(self.files[k], image)
+                image.load()
+            grey = _grey(self.files[k], image)
             wide = 257 if self._pixels.dtype == np.uint16 and grey.dtype == np.uint8 else 1  # 255 becomes 65535
             self._pixels[k] = grey.astype(self._pixels.dtype) * self._pixels.dtype.type(wide)
             self._decoded[k] = True

@@ -247,7 +247,7 @@ def read_table(file: Path, content: str) -> Table:
 
     def number(cell: str) -> float:
         if cell not in numbers:
-            text = re.sub(r"(?i)\s*dbm$", "", cell.replace("−", "-"))
+            text = re.sub(r"(?i)\s*dbm$", "", cell)
             value = to_number(text.replace(",", ".") if has_commas else text)
             numbers[cell] = math.inf if math.isnan(value) and text.strip().lower() not in EMPTY else value
         return numbers[cell]
@@ -285,7 +285,8 @@ def to_coordinates(file: Path, rows: Rows, names: Sequence[str]) -> list[list[fl
 
 def to_number(cell: str) -> float:
     """The number in a cell; NaN for any other text."""
-    return float(cell) if NUMBER.fullmatch(cell.strip()) else math.nan
+    plain = cell.strip().replace("−", "-")
+    return float(plain) if NUMBER.fullmatch(plain) else math.nan
 
 
 def to_index(text: str) -> int | None:

@@ -51,6 +51,7 @@ class Task(ABC):
         directions: Directions of a label's pixels; None for a label without.
         lowest: Least possible number of a real label.
         limits: Bounds of the numbers of labels that are read: others are of another unit, or marks.
+        beyond: What errors add on numbers beyond these bounds.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Task(ABC):
     directions: Grid | None = None
     lowest: float = -math.inf
     limits: tuple[float, float] = (-math.inf, math.inf)
+    beyond: str = ""
 
     @property
     @abstractmethod
@@ -175,7 +177,7 @@ def check_range(task: Task, labels: Tensor, name: str) -> None:
         bounds = f"from {lowest:g} to {highest:g} {task.unit}".rstrip()
         raise ValueError(
             f"{name} of task {task.name!r} must be {bounds}, nan where nothing was heard; "
-            f"those of number {row} are from {low:g} to {high:g}"
+            f"those of number {row} are from {low:g} to {high:g}{task.beyond}"
         )
 
 

@@ -13,3 +13,4 @@ class Rssi(Scalar):
 
     name, quantity, unit, error_unit = "rssi", "RSSI", "dBm", "dB"
     limits = -200.0, 30.0
+    beyond = "\nconvert path losses, percent, volts and powers to dBm"

@@ -11,7 +11,7 @@ from torch import Tensor
 from gaigs.data.checks.conventions import conventions
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.hypotheses import Sample, sample_at
-from gaigs.data.checks.subcarriers import check_constant_subcarriers, order_of_subcarriers
+from gaigs.data.checks.subcarriers import check_constant_subcarriers, check_powers, order_of_subcarriers
 from gaigs.data.checks.waves import aligned_likeness, coherence, has_extent, level_share, likeness, without_geometry
 from gaigs.phases import MANY, phase_sign, strange_parts, unknown_phase
 from gaigs.query import evenly
@@ -44,8 +44,22 @@ def check_channels(links: Any) -> Iterator[Finding]:
     parts = [evenly(known[every == receiver], 64) for receiver in range(len(links.receivers))]
     train = torch.cat(parts)
     sample = sample_at(links, train)
+    yield from check_powers(sample)
+    yield from check_signs(sample)
     order = order_of_subcarriers(sample)
     yield from [order] if order is not None else check_phases(links, train, sample)
+
+
+def check_signs(sample: Sample) -> Iterator[Finding]:
+    """A finding if channels lack a part, or if one that is never negative seems to be their amplitude."""
+    parts = {"real": sample.labels.real, "imaginary": sample.labels.imag}
+    for name, part in parts.items():
+        if sample.labels.numel() < 100 or part.min() < 0:
+            continue
+        what = "0 or more" if part.any() else "0"
+        text = f"{name} parts are {what} at all links, elements and subcarriers"
+        mend = "of amplitudes a and phases p [rad] give a * np.exp(1j * p); amplitudes or one part alone are no channel"
+        yield Finding("parts of channels", text, mend)
 
 
 def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterator[Finding]:
@@ -60,7 +74,7 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     coherent = Measure(coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links")
     each = likeness if has_gain else aligned_likeness
     within = Measure(each, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link")
-    level = Measure(level_share, 0.4, 0.5, "distance explains {} of the levels' variance", "of the variance of levels")
+    level = Measure(level_share, 0.22, 0.3, "distance explains {} of the levels' spread", "of the spread of levels")
     for score in (coherent,) * is_known + (within,) * (not sign):
         found = best_convention(few, score)
         if found is not None:

@@ -30,6 +30,7 @@ def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[
         ends = [("tx",), ("rx",), ("elements",), ("tx", "rx"), ("tx", "rx", "elements")]
         yield from of_arrays(sample)
     yield from of_axes(sample, ends)
+    yield from of_frames()
     yield from of_angles()
     yield from of_units(ends)
     yield from of_receivers(sample, measure)
@@ -40,10 +41,10 @@ def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
     if len(sample.frequencies) > 1:
         name = "subcarriers are in reversed order, or path coefficients are conjugate"
         mend = "h = h[..., ::-1], or of conjugate coefficients h = h.conj()[..., ::-1]"
-        yield _changing(name, ["labels"], lambda labels: labels.flip(2), mend)
+        yield changing(name, ["labels"], lambda labels: labels.flip(2), mend)
     for unit, factor in {"kHz": 1e3, "MHz": 1e6}.items():
         mend = f"frequencies = {factor:g} * frequencies"
-        yield _changing(f"frequencies are in {unit}", ["frequencies"], partial(torch.mul, other=factor), mend)
+        yield changing(f"frequencies are in {unit}", ["frequencies"], partial(torch.mul, other=factor), mend)
     is_constant = sample.labels.sgn().mean(0).abs() > 0.9999  # (e, s), the phase of all links
     is_relative = is_constant[:, 0].any() and not is_constant[:, -1].any()
     if is_relative or is_constant.all():
@@ -56,13 +57,13 @@ def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
 
 def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
     """Orders and units of elements, and orientations."""
-    yield _changing("elements are in reversed order", ["labels"], lambda labels: labels.flip(1), "h = h[:, ::-1]")
+    yield changing("elements are in reversed order", ["labels"], lambda labels: labels.flip(1), "h = h[:, ::-1]")
     count = sample.labels.shape[1]
     for rows in range(2, count // 2 + 1):
         if count % rows == 0:
             mend = f"h = h.reshape(len(h), {rows}, {count // rows}, -1).swapaxes(1, 2).reshape(h.shape)"
             name = "elements are in another order of rows and columns"
-            yield _changing(name, ["labels"], partial(_transposed, rows=rows), mend)
+            yield changing(name, ["labels"], partial(_transposed, rows=rows), mend)
     wavelength = speed_of_light / sample.frequencies.mean().item()
     yield _scaled(["elements"], "wavelengths", wavelength)
     yield _scaled(["elements"], "half wavelengths", wavelength / 2)
@@ -79,7 +80,7 @@ def of_orientations(sample: Sample) -> Iterator[Hypothesis]:
         ("quaternions have the order w, x, y, z", partial(_rolled, by=-1), "quaternion = np.roll(quaternion, -1)"),
         ("quaternions have the order x, y, z, w", partial(_rolled, by=1), "quaternion = np.roll(quaternion, 1)"),
     ):
-        yield _changing(name, ["rotations"], move, mend)
+        yield changing(name, ["rotations"], move, mend)
 
 
 def of_axes(sample: Sample, ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
@@ -98,7 +99,7 @@ def of_axes(sample: Sample, ends: Sequence[Sequence[str]]) -> Iterator[Hypothesi
             signs[axis] = -1
             if own == ("elements",) or not has_wall[axis]:
                 yield _everywhere(own, f"{subject} have {name} negated", f" * {signs}", torch.tensor(signs).diag())
-    for own in ("tx",), ("rx",):
+    for own in (own for own in ends if own in (("tx",), ("rx",))):
         for name, order in {"y, z, x": [2, 0, 1], "z, x, y": [1, 2, 0]}.items():
             yield _everywhere(own, f"{own[0]} have the order {name}", f"[:, {order}]", torch.eye(3)[:, order])
 
@@ -113,14 +114,35 @@ def of_angles() -> Iterator[Hypothesis]:
         ("radians taken for degrees", _widened, "angles = np.rad2deg(angles)"),
     ):
         yield Hypothesis(f"tx are of {name}", partial(_about_receivers, move=move), mend)
-        yield _changing(f"tx are of {name} about the origin", ["transmitters"], move, mend)
+        yield changing(f"tx are of {name} about the origin", ["transmitters"], move, mend)
 
 
 def of_units(ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
-    """Places and elements in other units than metres."""
-    for own in sorted(ends, key=len, reverse=True):
-        for unit, factor in {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "km": 1e3}.items():
+    """Places and elements in other units than metres; km is the rarest."""
+    for unit, factor in {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "km": 1e3}.items():
+        for own in sorted(ends, key=len, reverse=True):
             yield _scaled(own, unit, factor)
+
+
+def of_frames() -> Iterator[Hypothesis]:
+    """Transmitters whose origin is their receiver."""
+    yield Hypothesis("tx are relative to rx", _from_receivers, "tx = tx + rx")
+
+
+def of_plans(sample: Sample) -> Iterator[Hypothesis]:
+    """Receivers that are drawn from another end or point of the transmitters' plan."""
+    low, high = sample.transmitters.amin(0), sample.transmitters.amax(0)
+    for name, axes in {"x": [0], "y": [1], "x and y": [0, 1]}.items():
+        move = partial(_mirrored, ends=low + high, axes=axes)
+        mend = f"rx[:, {axes}] = (tx.min(0) + tx.max(0) - rx)[:, {axes}], as rows of a picture run downwards"
+        yield changing(f"rx have {name} from the other end", ["positions"], move, mend)
+    yield _everywhere(("rx",), "rx have x and y negated", " * [-1, -1, 1]", torch.diag(torch.tensor([-1, -1, 1])))
+    for name, point, mend in (
+        ("lowest corner", low, "tx.min(0)"),
+        ("middle", (low + high) / 2, "(tx.min(0) + tx.max(0)) / 2"),
+    ):
+        shift = point * point.new_tensor([1, 1, 0])
+        yield changing(f"the origin of rx is the {name} of tx", ["positions"], shift.add, f"rx[:, :2] += ({mend})[:2]")
 
 
 def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
@@ -138,10 +160,11 @@ def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator
     for order in orders:
         is_shift = len((order - own).remainder(count).unique()) == 1
         name = "rows of rx are exchanged" + ", as by numbers from 1" * is_shift
-        yield _changing(name, ["receivers"], order.__getitem__, f"rx = rx[{order.tolist()}]")
+        yield changing(name, ["receivers"], order.__getitem__, f"rx = rx[{order.tolist()}]")
 
 
-def _changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothesis:
+def changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothesis:
+    """A convention under which some parts of a sample are moved."""
     return Hypothesis(name, partial(_changed, parts=parts, move=move), mend)
 
 
@@ -149,7 +172,7 @@ def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hy
     """Points of some ends times a matrix, which ``mend`` writes in numpy."""
     parts = {"tx": "transmitters", "rx": "positions", "elements": "elements"}
     lines = "; ".join(f"{end} = {end}{mend}" for end in ends)
-    return _changing(name, [parts[end] for end in ends], partial(torch.matmul, other=matrix.double()), lines)
+    return changing(name, [parts[end] for end in ends], partial(torch.matmul, other=matrix.double()), lines)
 
 
 def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
@@ -166,6 +189,16 @@ def _changed(sample: Sample, parts: Sequence[str], move: Move) -> Sample:
 def _about_receivers(sample: Sample, move: Move) -> Sample:
     stands = sample.positions[sample.receivers]
     return replace(sample, transmitters=stands + move(sample.transmitters - stands))
+
+
+def _from_receivers(sample: Sample) -> Sample:
+    return replace(sample, transmitters=sample.transmitters + sample.positions[sample.receivers])
+
+
+def _mirrored(points: Float[Tensor, "r 3"], ends: Float[Tensor, "3"], axes: Sequence[int]) -> Float[Tensor, "r 3"]:
+    moved = points.clone()
+    moved[:, axes] = (ends - points)[:, axes]
+    return moved
 
 
 def _transposed(labels: Complex[Tensor, "n e s"], rows: int) -> Complex[Tensor, "n e s"]:

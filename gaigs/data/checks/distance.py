@@ -35,9 +35,14 @@ class Gain(NamedTuple):
 
 
 def decades(sample: Sample) -> Float[Tensor, " n"]:
-    """Logarithm of each link's distance; below a hundredth of the median distance the law ends."""
-    distances = (sample.transmitters - sample.positions[sample.receivers]).norm(dim=1)
-    return distances.clamp_min(0.01 * distances.median()).clamp_min(1e-9).log10()
+    """Logarithm of each link's distance [m]."""
+    return decades_of((sample.transmitters - sample.positions[sample.receivers]).norm(dim=1))
+
+
+def decades_of(distances: Float[Tensor, "*h n"]) -> Float[Tensor, "*h n"]:
+    """Logarithms of distances [m]; below a hundredth of the median distance the law ends."""
+    least = 0.01 * distances.median(-1, keepdim=True).values
+    return torch.maximum(distances, least).clamp_min(1e-9).log10()
 
 
 def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = False) -> Law:
@@ -67,6 +72,13 @@ def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = 
         scale = 1.4826 * errors.abs().median(-1, keepdim=True).values
         weights = (1.345 * scale.clamp_min(0.1) / errors.abs().clamp_min(1e-9)).clamp_max(1)
     return Law(slopes, errors)
+
+
+def explained(sample: Sample) -> float:
+    """Share of the levels' mean absolute deviation that the law of distance explains."""
+    law = fit_law(decades(sample), sample)
+    mean = fit_law(torch.zeros_like(law.errors), sample)
+    return max(0.0, 1 - (law.errors.abs().mean() / mean.errors.abs().mean().clamp_min(1e-9)).item())
 
 
 def compare(read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6) -> Gain:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gaigs.data.checks.distance import decades, fit_law
+from gaigs.data.checks.distance import decades, explained, fit_law
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.hypotheses import Sample, sample_of
 from gaigs.data.checks.receivers import check_power, check_receivers, sample_of_given
@@ -72,13 +72,6 @@ def _linear_unit(known: tuple[Sample, list[str]] | None, text: str, middle: floa
     else:
         unit, mend = "microwatts or less", "levels = 10 * np.log10(levels * 1e-3) of microwatts"
     return Finding("unit of levels", f"{text}; are they {unit}?", mend, read, fits, score)
-
-
-def explained(sample: Sample) -> float:
-    """Share of the levels' mean absolute deviation that the law of distance explains."""
-    law = fit_law(decades(sample), sample)
-    mean = fit_law(torch.zeros_like(law.errors), sample)
-    return max(0.0, 1 - (law.errors.abs().mean() / mean.errors.abs().mean().clamp_min(1e-9)).item())
 
 
 def check_signs(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
@@ -190,11 +183,5 @@ def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
 
 def _decibels(sample: Sample) -> Sample:
     """The sample's positive levels as powers."""
-    heard = sample.labels > 0
-    return replace(
-        sample,
-        index=sample.index[heard],
-        transmitters=sample.transmitters[heard],
-        receivers=sample.receivers[heard],
-        labels=10 * sample.labels[heard].log10(),
-    )
+    heard = sample.at((sample.labels > 0).nonzero()[:, 0])
+    return replace(heard, labels=10 * heard.labels.log10())

@@ -28,7 +28,7 @@ def check_places(links: Any) -> Iterator[Finding]:
     given = _given(links)
     stands = _stands(links)
     near = (torch.cdist(sites.double(), stands[given].double()) < 0.01).any(1)
-    if len(sites) > 1 and near.any():
+    if len(sites) > 1 and near.sum() > 1:  # one may be measured beside a receiver
         text = f"{int(near.sum())} places are where a receiver stands"
         yield Finding("places at a receiver", text)
     if links.task.is_scalar:  # antennas of one mast may share their place; levels show whether they do
@@ -54,12 +54,25 @@ def check_extent(links: Any) -> Iterator[Finding]:
         yield Finding("unit of places", text, "are they degrees? convert them to metres, as data=rssi_wide does")
     elif links.frame is None and span < 0.3:  # less than a table
         yield Finding("unit of places", f"places span {span:.3g} m", "are they in km or degrees?")
+    elif links.task.is_scalar and (scale := scale_of(sites)):  # spectra and channels show whether they are
+        yield Finding("unit of places", f"places span {span:.3g} m, as if {scale}", "give them in metres")
     if len(sites) > 1 and given:
         stands = _stands(links)[given]
         closest = torch.cdist(sites.double(), stands.double()).min().item()
         if closest > 10 * max(span, 1e-6):
             text = f"receivers are {closest:.3g} m from all places, which span {span:.3g} m"
             yield Finding("receivers far away", text, "are units and origin alike?")
+
+
+def scale_of(places: Float[Tensor, "n 3"]) -> str:
+    """How places seem to be scaled: to 0..1, -1..1 or -0.5..0.5, or standardised; empty if they are not."""
+    low, high = places.min().item(), places.max().item()
+    for lower, upper in ((0.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)):
+        margin = 0.15 * (upper - lower)  # places seldom reach the walls of the room that was scaled
+        if 0 <= low - lower <= margin and 0 <= upper - high <= margin:
+            return f"scaled to {lower:g}..{upper:g} along each axis"
+    apart = (places.std(0, correction=0) - 1).abs().max()
+    return "standardised along each axis" if max(apart, places.mean(0).abs().max()) < 0.1 else ""
 
 
 def sites_of(query: Query) -> Float[Tensor, "k 3"]:

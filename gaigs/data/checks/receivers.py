@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -12,13 +11,11 @@ from scipy.constants import speed_of_light
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from gaigs.data.checks.distance import Gain, compare, decades, fit_law
+from gaigs.data.checks.conventions import of_axes, of_frames, of_plans, of_units
+from gaigs.data.checks.distance import Gain, compare, decades, decades_of, fit_law
 from gaigs.data.checks.finding import Finding
-from gaigs.data.checks.hypotheses import Hypothesis, Sample, sample_of
-from gaigs.data.gateways import estimate_place
+from gaigs.data.checks.hypotheses import Sample, sample_of
 from gaigs.io.tables import shortened
-
-SCORE = "mean error about the law of distance [dB]"
 
 
 def check_receivers(links: Any) -> Iterator[Finding]:
@@ -27,13 +24,12 @@ def check_receivers(links: Any) -> Iterator[Finding]:
     if known is None:
         return
     sample, names = known
-    read = fit_law(decades(sample), sample).errors
-    found = [*check_conventions(sample, read)]
-    exchanged = [*check_order(sample, read, names)]
+    found = [*check_conventions(sample)]
+    exchanged = [*check_order(sample, names)]
     # Gateways in the corners of a room that is mirrored seem exchanged, too: the clearly closer fit counts.
     if exchanged and (not found or _share(exchanged[0]) < 0.9 * _share(found[0])):
         found = exchanged
-    yield from found or [*check_origin(sample, read)] or check_each(sample, names)
+    yield from found or [*check_origin(sample)] or check_each(sample, names)
 
 
 def check_power(links: Any) -> Iterator[Finding]:
@@ -59,7 +55,7 @@ def check_power(links: Any) -> Iterator[Finding]:
     elif offsets[:, 2].abs().min() > 300 and powers(4e8).quantile(0.95) > 40:
         text = f"receivers are {offsets[:, 2].abs().min():.3g} m above or below all places"
         yield Finding("unit of places", text, "are places in mm?")
-    elif (weak := powers(6e9).max().item()) < -40:
+    elif (weak := powers(6e9).quantile(0.95).item()) < -40:
         yield Finding("unit of places", f"{middle}{weak:.2g} dBm in free space", "are places in km?")
 
 
@@ -76,158 +72,105 @@ def sample_of_given(links: Any, most: int = 2000, fewest: int = 8) -> tuple[Samp
     return _only(sample, kept), [links.receivers[k].name for k in kept.tolist()]
 
 
-def conventions() -> list[Hypothesis]:
-    """Other units and axes of the receivers than of the places."""
-    found = []
-    for factor in (1e-3, 1e-2, 0.3048, 1 / 0.3048, 1e2, 1e3):
-        mend = f"receivers = {factor:.4g} * receivers, or transmitters = {1 / factor:.4g} * transmitters"
-        change = partial(_moved, axes=[0, 1, 2], factors=[factor] * 3)
-        found.append(Hypothesis(f"coordinates are times {factor:.4g}", change, mend))
-    orders = {
-        "x and y are exchanged": [1, 0, 2],
-        "y and z are exchanged": [0, 2, 1],
-        "x and z are exchanged": [2, 1, 0],
-        "axes are y, z, x": [1, 2, 0],
-        "axes are z, x, y": [2, 0, 1],
-    }
-    for name, axes in orders.items():
-        change = partial(_moved, axes=axes, factors=[1.0] * 3)
-        found.append(Hypothesis(name, change, f"receivers = receivers[:, {axes}], or the same of transmitters"))
-    signs = {"x is negated": [-1.0, 1.0, 1.0], "y is negated": [1.0, -1.0, 1.0], "x and y are negated": [-1.0, -1, 1]}
-    for name, factors in signs.items():
-        change = partial(_moved, axes=[0, 1, 2], factors=factors)
-        found.append(Hypothesis(name, change, f"receivers = receivers * {[int(sign) for sign in factors]}"))
-    for name, axes in {"x": [0], "y": [1], "x and y": [0, 1]}.items():
-        mend = f"{name} may run the other way, as rows of a picture do: subtract from the plan's extent"
-        found.append(Hypothesis(f"{name} run from the other end", partial(_mirrored, axes=axes), mend))
-    corner = "receivers = receivers + transmitters.min(0)"
-    found.append(Hypothesis("origin is the lowest corner of the places", _from_corner, corner))
-    return found
-
-
-def check_conventions(sample: Sample, read: Float[Tensor, " n"]) -> Iterator[Finding]:
+def check_conventions(sample: Sample) -> Iterator[Finding]:
     """A finding if levels follow the distance clearly better in another unit or with other axes."""
-    rows = conventions()
+    rows = [*of_frames(), *of_units([("tx",), ("rx",)]), *of_axes(sample, [("rx",)]), *of_plans(sample)]
     logarithms = torch.stack([decades(row.change(sample)) for row in rows])  # (h, n)
     errors = fit_law(logarithms, sample).errors
     best = int(errors.abs().clamp_max(30).mean(1).argmin())
-    gain = compare(read, errors[best], sample)
-    # A directional receiver is louder on one side: another convention has to explain levels better than that.
-    directed = fit_law(decades(sample), sample, patterns=True).errors
-    if gain.is_clear() and gain.fits < compare(directed, directed, sample).read:
-        text = f"levels follow the distance to {gain.fits:.2g} dB instead of {gain.read:.2g} dB if the receivers' "
-        text += rows[best].name
-        yield Finding("coordinates of receivers", text, rows[best].mend, gain.read, gain.fits, SCORE)
+    gain = _gain(sample, errors[best])
+    if gain is not None:
+        yield _finding("coordinates of receivers", "levels", gain, f"if {rows[best].name}", rows[best].mend)
 
 
-def check_order(sample: Sample, read: Float[Tensor, " n"], names: Sequence[str]) -> Iterator[Finding]:
+def check_order(sample: Sample, names: Sequence[str]) -> Iterator[Finding]:
     """A finding if levels of some receivers follow the distance from one another's places."""
     count = len(names)
     if not 2 <= count <= 64:
         return
     apart = torch.cdist(sample.positions, sample.transmitters)  # (r, n)
-    least = 0.01 * apart[sample.receivers, torch.arange(len(read))].median()
-    errors = fit_law(apart.clamp_min(least).clamp_min(1e-9).log10(), sample).errors  # (r, n), from every place
+    errors = fit_law(decades_of(apart), sample).errors  # (r, n), from every place
     sums = torch.zeros(count, count, dtype=errors.dtype)
     sums.index_add_(1, sample.receivers, errors.abs().clamp_max(30))
-    costs = sums / sample.receivers.bincount()
+    costs = (sums / sample.receivers.bincount()).T  # (receiver, place)
     costs.diagonal().mul_(0.9)  # receivers stay unless another place is clearly better
-    places, columns = linear_sum_assignment(costs.numpy())
-    order = [0] * count
-    for place, column in zip(places.tolist(), columns.tolist(), strict=True):
-        order[column] = place
-    directed = fit_law(decades(sample), sample, patterns=True).errors
-    for cycle in _cycles(order):
-        own = torch.isin(sample.receivers, torch.tensor(cycle))
-        part = _only(sample, torch.tensor(sorted(cycle)))
-        other = errors[torch.tensor(order)[sample.receivers[own]], own.nonzero()[:, 0]]
-        gain = compare(read[own], other, part)
-        if not gain.is_clear() or gain.fits > compare(directed[own], other, part).read:
-            continue
-        text = f"levels of {shortened([names[k] for k in cycle])} follow the distance to {gain.fits:.2g} dB instead of "
-        text += f"{gain.read:.2g} dB from the places of {shortened([names[order[k]] for k in cycle])}"
-        mend = "are names or places exchanged?"
-        for step in (1, -1):
-            if count > 2 and order == [(k + step) % count for k in range(count)]:
-                mend = f"are receivers counted from 1? receivers = np.roll(receivers, {-step}, axis=0)"
-        yield Finding("exchanged receivers", text, mend, gain.read, gain.fits, SCORE)
+    order = torch.from_numpy(linear_sum_assignment(costs.numpy())[1])
+    moved = (order != torch.arange(count)).nonzero()[:, 0]
+    own = torch.isin(sample.receivers, moved).nonzero()[:, 0]
+    gain = _gain(_only(sample, moved), errors[order[sample.receivers[own]], own]) if len(moved) else None
+    if gain is None:
+        return
+    mend = "are names or places exchanged?"
+    for step in (1, -1):
+        if count > 2 and torch.equal(order, torch.arange(count).roll(-step)):
+            mend = f"are receivers counted from 1? rx = np.roll(rx, {-step}, axis=0)"
+    others = shortened([names[place] for place in order[moved].tolist()])
+    subject = f"levels of {shortened([names[k] for k in moved.tolist()])}"
+    yield _finding("exchanged receivers", subject, gain, f"from the places of {others}", mend)
+
+
+def check_origin(sample: Sample) -> Iterator[Finding]:
+    """A finding if levels follow the distance clearly better once all receivers are shifted alike."""
+    (x, y), gain = best_shift(sample)
+    if gain is not None and len(sample.positions) > 1:
+        mend = f"rx = rx + [{x:.3g}, {y:.3g}, 0], if their origin is another one"
+        text = f"if all receivers stand ({x:.3g}, {y:.3g}) m elsewhere"
+        yield _finding("origin of receivers", "levels", gain, text, mend)
 
 
 def check_each(sample: Sample, names: Sequence[str], most: int = 4) -> Iterator[Finding]:
-    """Findings about receivers whose levels are those of another place."""
-    for number in _doubtful(sample)[:most]:
+    """Findings about receivers whose levels are those of another place, the clearest first."""
+    found = []
+    for number, name in enumerate(names):
         alone = _only(sample, torch.tensor([number]))
-        place, deviation = estimate_place(alone.transmitters.float(), alone.labels.float())
-        moved = replace(alone, positions=place.double()[None])
-        gain = _gain(alone, fit_law(decades(moved), moved).errors)
-        away = (moved.positions - alone.positions)[0, :2].norm().item()
-        if gain is None or away < 3 * deviation:
+        if len(alone.labels) < 16:  # place, level and slope fit a few links by chance
             continue
-        at = ", ".join(f"{x:.4g}" for x in place.tolist())
-        text = f"levels of {names[number]} follow the distance to {gain.fits:.2g} dB instead of {gain.read:.2g} dB "
-        text += f"from ({at}) m, {away:.3g} m off its place"
+        shift, gain = best_shift(alone)
+        if gain is None:
+            continue
+        at = ", ".join(f"{x:.4g}" for x in (alone.positions[0, :2] + shift).tolist())
+        text = f"from ({at}) m, {shift.norm():.3g} m off its place"
         mend = "check its place, name, axes and unit"
-        yield Finding("place of a receiver", text, mend, gain.read, gain.fits, SCORE)
+        found.append(_finding("place of a receiver", f"levels of {name}", gain, text, mend))
+    yield from sorted(found, key=_share)[:most]
 
 
-def check_origin(sample: Sample, read: Float[Tensor, " n"]) -> Iterator[Finding]:
-    """A finding if levels follow the distance clearly better once all receivers are shifted alike."""
-    if len(sample.positions) < 2:
-        return
-    step = (sample.transmitters.amax(0) - sample.transmitters.amin(0)).max() / 5
-    shift = torch.zeros(2, dtype=step.dtype)
-    for width in (step, step / 3, step / 9):
-        steps = torch.arange(-5, 6) * width
+def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain | None]:
+    """The shift of all receivers along x and y that explains levels best, within twice the places' extent."""
+    low, high = sample.transmitters.amin(0), sample.transmitters.amax(0)
+    offsets = sample.transmitters - sample.positions[sample.receivers]  # (n, 3)
+    shift = ((low + high) / 2 - sample.positions.mean(0))[:2]
+    fits = torch.zeros_like(sample.labels)
+    width = (high - low).max() / cells
+    for _ in range(3):  # three grids, each finer by a factor of three
+        steps = torch.arange(-cells, cells + 1) * width
         shifts = shift + torch.cartesian_prod(steps, steps)  # (g, 2)
-        shifts = torch.cat((shifts, torch.zeros(len(shifts), 1, dtype=step.dtype)), 1)
-        moved = [replace(sample, positions=sample.positions + one) for one in shifts]
-        errors = fit_law(torch.stack([decades(one) for one in moved]), sample).errors
+        level = (offsets[:, :2] - shifts[:, None]).square().sum(-1)  # (g, n)
+        errors = fit_law(decades_of((level + offsets[:, 2].square()).sqrt()), sample).errors
         best = errors.abs().clamp_max(30).mean(1).argmin()
-        shift, own = shifts[best, :2], errors[best]
-        if own.abs().mean() > 0.95 * read.abs().mean():  # a finer grid gains no more than that
-            return
-    gain = compare(read, own, sample)
-    directed = fit_law(decades(sample), sample, patterns=True).errors
-    if gain.is_clear(0.8, 10.0) and compare(directed, own, sample).is_clear(0.9, 0.0):
-        x, y = shift.tolist()
-        text = f"levels follow the distance to {gain.fits:.2g} dB instead of {gain.read:.2g} dB if all receivers stand "
-        text += f"({x:.3g}, {y:.3g}) m elsewhere"
-        mend = f"receivers = receivers + [{x:.3g}, {y:.3g}, 0], if their origin is another one"
-        yield Finding("origin of receivers", text, mend, gain.read, gain.fits, SCORE)
+        shift, fits = shifts[best], errors[best]
+        width = width / 3
+    return shift, _gain(sample, fits, is_fitted=True)
 
 
-def _doubtful(sample: Sample, cells: int = 12) -> list[int]:
-    """Receivers whose levels follow the distance clearly better from a point of a grid, the worst first."""
-    places = sample.transmitters
-    low, high = places.amin(0), places.amax(0)
-    margin = (high - low).max() / 2
-    x, y = (
-        torch.linspace((low[k] - margin).item(), (high[k] + margin).item(), cells, dtype=places.dtype) for k in (0, 1)
-    )
-    grid = torch.cartesian_prod(x, y)  # (g, 2)
-    heights = places[:, 2] - sample.positions[sample.receivers, 2]
-    apart = (torch.cdist(grid, places[:, :2]).square() + heights.square()).sqrt()  # (g, n)
-    errors = fit_law(apart.clamp_min(0.01 * apart.median()).clamp_min(1e-9).log10(), sample).errors
-    gains = {}
-    for number in range(len(sample.positions)):
-        own = sample.receivers == number
-        best = errors[:, own].abs().clamp_max(30).mean(1).argmin()
-        gain = _gain(_only(sample, torch.tensor([number])), errors[best, own])
-        if gain is not None:
-            gains[number] = gain.fits / gain.read
-    return sorted(gains, key=gains.__getitem__)
+def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) -> Gain | None:
+    """The gain of errors about another law, if neither chance nor directional antennas explain it.
 
-
-def _gain(sample: Sample, fits: Float[Tensor, " n"]) -> Gain | None:
-    """The gain of errors about another law, if neither chance nor directional antennas explain it."""
+    A law of places that were fitted to the levels has to be clearly better.
+    """
     logarithms = decades(sample)
     gain = compare(fit_law(logarithms, sample).errors, fits, sample)
     directed = fit_law(logarithms, sample, patterns=True)
     beyond = compare(directed.errors, fits, sample)
     # Within the beam of a directional antenna levels still fall with the distance.
-    is_flat = directed.slopes.median() > -8
-    is_beyond = beyond.is_clear(0.85, -math.inf if is_flat else 6.5)
-    return gain if gain.is_clear(0.75) and is_beyond else None
+    evidence = 6.5 if is_fitted and directed.slopes.median() < -8 else -math.inf
+    is_beyond = beyond.is_clear(0.85 if is_fitted else 1.0, evidence)
+    return gain if gain.is_clear(0.75 if is_fitted else 0.85) and is_beyond else None
+
+
+def _finding(fault: str, subject: str, gain: Gain, under: str, mend: str) -> Finding:
+    text = f"{subject} follow the distance to {gain.fits:.2g} dB instead of {gain.read:.2g} dB {under}"
+    return Finding(fault, text, mend, gain.read, gain.fits, "mean error about the law of distance [dB]")
 
 
 def _share(finding: Finding) -> float:
@@ -237,47 +180,7 @@ def _share(finding: Finding) -> float:
 
 def _only(sample: Sample, numbers: Int[Tensor, " k"]) -> Sample:
     """The links of some receivers, numbered anew."""
-    own = torch.isin(sample.receivers, numbers)
-    _, receivers = sample.receivers[own].unique(return_inverse=True)
-    return replace(
-        sample,
-        index=sample.index[own],
-        transmitters=sample.transmitters[own],
-        receivers=receivers,
-        positions=sample.positions[numbers],
-        rotations=sample.rotations[numbers],
-        elements=tuple(sample.elements[k] for k in numbers.tolist()),
-        labels=sample.labels[own],
-    )
-
-
-def _cycles(order: Sequence[int]) -> list[list[int]]:
-    """Cycles of two or more of a permutation."""
-    found, seen = [], set()
-    for start in range(len(order)):
-        cycle = []
-        number = start
-        while number not in seen:
-            seen.add(number)
-            cycle.append(number)
-            number = order[number]
-        if len(cycle) > 1:
-            found.append(cycle)
-    return found
-
-
-def _moved(sample: Sample, axes: Sequence[int], factors: Sequence[float]) -> Sample:
-    return replace(sample, positions=sample.positions[:, axes] * sample.positions.new_tensor(factors))
-
-
-def _mirrored(sample: Sample, axes: Sequence[int]) -> Sample:
-    """Receivers on the other side of the middle of the places."""
-    middle = (sample.transmitters.amin(0) + sample.transmitters.amax(0)) / 2
-    positions = sample.positions.clone()
-    positions[:, axes] = 2 * middle[axes] - positions[:, axes]
-    return replace(sample, positions=positions)
-
-
-def _from_corner(sample: Sample) -> Sample:
-    corner = sample.transmitters.amin(0)
-    return replace(sample, positions=sample.positions + corner * corner.new_tensor([1, 1, 0]))
+    own = sample.at(torch.isin(sample.receivers, numbers).nonzero()[:, 0])
+    _, receivers = own.receivers.unique(return_inverse=True)
+    positions, rotations = sample.positions[numbers], sample.rotations[numbers]
+    return replace(own, receivers=receivers, positions=positions, rotations=rotations)

@@ -2,17 +2,18 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.data.checks.conventions import of_axes, of_orientations, of_units
+from gaigs.data.checks.conventions import changing, of_axes, of_frames, of_orientations, of_receivers, of_units
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.hypotheses import Hypothesis, Sample, sample_of
+from gaigs.data.checks.places import scale_of
 from gaigs.geometry import Grid, from_spherical, to_spherical
 from gaigs.task.spectrum import SSIM_WINDOW
 
@@ -57,6 +58,7 @@ class Limits:
 
     Attributes:
         fewest: Fewest spectra that are checked.
+        near: Fewest spectra that show whether near places are alike.
         most: Most spectra that are read.
         pixels: Most rows and columns that are compared; an array resolves fewer.
         better: Least excess of the score over that of the data as read.
@@ -67,6 +69,7 @@ class Limits:
     """
 
     fewest: int = 16
+    near: int = 32
     most: int = 160
     pixels: tuple[int, int] = (45, 90)
     better: float = 0.08
@@ -75,13 +78,6 @@ class Limits:
     of_others: float = 3.0
     of_axes: float = 4.0
     of_pairs: float = 4.5
-
-
-class Convention(NamedTuple):
-    """Changes of a convention, and the score of the spectra under them."""
-
-    score: float
-    changes: tuple[Hypothesis, ...]
 
 
 def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Finding]:
@@ -96,44 +92,61 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
     if len(sample.labels) < limits.fewest:
         return
     directions = Directions(links.task.directions, sample, limits.pixels)
-    sample = replace(sample, labels=directions.rareness)
+    sample = replace(sample, labels=directions.ranks)
     read = directions.scores(sample)
     groups = [
         [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])],
         [*of_units([("tx",), ("rx",)])],  # in any unit of both, directions are the same
         [*of_orientations(sample)],
-        [Hypothesis("rows are upside down", _upside_down, "spectra = spectra[:, ::-1]")],
+        pixel_changes(sample),
         column_changes(directions.grid),
     ]
     axes, *others = groups
-    single = [*itertools.chain(*others), *scaling_changes(sample, directions.grid), *order_changes(links, sample)]
-    tries: list[tuple[list[tuple[Hypothesis, ...]], float, int]] = [
-        ([(change,) for change in single], limits.of_others, 1),
-        ([(change,) for change in axes], limits.of_axes, 1),
-    ]
+    single = [*of_frames(), *itertools.chain(*others)]
+    single += [*scaling_changes(sample, directions.grid), *order_changes(links)]
+    single += of_receivers(sample, lambda own: directions.scores(own).mean().item())
+    tries = [(single, limits.of_others, 1), (axes, limits.of_axes, 1)]
     if read.mean() < limits.known:
-        pairs = itertools.combinations(groups, 2)
-        both = itertools.chain.from_iterable(itertools.product(*pair) for pair in pairs)
-        tries.append(([*both], limits.of_pairs, 2))  # by every other link: there are hundreds
-    best = Convention(0.0, ())
+        pairs = itertools.chain.from_iterable(itertools.product(*two) for two in itertools.combinations(groups, 2))
+        tries.append(([both(*pair) for pair in pairs], limits.of_pairs, 2))  # by every other link: there are hundreds
+    best: Hypothesis | None = None
+    best_score = 0.0
     for candidates, deviations, step in tries:
-        fit, excess = _best(directions, sample, candidates, step, read)
+        some = sample.at(torch.arange(0, len(read), step))
+        means = [directions.scores(candidate.change(some)).mean().item() for candidate in candidates]
+        likeliest = candidates[next(k for k, mean in enumerate(means) if mean > max(means) - 0.01)]
+        scores = directions.scores(likeliest.change(sample))
+        score = scores.mean().item()
+        excess = scores - read
         needed = deviations * excess.std().item() / math.sqrt(directions.places)
-        is_clear = excess.mean() >= max(limits.better, needed, limits.share * fit.score)
+        is_clear = excess.mean() >= max(limits.better, needed, limits.share * score)
         # A pair has to be better than one fault, which is simpler.
-        if is_clear and fit.score > best.score + limits.better * (step - 1):
-            best = fit
-    if best.changes:
-        names = " and ".join(change.name for change in best.changes)
-        score = f"score {best.score:.2f} instead of {read.mean():.2f}"
+        if is_clear and score > best_score + limits.better * (step - 1):
+            best, best_score = likeliest, score
+    if best is not None:
         yield Finding(
             "directions of spectra",
-            f"spectra are bright towards their transmitters ({score}) if {names}",
-            "; ".join(change.mend for change in best.changes),
+            f"spectra are bright towards their transmitters (score {best_score:.2f} instead of {read.mean():.2f}) if "
+            f"{best.name}",
+            best.mend,
             read.mean().item(),
-            best.score,
+            best_score,
             "rareness of pixels as bright as the one towards the transmitter, less that in other spectra",
         )
+        return
+    alike = near_likeness(sample)
+    # Near places of a survey have more in common, also behind walls.
+    if len(read) >= limits.near and read.mean() < 2 * read.std() / math.sqrt(len(read)) and alike < 0.1:
+        text = f"spectra are not bright towards their transmitters, and near places have a correlation of {alike:.2f}"
+        yield Finding("order of rows", text, "are places and spectra in the same order?")
+
+
+def near_likeness(sample: Sample) -> float:
+    """Mean correlation of each spectrum with that of the nearest other place, without what all have in common."""
+    pixels = sample.labels.flatten(1)
+    likeness = torch.corrcoef(pixels - pixels.mean(0))  # (n, n)
+    apart = torch.cdist(sample.transmitters, sample.transmitters).fill_diagonal_(math.inf)
+    return likeness.gather(1, apart.argmin(1, keepdim=True)).mean().item()
 
 
 class Directions:
@@ -141,7 +154,7 @@ class Directions:
 
     Attributes:
         grid: Directions of the pixels that are compared.
-        rareness: Of each pixel, 0 for the darkest and 1 for the brightest (n, rows, columns).
+        ranks: Of each pixel, 0 for the darkest and 1 for the brightest (n, rows, columns).
         places: Number of places that count: within a sixth of the room spectra are alike.
     """
 
@@ -151,11 +164,7 @@ class Directions:
         self.grid = grid.thin(slice(None, None, row_step), slice(None, None, column_step))
         labels = sample.labels[:, ::row_step, ::column_step]
         ranks = labels.flatten(1).argsort(1).argsort(1)  # (n, pixels)
-        brighter = 1 - ranks / (ranks.shape[1] - 1)  # share of brighter pixels
-        # ln(1 / share) as in a likelihood: the top per cent counts more than the top tenth.
-        least = 0.02
-        rareness = (brighter + least).log() / math.log(least)
-        self.rareness = rareness.clamp_min(0).reshape(labels.shape).float()
+        self.ranks = (ranks / (ranks.shape[1] - 1)).reshape(labels.shape).float()
         places = sample.transmitters - sample.transmitters.amin(0)
         cells = (6 * places / places.amax().clamp_min(1e-9)).floor()  # (n, 3)
         self.places = len(cells.unique(dim=0))
@@ -165,7 +174,10 @@ class Directions:
         azimuths, elevations, _ = to_spherical(sample.local.float())
         rows = (elevations[:, None] - self.grid.elevations).abs().argmin(1)
         columns = torch.cos(azimuths[:, None] - self.grid.azimuths).argmax(1)
-        rareness = sample.labels[:, rows, columns]  # (spectrum, transmitter)
+        brighter = 1 - sample.labels[:, rows, columns]  # share of brighter pixels (spectrum, transmitter)
+        # ln(1 / share) as in a likelihood: the top per cent counts more than the top tenth.
+        least = 0.02
+        rareness = ((brighter + least).log() / math.log(least)).clamp_min(0)
         low, high = self.grid.elevations.aminmax()
         seen = (elevations > low - self.grid.pitch) & (elevations < high + self.grid.pitch)
         rareness = rareness * seen
@@ -174,29 +186,25 @@ class Directions:
         return rareness.diagonal() - others
 
 
-def _best(
-    directions: Directions,
-    sample: Sample,
-    candidates: Sequence[tuple[Hypothesis, ...]],
-    step: int,
-    read: Float[Tensor, " n"],
-) -> tuple[Convention, Float[Tensor, " n"]]:
-    """The candidate that is best at every ``step``-th link, and its excess over ``read`` at all links."""
-    some = sample.at(torch.arange(0, len(read), step))
-    means = [directions.scores(_changed(some, changes)).mean().item() for changes in candidates]
-    changes = candidates[max(range(len(means)), key=means.__getitem__)]
-    scores = directions.scores(_changed(sample, changes))
-    return Convention(scores.mean().item(), changes), scores - read
+def both(first: Hypothesis, second: Hypothesis) -> Hypothesis:
+    """Two conventions at once."""
+
+    def change(sample: Sample) -> Sample:
+        return second.change(first.change(sample))
+
+    return Hypothesis(f"{first.name} and {second.name}", change, f"{first.mend}; {second.mend}")
 
 
-def _changed(sample: Sample, changes: Sequence[Hypothesis]) -> Sample:
-    for hypothesis in changes:
-        sample = hypothesis.change(sample)
-    return sample
-
-
-def _upside_down(sample: Sample) -> Sample:
-    return replace(sample, labels=sample.labels.flip(1))
+def pixel_changes(sample: Sample) -> list[Hypothesis]:
+    """Other orders of the pixels, and other signs."""
+    changes = [
+        ("rows are upside down", lambda labels: labels.flip(1), "spectra = spectra[:, ::-1]"),
+        ("amplitudes are inverted, as in a grey map", lambda labels: 1 - labels, "spectra = 1 - spectra"),
+    ]
+    if sample.labels.shape[1] == sample.labels.shape[2]:
+        mend = "spectra = spectra.swapaxes(1, 2)"
+        changes.append(("rows and columns are exchanged", lambda labels: labels.mT, mend))
+    return [changing(name, ["labels"], move, mend) for name, move, mend in changes]
 
 
 def column_changes(grid: Grid) -> list[Hypothesis]:
@@ -223,39 +231,30 @@ def column_changes(grid: Grid) -> list[Hypothesis]:
     return changes
 
 
-def order_changes(links: Any, sample: Sample) -> list[Hypothesis]:
-    """Other orders of transmitters and receivers."""
+def order_changes(links: Any) -> list[Hypothesis]:
+    """Other orders of transmitters."""
     total = len(links)
-    by_name = sorted(range(1, total + 1), key=str)  # 1, 10, 11, ..., 2, 20, ...
     orders = {
         "spectra are one row late": [max(k - 1, 0) for k in range(total)],
         "spectra are one row early": [min(k + 1, total - 1) for k in range(total)],
         "spectra are in the reverse order": list(range(total))[::-1],
-        "spectra are sorted by name (1, 10, 11, ... 2)": [k - 1 for k in by_name],
     }
+    for first in (0, 1):
+        names = [str(k + first) for k in range(total)]
+        orders[f"spectra are sorted by name ({first}, 10, 11, ... 2)"] = sorted(range(total), key=names.__getitem__)
     changes = []
     for name, order in orders.items():
         places = links.query.transmitters[order].double()
         change = lambda own, places=places: replace(own, transmitters=places[own.index])
         changes.append(Hypothesis(name, change, "sort spectra and positions alike"))
-    count = len(sample.positions)
-    for step, word in ((1, "less"), (-1, "more")) if count > 1 else ():
-        change = lambda own, step=step: replace(own, receivers=(own.receivers + step) % count)
-        changes.append(Hypothesis(f"receivers' numbers are {word} by one", change, "count receivers from 0"))
     return changes
 
 
 def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
-    """Transmitters that fill 0..1 or -1..1, with the scales and offsets along the axes that suit the spectra best."""
-    low = sample.transmitters.amin().item()
-    high = sample.transmitters.amax().item()
-    lower = -1.0 if low < 0 else 0.0
-    margin = 0.15 * (1 - lower)  # places seldom reach the walls of the room that was scaled
-    if low < lower or low > lower + margin or not 1 - margin <= high <= 1:
-        return []
-    name = f"tx are scaled to {lower:g}..1 along each axis"
-    mend = "undo it, such as tx = centre + half_extent * tx" if lower else "undo it, such as tx = low + extent * tx"
-    return [Hypothesis(name, change, mend) for change in _unscaled(sample, grid)]
+    """Transmitters that were scaled, with the scales and offsets along the axes that suit the spectra best."""
+    scale = scale_of(sample.transmitters)
+    mend = "undo it, such as tx = middle + half_extent * tx"
+    return [Hypothesis(f"tx are {scale}", change, mend) for change in _unscaled(sample, grid)] if scale else []
 
 
 def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sample], Sample]]:

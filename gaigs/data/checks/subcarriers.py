@@ -51,6 +51,16 @@ def check_constant_subcarriers(links: Any) -> Iterator[Finding]:
         yield Finding("constant subcarriers", text.format("as guard or null subcarriers"), "leave them out")
 
 
+def check_powers(sample: Sample) -> Iterator[Finding]:
+    """A finding about subcarriers that are 30 dB from the usual one: guards with noise, pilots or unscaled ones."""
+    powers = sample.labels.abs().square().mean((0, 1)).clamp_min(1e-300)  # (s,)
+    odd = (10 * (powers / powers.median()).log10()).abs() > 30
+    if len(sample.labels) >= 5 and odd.any():
+        named = shortened([f"{carrier / 1e9:.6g}" for carrier in sample.frequencies[odd].tolist()])
+        text = f"{int(odd.sum())} of {len(odd)} subcarriers are 30 dB or more from the usual one in power: {named} GHz"
+        yield Finding("power of subcarriers", text, "leave them out if they are guards, or scale them alike")
+
+
 def order_of_subcarriers(sample: Sample) -> Finding | None:
     """A finding if channels jump within the band, and go on from its last to its first subcarrier.
 

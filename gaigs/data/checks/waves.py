@@ -10,6 +10,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from gaigs.data.checks.distance import explained
 from gaigs.data.checks.hypotheses import Sample
 from gaigs.phases import alignment
 from gaigs.query import evenly
@@ -108,14 +109,6 @@ def aligned_likeness(sample: Sample) -> float:
 
 
 def level_share(sample: Sample) -> float:
-    """Share of the variance of levels that one law of distance explains at all receivers, each with its own gain."""
-    powers = sample.labels.abs().square().mean((1, 2)).clamp_min(1e-300).log10()
-    distances = (sample.transmitters - sample.positions[sample.receivers]).norm(dim=-1).clamp_min(0.1).log10()
-    for receiver in sample.receivers.unique():
-        own = sample.receivers == receiver
-        powers[own] -= powers[own].mean()
-        distances[own] -= distances[own].mean()
-    if distances.std() < 0.02:
-        return 0.0
-    product = (powers @ distances).clamp_max(0)  # levels fall with the distance
-    return (product.square() / (powers @ powers * (distances @ distances)).clamp_min(1e-300)).item()
+    """Share of the spread of the channels' mean powers that the law of distance explains."""
+    powers = sample.labels.abs().square().mean((1, 2)).clamp_min(1e-300)
+    return explained(replace(sample, labels=10 * powers.log10()))

@@ -138,7 +138,7 @@ def test_conventions_show_within_links_of_unknown_phase_and_in_levels():
     single = room(1, 1, 3, reflection=-0.1)
     single.h = single.h * np.exp(2j * np.pi * rng.random((*single.h.shape[:2], 1, 1)))
     remarks = replace(single, tx=100 * single.tx).links("per_link").remarks
-    assert re.search(r"distance explains \d+% of the levels' variance in place of \d+% if tx are in cm", remarks)
+    assert re.search(r"distance explains \d+% of the levels' spread in place of \d+% if tx are in cm", remarks)
 
 
 @pytest.mark.parametrize("count", [16, 17, 64])
@@ -151,6 +151,28 @@ def test_the_fft_order_is_named(count, phase):
     assert re.search(r"FFT order\?; frequencies = np.sort\(frequencies\)", other)
     both = replace(own, h=np.fft.ifftshift(own.h, axes=-1), frequencies=np.fft.ifftshift(own.frequencies))
     assert "FFT order" not in both.links(phase).remarks
+
+
+@pytest.mark.parametrize("change", [lambda h: h.real + 0j, lambda h: np.abs(h) + 1j * np.angle(h) / np.pi])
+def test_channels_without_their_parts_are_named(change):
+    own = room(1, 16, 3)
+    remarks = replace(own, h=change(own.h)).links().remarks
+    words = "(real parts are 0 or more|imaginary parts are 0) at all links, .* of amplitudes a and phases p"
+    assert re.search(words, remarks)
+
+
+def test_transmitters_in_the_frame_of_their_receiver_are_named():
+    own = room(4, 16, 1)
+    remarks = replace(own, tx=own.tx - own.rx[0]).links().remarks
+    assert "if tx are relative to rx or rx are in mm; tx = tx + rx or" in remarks
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_noise_in_guard_subcarriers_is_named(factor):
+    own = room(4, 16, 2)
+    own.h[..., :2] *= factor * np.exp(2j * np.pi * np.random.default_rng(0).random(own.h[..., :2].shape))
+    words = "2 of 16 subcarriers are 30 dB or more from the usual one in power: 3.46, 3.465 GHz; leave them out if"
+    assert words in own.links().remarks
 
 
 @pytest.mark.parametrize("value", [0.0, 0.3 + 0.4j, 1e-12])

@@ -90,11 +90,12 @@ def test_further_levels_far_from_near_places_are_counted():
 
 
 CONVENTIONS = {
-    "receivers in mm": (1, 1e3, "receivers' coordinates are times 0.001; receivers = 0.001 "),
-    "receivers in cm": (1, 100, "receivers' coordinates are times 0.01; receivers = 0.01 "),
-    "receivers in feet": (1, 1 / 0.3048, "receivers' coordinates are times 0.3048; "),
-    "places in cm": (100, 1, "receivers' coordinates are times 100; .* or transmitters = 0.01 . transmitters"),
-    "exchanged axes": (1, [1, 0, 2], r"receivers' x and y are exchanged; receivers = receivers\[:, \[1, 0, 2\]\]"),
+    "receivers in mm": (1, 1e3, "rx are in mm; rx = rx . 0.001"),
+    "receivers in cm": (1, 100, "rx are in cm; rx = rx . 0.01"),
+    "receivers in inches": (1, 1 / 0.0254, "rx are in inches; rx = rx . 0.0254"),
+    "receivers in feet": (1, 1 / 0.3048, "rx are in feet; rx = rx . 0.3048"),
+    "places in cm": (100, 1, "tx are in cm; tx = tx . 0.01"),
+    "exchanged axes": (1, [1, 0, 2], r"rx have x and y exchanged; rx = rx\[:, \[1, 0, 2\]\]"),
 }
 
 
@@ -105,24 +106,25 @@ def test_another_convention_of_places_is_named_by_one_receiver_too(convention, c
     gateways = GATEWAYS[1 : count + 1]
     moved = gateways[:, change] if isinstance(change, list) else change * gateways
     found = found_in(places=factor * PLACES, gateways=moved, levels=LEVELS[:, 1 : count + 1])
-    assert any(re.search(rf"distance to 2.* dB instead of .* dB if the {words}", one) for one in found), found
+    assert any(re.search(rf"distance to 2.* dB instead of .* dB if {words}", one) for one in found), found
 
 
 @pytest.mark.parametrize(
     ("gateways", "words"),
     [
-        (GATEWAYS * [1, -1, 1], "if the receivers' y is negated; receivers = receivers . .1, -1, 1."),
+        (GATEWAYS - [9, 5.5, 0], r"the origin of rx is the middle of tx; rx\[:, :2\] \+= \(\(tx.min\(0\) \+ tx.max"),
+        (GATEWAYS * [1, -1, 1], "if rx have y negated; rx = rx . .1, -1, 1."),
         (
             GATEWAYS * [1, -1, 1] + [0, 11, 0],
-            "receivers' (x|y) runs? from the other end; .* as rows of a picture",
+            "rx have (x|y) from the other end; rx.* = .* as rows of a picture",
         ),
         (
             np.add(GATEWAYS, [9, 5, 0]),
-            r"if all receivers stand \(-[89].*, -[45].*\) m elsewhere; receivers = receivers \+ \[",
+            r"if all receivers stand \(-[89].*, -[45].*\) m elsewhere; rx = rx \+ \[",
         ),
         (GATEWAYS[[1, 0, 2, 3]], "levels of ap0, ap1 follow .* from the places of ap1, ap0; are names or places exch"),
-        (np.roll(GATEWAYS, 1, 0), r"are receivers counted from 1. receivers = np.roll\(receivers, -1, axis=0\)"),
-        (np.roll(GATEWAYS, -1, 0), r"are receivers counted from 1. receivers = np.roll\(receivers, 1, axis=0\)"),
+        (np.roll(GATEWAYS, 1, 0), r"are receivers counted from 1. rx = np.roll\(rx, -1, axis=0\)"),
+        (np.roll(GATEWAYS, -1, 0), r"are receivers counted from 1. rx = np.roll\(rx, 1, axis=0\)"),
         (np.vstack((GATEWAYS[:3], [[2.0, 10.0, 2.0]])), r"levels of ap3 follow .* from \(1.*, .*\) m, 1\d.* m off its"),
     ],
 )
@@ -148,6 +150,12 @@ def test_a_unit_of_all_places_is_doubted_by_what_free_space_allows(factor, shift
     frequency = None if shift == 0 else 2.4e9
     found = found_in(places=factor * PLACES, gateways=factor * GATEWAYS, levels=LEVELS + shift, frequency=frequency)
     assert any(re.search(words, one) for one in found), found
+
+
+def test_places_that_were_scaled_are_doubted():
+    size = np.array([18.0, 11.0, 3.0])
+    (found,) = found_in(places=PLACES / size, gateways=GATEWAYS / size)
+    assert re.match("places span 0.98.* m, as if scaled to 0..1 along each axis; give them in metres", found)
 
 
 def test_degrees_in_place_of_metres_are_named():

@@ -8,6 +8,9 @@ import pytest
 from invented_spectra import SIZE, room
 
 import gaigs
+from gaigs.antenna import Receiver
+from gaigs.geometry import Grid, Pose
+from gaigs.task.spectrum import Spectrum
 
 
 @functools.cache
@@ -18,6 +21,10 @@ def sound():
 def scaled(made):
     low, high = made.transmitters.min(0), made.transmitters.max(0)
     return 2 * (made.transmitters - low) / (high - low) - 1
+
+
+def standardised(places):
+    return (places - places.mean(0)) / places.std(0)
 
 
 FAULTS = {
@@ -35,6 +42,12 @@ FAULTS = {
     "the first column is at azimuth -180 degrees": lambda own: {"spectra": np.roll(own.spectra, 45, 2)},
     "azimuths run clockwise": lambda own: {"spectra": own.spectra[:, :, -np.arange(90)]},
     "azimuths run clockwise from the y axis": lambda own: {"spectra": own.spectra[:, :, 22 - np.arange(90)]},
+    "tx are relative to rx": lambda own: {"transmitters": own.transmitters - own.position},
+    "rx are in mm": lambda own: {"position": 1000 * own.position},
+    "tx are scaled to -0.5..0.5 along each axis": lambda own: {"transmitters": own.transmitters / SIZE - 0.5},
+    "tx are standardised along each axis": lambda own: {"transmitters": standardised(own.transmitters)},
+    "amplitudes are inverted": lambda own: {"spectra": 1 - own.spectra},
+    "spectra are sorted by name (0, 10": lambda own: {"spectra": own.spectra[np.argsort([*map(str, range(120))])]},
     "spectra are one row late": lambda own: {"spectra": np.roll(own.spectra, 1, 0)},
     "spectra are sorted by name": lambda own: {"spectra": own.spectra[np.argsort([*map(str, range(1, 121))])]},
     "tx are in cm and quaternions have the order w, x, y, z": lambda own: {
@@ -54,6 +67,26 @@ def test_the_convention_of_spectra_is_named(fault):
     assert fault in finding.text
     assert finding.fits > finding.read + 0.08
     assert finding.mend
+
+
+def test_exchanged_rows_and_columns_of_a_square_grid_are_named():
+    made = sound()
+    grid = Grid.degrees(range(2, 91, 2), range(0, 360, 8))
+    pose = Pose.from_xyzw(made.position, made.quaternion)
+    links = gaigs.links(
+        task=Spectrum(grid.elevations, grid.azimuths),
+        transmitters=made.transmitters,
+        receivers=Receiver("array", pose),
+        labels=made.spectra[..., ::2].swapaxes(1, 2).copy(),
+    )
+    assert "if rows and columns are exchanged; spectra = spectra.swapaxes(1, 2)" in links.remarks
+
+
+def test_spectra_in_no_order_are_doubted():
+    made = replace(sound(), spectra=np.random.default_rng(0).permutation(sound().spectra))
+    (found,) = gaigs.describe(made.links()).suspicious
+    assert found.startswith("spectra are not bright towards their transmitters, and near places have a correlation of ")
+    assert found.endswith("are places and spectra in the same order?")
 
 
 @pytest.mark.parametrize("options", [{}, {"blocked": 0.0}, {"blocked": 1.0}, {"count": 40}, {"edge": 2}])
