@@ -216,8 +216,10 @@ def column_changes(grid: Grid) -> list[Hypothesis]:
         source = torch.cos(azimuths[:, None] - grid.azimuths).argmax(1)  # (columns,)
         return lambda own: replace(own, labels=own.labels[:, :, source])
 
+    is_symmetric = torch.allclose(grid.azimuths, -grid.azimuths.flip(0), atol=1e-3)  # such as -90..90 degrees
+    columns = "::-1" if is_symmetric else "-np.arange(columns)"
     changes = [
-        Hypothesis("azimuths run clockwise", moved(0.0, -1), "spectra = spectra[:, :, -np.arange(columns)]"),
+        Hypothesis("azimuths run clockwise", moved(0.0, -1), f"spectra = spectra[:, :, {columns}]"),
         Hypothesis(
             "azimuths run clockwise from the y axis",
             moved(math.pi / 2, -1),

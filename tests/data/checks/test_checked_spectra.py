@@ -5,10 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from invented_spectra import SIZE, room
 
 import gaigs
 from gaigs.antenna import Receiver
+from gaigs.data.checks.spectra import column_changes
 from gaigs.geometry import Grid, Pose
 from gaigs.task.spectrum import Spectrum
 
@@ -80,6 +82,16 @@ def test_exchanged_rows_and_columns_of_a_square_grid_are_named():
         labels=made.spectra[..., ::2].swapaxes(1, 2).copy(),
     )
     assert "if rows and columns are exchanged; spectra = spectra.swapaxes(1, 2)" in links.remarks
+
+
+@pytest.mark.parametrize("azimuths", [range(0, 360, 4), range(-90, 91, 5), range(-178, 180, 4)])
+def test_the_line_that_mends_clockwise_azimuths_mirrors_them(azimuths):
+    grid = Grid.degrees(range(0, 91, 10), azimuths)
+    (change, *_) = column_changes(grid)
+    given = torch.cos(grid.azimuths + 0.3).expand(1, *grid.shape).numpy()
+    names = {"np": np, "spectra": given, "columns": len(azimuths)}
+    mended = eval(change.mend.removeprefix("spectra = "), names)
+    np.testing.assert_allclose(mended[0, 0], torch.cos(-grid.azimuths + 0.3), atol=1e-5)
 
 
 def test_spectra_in_no_order_are_doubted():
