@@ -81,7 +81,7 @@ def describe(links: Links) -> Description:
     ]
     if links.split is not None:
         read.append(f"split {links.split.name}: " + ", ".join(f"{len(p)} {n}" for n, p in links.split.parts().items()))
-    if repeated := _repeats(links):
+    if repeated := len(links) - len(links.query.unique(with_receivers=True)[0]):
         read.append(f"{repeated} links repeat place and receiver of another")
     findings = tuple(check(links))
     remarks = links.remarks
@@ -129,16 +129,6 @@ def levels(links: Links, index: Tensor) -> Float[Tensor, " k"]:
             mean = mean / (1 - absent.double().mean(1))
         found.append(10 * mean.clamp_min(1e-300).log10() if is_wave else mean)
     return torch.cat(found)
-
-
-def _repeats(links: Links) -> int:
-    """Number of links that repeat transmitter, receiver and carrier of another."""
-    query = links.query
-    columns = [query.transmitters, query.receivers[:, None].float()]
-    if query.frequencies is not None:
-        columns.append(query.frequencies[:, None])
-    keys = torch.cat(columns, 1)  # (n, 4 or 5)
-    return len(keys) - len(keys.unique(dim=0))
 
 
 def run(config: dict, folder: Path) -> None:

@@ -417,7 +417,7 @@ def run(config: dict, folder: Path) -> None:
     ``locate.png`` and, of a test, ``locate.json`` into a folder."""
     if config["folder"] is None:
         raise ValueError("command=locate needs the folder of a finished run; add folder=runs/...")
-    model, links = load(config["folder"], config["trust"]), links_of(config["folder"])
+    model, links = load(config["folder"], config["trust"]), links_of(config["folder"], config["trust"])
     options = dict(config["locate"])
     own, value = {name: options.pop(name) for name in ("region", "frequency", "points")}, options.pop("value")
     value = read_value(Path(value), links) if isinstance(value, str) else value

@@ -615,6 +615,27 @@ def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch, caplog):
     runs.folder.claim(folder, config)
 
 
+def test_a_reader_of_a_run_is_imported_if_it_is_the_recorded_one_or_trusted(tmp_path, monkeypatch):
+    (tmp_path / "plugins").mkdir()
+    source = tmp_path / "plugins/own_data.py"
+    source.write_text(
+        "import gaigs\nfrom gaigs.data.synthetic import furnished_room\n\n"
+        "@gaigs.register('data', 'own_data')\ndef own_data():\n    return furnished_room(transmitters=30, order=0)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    runs.run(gaigs.compose("model=knn", "data=own_data", baselines=[]), tmp_path / "run")
+    source.write_text(source.read_text() + "\n")
+    forget = [(sys.modules, "plugins.own_data"), (registry("data")._registered, "own_data")]  # as a new process
+    for names, name in forget:
+        del names[name]
+    with pytest.raises(ValueError, match=r"plugins/own_data.py is not the source of data 'own_data'"):
+        runs.links_of(tmp_path / "run", trust=False)
+    assert len(runs.links_of(tmp_path / "run", trust=True)) == 30
+    for names, name in forget:
+        del names[name]
+
+
 @pytest.mark.parametrize("name", ["own_mean", "own_level"])
 def test_a_plug_in_is_imported_if_it_is_the_recorded_one_or_trusted(name, tmp_path, monkeypatch, caplog):
     """A look-up by the digests of its folder; a trained model by those of its checkpoint, or of an old one's folder."""

@@ -163,7 +163,7 @@ def test_a_run_whose_time_is_up_ends_with_what_it_has(clock, tmp_path):
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert metrics["max_time"] == 10.0
     parts = (
-        "the time for the fit of gaigs before", "the training ended after 1 of 3 steps", "the fit of kriging ended",
+        "the time for the fit of gaigs was up", "the training ended after 1 of 3 steps", "the fit of kriging ended",
         "0 of 2 folds calibrate kriging", "no validation scores of mean, gaussian_process",
         "no test scores of mean, gaussian_process",
     )  # fmt: skip

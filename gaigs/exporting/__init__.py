@@ -97,7 +97,7 @@ def run(config: dict, folder: Path) -> None:
         places = "test"
     name = "predictions" if suffix in PREDICTIONS and places else "radio_map" if suffix in MAPS else "room"
     if places == "test":
-        places = links_of(config["folder"])
+        places = links_of(config["folder"], config["trust"])
     elif isinstance(places, str):
         places = read_points(Path(places), "xyz", "x,y,z [m] of one place a line")
     folder.mkdir(parents=True, exist_ok=True)

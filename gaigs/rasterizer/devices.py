@@ -29,6 +29,7 @@ def is_forked() -> bool:
 
 def _devices() -> list:
     """The devices of all drivers. A broken driver is an error only where no other lists a device."""
+    _process()  # drivers start threads here, too
     found, causes = [], []
     try:
         for platform in cl.get_platforms():

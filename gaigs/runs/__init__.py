@@ -17,7 +17,7 @@ from gaigs.kriging.links import check_known
 from gaigs.model import Model, call_optional
 from gaigs.processes import is_first, limited_threads, only_run
 from gaigs.radio_maps import radio_map
-from gaigs.registry import check_type, registry
+from gaigs.registry import check_type, only_recorded, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store, stored_software, warn_of_changes
 from gaigs.stages import stage
@@ -120,12 +120,13 @@ def configuration_of(folder: str | Path) -> dict:
     return config
 
 
-def links_of(folder: str | Path) -> Links:
-    """The links of a run, read again."""
+def links_of(folder: str | Path, trust: bool) -> Links:
+    """The links of a run, read again, by a reader that ``load`` would import."""
     config = configuration_of(folder)
     if config["data"]["name"] == "arrays":
         raise ValueError(f"the data of {folder} were arrays, which are not stored; use the model in Python")
-    return data.load(config["data"], config["split"], config["task"]["name"])
+    with only_recorded(None if trust else stored_software(Path(folder))):
+        return data.load(config["data"], config["split"], config["task"]["name"])
 
 
 def train_and_test(config: dict, folder: Path) -> dict | None:

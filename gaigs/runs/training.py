@@ -150,7 +150,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     with stages.stage(until=0.3 if is_trained(model) else 0.8):
         model.fit(links)
         if stages.is_up():
-            stages.leave_out(f"the time for the fit of {name} before a training was up")
+            stages.leave_out(f"the time for the fit of {name} was up")
     if is_trained(model) and model.known_places is not None:  # a training before this one
         places = torch.cat((places, model.known_places)).unique()
     model.known_places = places

@@ -163,7 +163,7 @@ def contents_of(source: str | Path, trust: bool = False) -> Contents:
     if path.is_file():
         return Contents(load(path, trust), title=path.stem)
     in_memory = configuration_of(path)["data"]["name"] == "arrays"  # which a run does not store
-    return Contents(load(path, trust), None if in_memory else links_of(path), path.name)
+    return Contents(load(path, trust), None if in_memory else links_of(path, trust), path.name)
 
 
 def run(config: dict) -> None:

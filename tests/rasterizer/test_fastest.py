@@ -81,3 +81,14 @@ def test_a_forked_process_renders_by_torch_though_drivers_have_their_threads_els
             os._exit(2)
     torch.set_num_threads(threads)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no forks")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")
+def test_a_process_that_has_only_listed_the_devices_counts_as_one_that_uses_them():
+    found_devices._process.cache_clear()
+    found_devices.default_device()
+    child = os.fork()
+    if child == 0:
+        os._exit(int(not found_devices.is_forked()))
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
