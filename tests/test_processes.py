@@ -157,7 +157,9 @@ def test_nohup_is_heeded():
     code = "import signal; from gaigs import processes; print(signal.SIGHUP in processes.STOPPING)"
     environment = os.environ | {"PYTHONPATH": str(Path(gaigs.__path__[0]).parent)}
     for words, expected in ((["nohup"], "False"), ([], "True")):
-        done = subprocess.run([*words, sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+        command = [*words, sys.executable, "-c", code]
+        usual = lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run by nohup themselves
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, preexec_fn=usual)
         assert done.stdout.strip() == expected
 
 
