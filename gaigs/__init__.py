@@ -155,8 +155,12 @@ def _execute(config: dict, folder: Path) -> dict | None:
         case unknown:
             from gaigs.registry import suggest
 
-            if unknown == "report":
-                raise ValueError("there is no command 'report'; python -m gaigs.report FOLDER makes its tables")
+            scripts = {
+                "report": "python -m gaigs.report FOLDER makes its tables",
+                "benchmark": "python benchmarks/step.py and others measure, in a clone",
+            }
+            if unknown in scripts:
+                raise ValueError(f"there is no command {unknown!r}; {scripts[unknown]}")
             known = "train", "agreement", "describe", "survey", "locate", "export", "view", "devices"
             raise ValueError(f"command must be one of {', '.join(known)}, got {suggest(unknown, known)}")
     return None

@@ -179,6 +179,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("command=trian", "command must be one of train, agreement, describe, survey, locate, export, "),
         ("command=exprt", "devices, got 'exprt' (did you mean 'export'?)"),
         ("command=report", "there is no command 'report'; python -m gaigs.report FOLDER makes its tables"),
+        ("command=benchmark", "there is no command 'benchmark'; python benchmarks/step.py and others measure, in a"),
         ("split=blocks", "split.edge must be given, as it has no default; add split.edge=1.0, the edge of a cube [m]"),
         ("~command", "the configuration needs the key 'command'"),
         ("data=nerf2_spectrum", "data.root must be given, as it has no default; add data.root=/path/to/folder"),

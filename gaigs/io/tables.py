@@ -228,7 +228,7 @@ def inert(text: str) -> str:
 
 
 def original(text: str) -> str:
-    """The text of which ``inert`` gives this one."""
+    """The text before ``inert``, without its apostrophe."""
     return text[1:] if text.startswith("'") and inert(text[1:]) == text else text
 
 

@@ -110,7 +110,7 @@ def deviation(errors: Float[Tensor, " k"]) -> Float[Tensor, ""]:
 
 
 def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
-    """Some links with one random reading of each place, receiver and carrier: those of one place err together."""
+    """One random link for each place, receiver and carrier: repeated readings have nearly the same error."""
     if not len(index):
         return index
     _, which = links.query[index].unique(with_receivers=True)

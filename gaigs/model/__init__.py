@@ -183,8 +183,8 @@ class Model(nn.Module):
             ``model.scene.receivers``, of a single one too, and of the task's shape. With ``receiver`` (..., *shape); of
             a query (b, *shape). They are scaled as the training labels (``model.scene.task.normalisation``), on the
             model's device. With an interval an ``Estimate``: the value, its standard deviation, and the interval's
-            ends. Where arrays have different numbers of elements, channels of all receivers are a dictionary by name,
-            and those of one have its own elements.
+            ends. Where arrays have different numbers of elements, channels of all receivers are a dictionary by name;
+            channels of a named receiver have the elements of its array.
 
         Warns:
             ExtrapolationWarning: A position is farther from the training transmitters' box than the diagonal of this
