@@ -14,10 +14,10 @@ import torch
 from jaxtyping import Complex
 from torch import Tensor
 
+from gaigs.core.propagation import fit_gain
+from gaigs.core.scene import direct_gains, direct_waves
 from gaigs.data import Links, load
-from gaigs.propagation import fit_gain
 from gaigs.report.table import markdown
-from gaigs.scene import direct_gains, direct_waves
 
 Channels = Complex[Tensor, "k m"]
 

@@ -20,13 +20,13 @@ from jaxtyping import Complex
 from torch import Tensor
 
 import gaigs
+from gaigs.core.query import Query
 from gaigs.data import Links
 from gaigs.data.sionna.tracing import open_scene, trace_scene
 from gaigs.data.synthetic.image_source import respond
 from gaigs.model.kriging import Kriging
-from gaigs.placement.mirrored.export import facts
-from gaigs.placement.mirrored.materials import materials
-from gaigs.query import Query
+from gaigs.planes.export import facts
+from gaigs.planes.materials import materials
 from gaigs.report.table import markdown
 from gaigs.runs import links_of, load
 

@@ -21,9 +21,9 @@ import pyopencl as cl
 import torch
 from scenes import DrawnScene, common, passes
 
-from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST, opencl
 from gaigs.registry import registry
 from gaigs.report.table import markdown
+from gaigs.splatting.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST, opencl
 from gaigs.testing.rasterizer import cast_scene, footprints_of
 
 WAYS = "forward", "backward"

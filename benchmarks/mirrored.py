@@ -24,12 +24,12 @@ from rich.table import Table
 from scipy.constants import speed_of_light
 
 import gaigs
+from gaigs.core.query import Batch
+from gaigs.core.scene import carriers
 from gaigs.data import Links, load
 from gaigs.model import Model
-from gaigs.query import Batch
 from gaigs.registry import registry
 from gaigs.runs.evaluation import device_name
-from gaigs.scene import carriers
 
 POOLINGS = {"spectrum": "array_response", "rssi": "mean_power", "csi": "element_sum"}
 """Pooling of maps by task."""

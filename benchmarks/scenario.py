@@ -11,9 +11,9 @@ import torch
 from scipy.constants import speed_of_light
 
 import gaigs
+from gaigs.core.task.csi import Csi
 from gaigs.data import deepmimo, synthetic
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.task.csi import Csi
 
 CARRIER, SUBCARRIERS, SIZE = 6.4896e9, 9, (7.0, 5.0, 3.0)
 

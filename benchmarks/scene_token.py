@@ -37,15 +37,15 @@ from rich.table import Table
 from torch import Tensor, nn
 
 import gaigs
+from gaigs.core.query import Query
 from gaigs.data import Links, load
-from gaigs.gaussians import Placed, Tokens
 from gaigs.model import Model
-from gaigs.query import Query
 from gaigs.registry import register, registry
 from gaigs.runs.evaluation import validate
 from gaigs.runs.training import descend
-from gaigs.tokenizer.ga import GATokenizer
-from gaigs.tokenizer.multiview import MultiviewTokenizer
+from gaigs.splatting.gaussians import Placed, Tokens
+from gaigs.splatting.tokenizer.ga import GATokenizer
+from gaigs.splatting.tokenizer.multiview import MultiviewTokenizer
 
 GAIN = 100.0
 """By which a faint token is made as loud as E(P_TX) at the start."""

@@ -9,8 +9,8 @@ import torch
 from common import now
 from torch import Tensor
 
-from gaigs.projection import Plane, Splats
-from gaigs.rasterizer import ALPHA_MIN
+from gaigs.splatting.projection import Plane, Splats
+from gaigs.splatting.rasterizer import ALPHA_MIN
 from gaigs.testing.rasterizer import (
     cast_scene,
     distance_to_jumps,

@@ -37,9 +37,10 @@ import numpy as np
 import torch
 
 import gaigs
-from gaigs import __main__ as command_line
-from gaigs import checkpoint, runs  # noqa: F401, imported before the forks
+from gaigs import runs  # noqa: F401, imported before the forks
+from gaigs.commands import command_line
 from gaigs.io.files import write_text
+from gaigs.model import checkpoint
 from gaigs.report import curves, run_figures, style  # noqa: F401, imported before the forks
 from gaigs.report.table import markdown
 from gaigs.runs.evaluation import device_name

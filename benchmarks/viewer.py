@@ -15,8 +15,8 @@ from browser import Browser
 from PIL import Image
 
 import gaigs
-from gaigs.viewing import View, contents_of
-from gaigs.viewing.server import server
+from gaigs.commands.view import View, contents_of
+from gaigs.commands.view.server import server
 
 DRAGS = 40
 WINDOW = 1200, 860  # pixels

@@ -21,15 +21,15 @@ from hydra import compose, initialize_config_dir
 import gaigs
 from gaigs import configuration
 from gaigs.algebra import Algebra
-from gaigs.geometry import ExtrapolationWarning
+from gaigs.core.geometry import ExtrapolationWarning
+from gaigs.core.propagation import bartlett
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.model.kriging import Kriging
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.projection import project
-from gaigs.propagation import bartlett
 from gaigs.registry import check_instance, configuration_of
-from gaigs.tokenizer.euclidean import EuclideanTokenizer
+from gaigs.splatting.projection import project
+from gaigs.splatting.tokenizer.euclidean import EuclideanTokenizer
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from gaigs.registry import KINDS, find_holders
+from gaigs.registry.holders import ROOMS
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/architecture.md").read_text()
@@ -16,8 +17,8 @@ FILES = {
     ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): ast.parse(file.read_text())
     for file in (ROOT / "gaigs").rglob("*.py")
 }
-LONGEST_CHAIN = 12
-LIMITS = {"lines of gaigs/": 31_450, "lines of a file": 950}
+LONGEST_CHAIN = 10
+LIMITS = {"lines of gaigs/": 31_500, "lines of a file": 950}
 """Raised only with a reason. The checks of data against geometry (``data/checks``) took 1,700 lines."""
 
 
@@ -69,7 +70,7 @@ def drawn():
 def test_each_part_is_drawn_once(drawn):
     layers, _, kinds = drawn
     assert layers.keys() == {part(module) for module in FILES}
-    assert kinds == [*KINDS]
+    assert kinds == [kind for kind in KINDS if kind not in ROOMS]
     assert max(layers.values()) <= LONGEST_CHAIN
 
 
@@ -99,7 +100,7 @@ def test_arrows_are_imports_and_imports_follow_from_arrows(pairs, drawn):
 def test_a_components_name_is_its_files(kind):
     built_in = [holder for holder in find_holders(kind)[0] if holder.file and holder.root is None]
     for holder in built_in:
-        place = ROOT / "gaigs" / kind / holder.name
+        place = ROOT / "gaigs" / ROOMS.get(kind, kind) / holder.name
         assert holder.file == place.with_suffix(".py") or holder.file.is_relative_to(place)
     names = {holder.name for holder in built_in}
     assert len(names) == len(built_in)

@@ -16,8 +16,8 @@ from omegaconf import OmegaConf
 import gaigs
 from gaigs.data import deepmimo, load, nerf2_spectrum
 from gaigs.model.gaigs import GaussianSplatting
-from gaigs.pooling.softmax_attention import SoftmaxAttention
 from gaigs.registry import registry
+from gaigs.splatting.pooling.softmax_attention import SoftmaxAttention
 from gaigs.testing import (
     check_data,
     check_deformation,

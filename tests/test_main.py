@@ -19,8 +19,8 @@ import torch
 import yaml
 
 import gaigs
-from gaigs import __main__ as command_line
-from gaigs import agreement, runs
+from gaigs import runs
+from gaigs.commands import agreement, command_line
 from gaigs.processes import Stopped, only_run
 from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
@@ -249,7 +249,7 @@ def test_a_verbose_run_prints_the_traceback_before_the_message(run):
 @pytest.fixture
 def devices(monkeypatch):
     """Two OpenCL devices, neither of which is asked for; to be changed."""
-    opencl = pytest.importorskip("gaigs.rasterizer.opencl", exc_type=ImportError)
+    opencl = pytest.importorskip("gaigs.splatting.rasterizer.opencl", exc_type=ImportError)
     kind, platform = opencl.cl.device_type, SimpleNamespace(name="Maker", get_devices=lambda: found)
     found = [SimpleNamespace(name=name, type=getattr(kind, name), platform=platform) for name in ("GPU", "CPU")]
     monkeypatch.setattr(opencl.cl, "get_platforms", lambda: [platform])

@@ -82,7 +82,7 @@ def test_a_taken_name_tells_who_holds_it_and_who_asks(models):
 
 def test_a_built_in_name_is_taken_before_its_file_is_imported():
     with pytest.raises(
-        ValueError, match=r"'mercator' is held by gaigs.projection.mercator\.py, and \w+.Waveguide asks"
+        ValueError, match=r"'mercator' is held by gaigs.splatting.projection.mercator\.py, and \w+.Waveguide asks"
     ):
         Registry("projection").register("mercator")(Waveguide)
 

@@ -20,14 +20,15 @@ import yaml
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs import checkpoint, configuration, runs
+from gaigs import configuration, runs
+from gaigs.core.geometry import Pose
+from gaigs.core.radio_maps import RadioMap
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
-from gaigs.geometry import Pose
 from gaigs.io.files import atomic_write
-from gaigs.placement.mirrored.channel_search import SLABS, ChannelSearch
+from gaigs.model import checkpoint
+from gaigs.planes.channel_search import SLABS, ChannelSearch
 from gaigs.processes import Stopped, stopping
-from gaigs.radio_maps import RadioMap
 from gaigs.registry import registry
 from gaigs.report.curves import read_curves
 from gaigs.runs import evaluation

@@ -11,19 +11,19 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gaigs.antenna import Receiver, lacking
+from gaigs.core.antenna import Receiver, lacking
+from gaigs.core.geometry import Frame, Pose
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
+from gaigs.core.task import Task
+from gaigs.core.task.csi import Csi
 from gaigs.data.checks import check
 from gaigs.data.checks.subcarriers import constant_sentence, constant_subcarriers
 from gaigs.data.gateways import estimate_place
 from gaigs.data.maps import check_metres
-from gaigs.geometry import Frame, Pose
 from gaigs.io.images import GreyImages
 from gaigs.io.tables import shortened
-from gaigs.query import Batch, Query
 from gaigs.registry import registry
-from gaigs.scene import Scene
-from gaigs.task import Task
-from gaigs.task.csi import Csi
 
 log = logging.getLogger(__name__)
 

@@ -8,13 +8,13 @@ import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gaigs.core.propagation import free_space
 from gaigs.data import Links, csi_npz, deepmimo, load, nerf2_spectrum, rssi_csv, sionna, synthetic
 from gaigs.data.sionna.meshes import wavefront_obj
 from gaigs.data.synthetic.image_source import bounces, trace
 from gaigs.io.files import write_text
 from gaigs.io.tables import check_empty, number_places
 from gaigs.processes import only_run
-from gaigs.propagation import free_space
 
 
 def main() -> None:

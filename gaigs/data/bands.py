@@ -6,9 +6,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from gaigs.core.query import check_carrier
+from gaigs.core.task.csi import Csi
 from gaigs.data import Links, kept_links
-from gaigs.query import check_carrier
-from gaigs.task.csi import Csi
 
 
 def hold_out_band(links: Links, band_train: Sequence[float] | None, band_test: Sequence[float] | None) -> Links:

@@ -10,17 +10,18 @@ import numpy as np
 import scipy.io
 import torch
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import CARRIERS, Query, unit_hint
+from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.data.bands import hold_out_band
 from gaigs.data.impulse_responses import from_sionna
 from gaigs.data.parts import check_parts, join
-from gaigs.geometry import FAR, WITHIN, Pose
+from gaigs.io import FAR, WITHIN
 from gaigs.io.files import atomic_write
 from gaigs.io.tables import find_file, number_places
-from gaigs.query import CARRIERS, Query, unit_hint
 from gaigs.registry import listed, register, suggest
-from gaigs.task.csi import Csi
 
 ARRAYS = {
     "tx": ("real", ("n", 3)),
@@ -75,7 +76,7 @@ def read(
             ``gaigs.data.impulse_responses.from_sionna``.
         arrays: Names of these arrays in the file where they differ, such as ``{"h": "CSI"}``; two names are those of
             real and imaginary part.
-        phase: Of ``gaigs.task.csi.Csi``.
+        phase: Of ``gaigs.core.task.csi.Csi``.
         band_train, band_test: Subcarriers to train and to test on, as for ``gaigs.data.bands.hold_out_band`` [Hz].
         parts: Axis of 2, ``first`` or ``last``, along which a real ``h`` has real and imaginary part. None: ``h`` is
             complex, or two arrays.

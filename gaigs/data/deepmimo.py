@@ -15,17 +15,18 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query, check_carrier
+from gaigs.core.task import Task
+from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.data.bands import hold_out_band
 from gaigs.data.impulse_responses import lacks_carrier, to_channels
-from gaigs.geometry import FAR, WITHIN, Pose
+from gaigs.io import FAR, WITHIN
 from gaigs.io.files import atomic_write, write_text
 from gaigs.io.tables import find_folder, has_file, number_places, quote
-from gaigs.query import Query, check_carrier
 from gaigs.registry import register
-from gaigs.task import Task
-from gaigs.task.csi import Csi
 
 UPRIGHT = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """Rotation of the stations' arrays: rows run upwards, columns along y, and the normal along x, as DeepMIMO's panels."""
@@ -90,7 +91,7 @@ def read(
         subcarriers: Evenly over the band; a single one is the carrier.
         transmitters: Number of random users to take; None for all.
         seed: Seed of the choice of users.
-        phase: Of ``gaigs.task.csi.Csi``.
+        phase: Of ``gaigs.core.task.csi.Csi``.
         band_train, band_test: Subcarriers to train and to test on, as for ``gaigs.data.bands.hold_out_band`` [Hz].
 
     Raises:

@@ -8,13 +8,13 @@ import torch
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.antenna import Array
+from gaigs.core.antenna import Array
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links
 from gaigs.data.deepmimo import StationPaths, gather, read_stations
 from gaigs.data.impulse_responses import to_channels
 from gaigs.data.simulation import rss_dbm, sample_band
 from gaigs.registry import register
-from gaigs.task.rssi import Rssi
 
 
 @register("data", "deepmimo_rssi")

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.query import evenly
+from gaigs.core.query import evenly
 
 READINGS, ROUNDS, ACROSS = 100, 3, 18
 """Most readings of a gateway, evenly spread; rounds, each on a finer grid; candidates along x and along y."""

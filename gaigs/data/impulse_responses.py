@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 
+from gaigs.core.query import check_carrier
 from gaigs.data.parts import check_parts
-from gaigs.query import check_carrier
 
 PART = 256
 """Links summed at a time, since the waves of all paths take many times the memory of their sums."""

@@ -13,17 +13,17 @@ from jaxtyping import Int
 from torch import Tensor
 
 from gaigs import configuration
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Frame, Pose
+from gaigs.core.query import Query, as_numbers, as_positions, as_tensor, check_carrier
+from gaigs.core.task import Task, check_range
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links, divide, load
 from gaigs.data.parts import check_parts
 from gaigs.data.readings import loud_remark, marks_of
-from gaigs.geometry import Frame, Pose
 from gaigs.io.tables import number_places, shortened
-from gaigs.query import Query, as_numbers, as_positions, as_tensor, check_carrier
 from gaigs.registry import check_instance, check_type, registry, suggest
-from gaigs.task import Task, check_range
-from gaigs.task.csi import Csi
-from gaigs.task.rssi import Rssi
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +79,7 @@ def from_arrays(
 
     Args:
         task: Task of the labels: ``"rssi"`` (scalars [dBm]), or a task with its axes, e.g.
-            ``gaigs.task.spectrum.Spectrum(elevations, azimuths)`` or ``gaigs.task.csi.Csi(elements, frequencies)``.
+            ``Spectrum(elevations, azimuths)`` or ``Csi(elements, frequencies)`` of ``gaigs.core.task``.
         transmitters: Positions, world frame (n, 3) [m].
         receivers: ``Receiver`` or several, or positions (3,) or (k, 3) [m] of antennas that look along the axes; all
             elements of a channel then stand there.

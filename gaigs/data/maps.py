@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from gaigs.geometry import is_utm
+from gaigs.core.geometry import is_utm
 
 
 def find_pyproj() -> Any:

@@ -5,8 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.scene import Scene
 
 
 def check_fit(links: Links, scene: Scene | None = None) -> None:

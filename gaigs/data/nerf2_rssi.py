@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from gaigs.core.query import Query
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links, Parts
 from gaigs.data.readings import carriers_of, gateway, loud_remark, match_names, suggested, to_dbm
 from gaigs.io import tables
 from gaigs.io.yaml import read_mapping, to_position
-from gaigs.query import Query
 from gaigs.registry import register
-from gaigs.task.rssi import Rssi
 
 NOT_HEARD = -100.0
 """Value of readings that were not heard [dBm]."""

@@ -14,16 +14,16 @@ from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Grid, Pose
+from gaigs.core.query import CARRIERS, Query, check_carrier, unit_hint
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Parts
-from gaigs.geometry import Grid, Pose
 from gaigs.io import tables
 from gaigs.io.files import atomic_write, write_text
 from gaigs.io.images import GreyImages
 from gaigs.io.yaml import read_mapping, to_position, to_vector
-from gaigs.query import CARRIERS, Query, check_carrier, unit_hint
 from gaigs.registry import register
-from gaigs.task.spectrum import Spectrum
 
 SHAPE = (90, 360)
 """Elevations 1..90 deg and azimuths 0..359 deg, fixed by the format."""

@@ -11,10 +11,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from gaigs.antenna import Receiver
-from gaigs.geometry import Pose
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import check_carrier
 from gaigs.io.tables import Rows, to_number, to_numbers
-from gaigs.query import check_carrier
 from gaigs.registry import suggest
 
 QUIETEST, LOUDEST = -150.0, 30.0

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from gaigs.core.query import Query
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links
 from gaigs.data.readings import and_list, carriers_of, gateway, loud_remark, marks_given, to_dbm
 from gaigs.io import tables
 from gaigs.io.files import write_text
-from gaigs.query import Query
 from gaigs.registry import register
-from gaigs.task.rssi import Rssi
 
 ENDS = {"tx": "transmitter", "rx": "receiver"}
 COLUMNS = (*(f"{end}_{axis}" for end in ENDS for axis in "xyz"), "rss_dbm")

@@ -11,6 +11,9 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
+from gaigs.core.geometry import Frame
+from gaigs.core.query import Query
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links
 from gaigs.data.maps import check_metres, is_utm, metres_of, to_utm
 from gaigs.data.readings import (
@@ -25,12 +28,9 @@ from gaigs.data.readings import (
     match_names,
     suggested,
 )
-from gaigs.geometry import FAR, Frame
-from gaigs.io import tables
+from gaigs.io import FAR, tables
 from gaigs.io.yaml import read_mapping, to_vector
-from gaigs.query import Query
 from gaigs.registry import register
-from gaigs.task.rssi import Rssi
 
 FORMS = ("{}", "{}pos", "pos{}", "{}coord", "coord{}", "position{}", "tx{}", "loc{}")
 PLAIN = {axis: {form.format(axis) for form in FORMS} for axis in "xyz"}

@@ -12,15 +12,15 @@ from jaxtyping import Bool, Complex, Float, Int
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Grid, Pose
+from gaigs.core.propagation import bartlett, min_max
+from gaigs.core.query import Query, check_carrier
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.rssi import Rssi
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Parts
-from gaigs.geometry import Grid, Pose
-from gaigs.propagation import bartlett, min_max
-from gaigs.query import Query, check_carrier
 from gaigs.registry import check_type
-from gaigs.task.csi import Csi
-from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import Spectrum
 
 PART = 64
 """Transmitters simulated at a time, since the waves of all paths take a hundred times the memory of the labels."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from plyfile import PlyData
 
-from gaigs.geometry import FAR, WITHIN
+from gaigs.io import FAR, WITHIN
 from gaigs.io.tables import NUMBER, read_lines
 
 Face = tuple[int, ...]

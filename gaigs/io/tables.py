@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from gaigs.geometry import FAR, WITHIN
+from gaigs.io import FAR, WITHIN
 from gaigs.io.files import atomic_write
 
 Rows = Mapping[int, Sequence[str]]

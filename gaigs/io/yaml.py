@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from gaigs.geometry import FAR, WITHIN
+from gaigs.io import FAR, WITHIN
 from gaigs.io.tables import quote, read_lines, to_number
 
 

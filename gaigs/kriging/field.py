@@ -4,11 +4,11 @@ import torch
 from jaxtyping import Float, Inexact
 from torch import Tensor, nn
 
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene
 from gaigs.kriging.fit import Hyperparameters, local_deviations
 from gaigs.kriging.kernel import cholesky_factor, covariance, kernel, resize
 from gaigs.kriging.links import at_directions
-from gaigs.query import Batch
-from gaigs.scene import Scene
 
 
 class Field(nn.Module):

@@ -10,12 +10,12 @@ from jaxtyping import Complex, Float, Int
 from scipy.optimize import minimize
 from torch import Tensor
 
+from gaigs.core.query import Query, evenly
+from gaigs.core.scene import Scene
+from gaigs.core.stages import end_in_time
 from gaigs.data import Links
 from gaigs.kriging.kernel import Process, kernel, kriging_weights
 from gaigs.kriging.links import PART, coordinates, distances, known_links, scale_bounds, scaled, single_readings
-from gaigs.query import Query, evenly
-from gaigs.scene import Scene
-from gaigs.stages import end_in_time
 
 
 class Hyperparameters(NamedTuple):

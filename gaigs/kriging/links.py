@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gaigs.core.geometry import Grid
+from gaigs.core.query import Batch, Query, evenly
+from gaigs.core.scene import Scene
 from gaigs.data import Links, Split
-from gaigs.geometry import Grid
-from gaigs.query import Batch, Query, evenly
-from gaigs.scene import Scene
 
 PART = 256
 """Labels held in memory at a time: a spectrum takes 130 KB."""

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
+from gaigs.core.stages import track
 from gaigs.kriging.fit import AROUND
 from gaigs.kriging.kernel import kernel, resize
 from gaigs.kriging.links import distances
-from gaigs.stages import track
 
 JITTER = 1e-6
 """Variance of the processes that is not shared by places, over their variance: for places that are measured twice."""

@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
 from torch import Tensor, nn
 
-from gaigs import stages
+from gaigs.core import stages
+from gaigs.core.query import evenly
+from gaigs.core.scene import Scene
 from gaigs.kriging.fit import EDGES
 from gaigs.kriging.kernel import Process, resize
 from gaigs.kriging.links import distances, scale_bounds, scaled
-from gaigs.query import evenly
-from gaigs.scene import Scene
 
 NEAREST = 32
 """Readings around a held-out one while a process is fitted, and around a place whose variance is asked of many."""

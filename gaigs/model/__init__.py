@@ -14,20 +14,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs import checkpoint
-from gaigs.antenna import lacking
+from gaigs.calibration import Calibration, Estimate
+from gaigs.core.antenna import lacking
+from gaigs.core.geometry import Directions, ExtrapolationWarning
+from gaigs.core.query import ROUNDING, Batch, Query, as_directions, as_receivers, as_subcarriers
+from gaigs.core.scene import Scene
+from gaigs.core.stages import track
+from gaigs.core.task.csi import Csi
 from gaigs.data import Links
-from gaigs.gaussians import Gaussians
-from gaigs.geometry import Directions, ExtrapolationWarning
-from gaigs.kriging.intervals import Calibration, Estimate
 from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import PART
-from gaigs.query import ROUNDING, Batch, Query, as_directions, as_receivers, as_subcarriers
+from gaigs.model import checkpoint
 from gaigs.registry import check_type, name_of, registry
 from gaigs.registry.modes import usual_modes
-from gaigs.scene import Scene
-from gaigs.stages import track
-from gaigs.task.csi import Csi
+from gaigs.splatting.gaussians import Gaussians
 
 NUMBERS, MOST = 2**17, 1024
 """Numbers of labels that a prediction computes at a time, and most links; 16 links at least."""
@@ -375,11 +375,11 @@ class OptionalMethods(Protocol):
         """The rendering alone of a batch, to be timed."""
 
     def learnt_room(self, links: Links | None = None) -> object:
-        """The room learnt from the links, a ``gaigs.placement.learnt_room.LearntRoom`` for figures; without links that
+        """The room learnt from the links, a ``gaigs.planes.learnt_room.LearntRoom`` for figures; without links that
         of the state alone."""
 
     def learnt_paths(self, query: Query) -> object:
-        """The strongest paths of some links together, a list of ``gaigs.placement.learnt_room.LearntPath``."""
+        """The strongest paths of some links together, a list of ``gaigs.planes.learnt_room.LearntPath``."""
 
     def export(self, folder: Path) -> None:
         """Writes files for other programs into a run's folder."""

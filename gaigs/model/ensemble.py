@@ -6,11 +6,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from gaigs.core.query import Batch, evenly
+from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.model import Model, Prediction, Wrapper, call_optional
-from gaigs.query import Batch, evenly
 from gaigs.registry import register, registry
-from gaigs.scene import Scene
 
 
 @register("model", "ensemble")

@@ -6,14 +6,14 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from gaigs.core.phases import TELLING
+from gaigs.core.propagation import fit_gain
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene, check_elements, direct_gains, direct_waves
 from gaigs.data import Links
 from gaigs.kriging.links import known_links
 from gaigs.model import Model, Prediction
-from gaigs.phases import TELLING
-from gaigs.propagation import fit_gain
-from gaigs.query import Batch, Query
 from gaigs.registry import register
-from gaigs.scene import Scene, check_elements, direct_gains, direct_waves
 
 
 @register("model", "friis")

@@ -10,20 +10,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from gaigs.core.geometry import Directions, magnitudes, semi_axes, spherical_harmonics
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene, carriers
 from gaigs.data import Links
-from gaigs.deformation import Deformation, Residuals
-from gaigs.gaussians import SH_DC, Gaussians, Placed
-from gaigs.geometry import Directions, magnitudes, semi_axes, spherical_harmonics
 from gaigs.model import LookUp, Model, Prediction, build_trend
-from gaigs.placement import Placement
-from gaigs.pooling import Pooling
-from gaigs.pooling.channels import ChannelPooling
-from gaigs.pooling.paths import PathPooling, ReceivedPaths
-from gaigs.projection import Projection
-from gaigs.query import Batch, Query
-from gaigs.rasterizer import Rasterizer
 from gaigs.registry import call, is_built, name_of, register, registry
-from gaigs.scene import Scene, carriers
+from gaigs.splatting.deformation import Deformation, Residuals
+from gaigs.splatting.gaussians import SH_DC, Gaussians, Placed
+from gaigs.splatting.placement import Placement
+from gaigs.splatting.pooling import Pooling
+from gaigs.splatting.pooling.channels import ChannelPooling
+from gaigs.splatting.pooling.paths import PathPooling, ReceivedPaths
+from gaigs.splatting.projection import Projection
+from gaigs.splatting.rasterizer import Rasterizer
 
 
 class Excited(NamedTuple):
@@ -45,7 +45,7 @@ class GaussianSplatting(Model):
         placement, tokenizer, deformation, projection, rasterizer, pooling: Registered components: each the name, the
             configuration (a mapping with ``name`` and options), or the object itself. Pooling None is the label's own.
             Projection and rasterizer are None if the pooling takes paths.
-        gaussians: Options of ``gaigs.gaussians.Gaussians`` [m]; None if the placement alone brings Gaussians.
+        gaussians: Options of ``gaigs.splatting.gaussians.Gaussians`` [m]; None if the placement alone brings Gaussians.
         trend: Model whose value the pooled map is added to, likewise; None for none.
 
     Raises:
@@ -56,7 +56,7 @@ class GaussianSplatting(Model):
 
     Example:
         >>> from gaigs.model.gaigs import GaussianSplatting
-        >>> from gaigs.tokenizer.euclidean import EuclideanTokenizer
+        >>> from gaigs.splatting.tokenizer.euclidean import EuclideanTokenizer
         >>> links = gaigs.links("synthetic", transmitters=20, order=0)
         >>> tokenizer = EuclideanTokenizer(links.scene, width=32)
         >>> model = GaussianSplatting(links.scene, tokenizer=tokenizer, rasterizer="torch", gaussians={"count": 50})

@@ -7,6 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from gaigs.core.query import Batch, Query, evenly, thin_labels
+from gaigs.core.scene import Scene
+from gaigs.core.stages import stage
+from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
 from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
@@ -22,11 +26,7 @@ from gaigs.kriging.links import (
 )
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, build_trend
-from gaigs.query import Batch, Query, evenly, thin_labels
 from gaigs.registry import name_of, register
-from gaigs.scene import Scene
-from gaigs.stages import stage
-from gaigs.task.csi import Csi
 
 NEIGHBOURS = 300
 """Known links that enter each prediction of local kriging: with this kernel near links screen those behind them."""

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gaigs.core.query import Batch, Query, evenly
+from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.links import at_directions, coordinates, distances, folds_of, known_links, scale_bounds
 from gaigs.model import LookUp, Prediction
-from gaigs.query import Batch, Query, evenly
 from gaigs.registry import register
-from gaigs.scene import Scene
 
 COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Numbers of neighbours to choose from."""

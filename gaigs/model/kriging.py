@@ -11,7 +11,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gaigs import stages
+from gaigs.core import stages
+from gaigs.core.query import Batch, evenly, thin_labels
+from gaigs.core.scene import Scene
+from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters
@@ -20,10 +23,7 @@ from gaigs.kriging.links import PART, coordinates, folds_of, scaled, single_read
 from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, Wrapper, call_optional
-from gaigs.query import Batch, evenly, thin_labels
 from gaigs.registry import name_of, register, registry
-from gaigs.scene import Scene
-from gaigs.task import Task
 
 log = logging.getLogger(__name__)
 

@@ -2,12 +2,12 @@
 
 import torch
 
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.links import at_directions, known_links
 from gaigs.model import Model, Prediction
-from gaigs.query import Batch
 from gaigs.registry import register
-from gaigs.scene import Scene
 
 
 @register("model", "mean")

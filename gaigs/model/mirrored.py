@@ -11,30 +11,30 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor, nn
 
+from gaigs.core.propagation import fit_gain
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene, carriers, direct_gains, direct_waves
+from gaigs.core.task.csi import Csi
 from gaigs.data import Links
-from gaigs.deformation import Deformation
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
-from gaigs.placement import Placement
-from gaigs.placement.learnt_room import LearntPath, LearntRoom
-from gaigs.placement.mirrored import export
-from gaigs.placement.mirrored.channel_search import FEWEST, ChannelSearch
-from gaigs.placement.mirrored.lag_search import LagSearch
-from gaigs.placement.mirrored.level_search import LevelSearch
-from gaigs.placement.mirrored.reflections import seen_from
-from gaigs.placement.mirrored.search import Loss, move_planes, prune
-from gaigs.pooling import Pooling
-from gaigs.pooling.channels import ChannelPooling
-from gaigs.pooling.path_rssi import PathRssi
-from gaigs.pooling.path_spectrum import PathSpectrum
-from gaigs.pooling.paths import LagPooling
-from gaigs.projection import Projection
-from gaigs.propagation import fit_gain
-from gaigs.query import Batch, Query
-from gaigs.rasterizer import Rasterizer
+from gaigs.planes import export
+from gaigs.planes.channel_search import FEWEST, ChannelSearch
+from gaigs.planes.lag_search import LagSearch
+from gaigs.planes.learnt_room import LearntPath, LearntRoom
+from gaigs.planes.level_search import LevelSearch
+from gaigs.planes.search import Loss, move_planes, prune
 from gaigs.registry import register
-from gaigs.scene import Scene, carriers, direct_gains, direct_waves
-from gaigs.task.csi import Csi
+from gaigs.splatting.deformation import Deformation
+from gaigs.splatting.placement import Placement
+from gaigs.splatting.placement.mirrored.reflections import seen_from
+from gaigs.splatting.pooling import Pooling
+from gaigs.splatting.pooling.channels import ChannelPooling
+from gaigs.splatting.pooling.path_rssi import PathRssi
+from gaigs.splatting.pooling.path_spectrum import PathSpectrum
+from gaigs.splatting.pooling.paths import LagPooling
+from gaigs.splatting.projection import Projection
+from gaigs.splatting.rasterizer import Rasterizer
 
 log = logging.getLogger(__name__)
 

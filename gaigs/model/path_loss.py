@@ -4,12 +4,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.links import known_links, without_gross_errors
 from gaigs.model import Model, Prediction
-from gaigs.query import Batch
 from gaigs.registry import register
-from gaigs.scene import Scene
 
 
 @register("model", "path_loss")

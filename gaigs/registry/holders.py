@@ -16,6 +16,18 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1]
 """Folder of gaigs."""
 
+ROOMS = {
+    "task": "core/task",
+    "placement": "splatting/placement",
+    "tokenizer": "splatting/tokenizer",
+    "deformation": "splatting/deformation",
+    "projection": "splatting/projection",
+    "rasterizer": "splatting/rasterizer",
+    "pooling": "splatting/pooling",
+    "loss": "splatting/loss",
+}
+"""Folders in gaigs of the kinds that have none of their own there."""
+
 GIVEN = {
     "split": ("links",),
     "placement": ("scene", "channels"),
@@ -85,7 +97,8 @@ def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list
 
     The second list has the unreadable files, each with the cause.
     """
-    built_in, unreadable = _scan(kind, PACKAGE / kind, f"gaigs.{kind}")
+    room = ROOMS.get(kind, kind)
+    built_in, unreadable = _scan(kind, PACKAGE / room, f"gaigs.{room.replace('/', '.')}")
     installed = _installed_holders(kind)
     dropped, causes = _scan(kind, Path.cwd() / "plugins", "plugins", root=Path.cwd())
     targets = {(holder.name, holder.target) for holder in installed}

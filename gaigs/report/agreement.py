@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from gaigs.core.task import Task
 from gaigs.io.files import write_text
 from gaigs.report.style import COLUMN, LINES, STYLE, save
 from gaigs.report.table import markdown
-from gaigs.task import Task
 
 
 class Cell(NamedTuple):

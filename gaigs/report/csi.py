@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 from numpy import ndarray
 
+from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.report.curves import LABEL, cdf
 from gaigs.report.figures import Examples, TaskFigures, own_scores, read_examples, scores_of_systems
 from gaigs.report.style import COLUMN, MARKERS, PAGE, SKY, STYLE, looks
-from gaigs.task.csi import Csi
 
 LOOKS = {
     "predicted": {"color": SKY, "linewidth": 2.4, "markersize": 5},

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy import ndarray
 
+from gaigs.core.task import Metric
 from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE, looks
-from gaigs.task import Metric
 
 LABEL = 48
 """Most characters of a line of an axis label, in a figure of one column."""

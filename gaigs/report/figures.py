@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.report.runs import as_baseline
-from gaigs.task import Task
 
 registered: dict[type[Task], type["TaskFigures"]] = {}
 """Figures of plug-ins, by task."""

@@ -8,10 +8,10 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from gaigs.core.task import Task
+from gaigs.core.task.scalar import Scalar
 from gaigs.report.figures import own_scores
 from gaigs.report.style import PAGE, STYLE, looks
-from gaigs.task import Task
-from gaigs.task.scalar import Scalar
 
 BINS = 12
 """Points of the second panel, each of as many test links."""

@@ -13,9 +13,9 @@ from matplotlib.patheffects import Normal, Stroke
 from numpy import ndarray
 
 from gaigs.data import Links
-from gaigs.gaussians import SH_DC, Gaussians
-from gaigs.placement.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
+from gaigs.planes.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
 from gaigs.report.style import BLUE, GREEN, ORANGE, STYLE
+from gaigs.splatting.gaussians import SH_DC, Gaussians
 
 SHOWN = 0.001
 """Smallest share of the power of a plane that is drawn."""

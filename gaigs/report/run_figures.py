@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
-from gaigs import stages
+from gaigs.core import stages
+from gaigs.core.task import Task
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.scalar import Scalar
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links
 from gaigs.model import Model, call_optional
 from gaigs.report import figures, style
@@ -12,10 +16,6 @@ from gaigs.report.intervals import intervals
 from gaigs.report.room import paths, room
 from gaigs.report.scalar import ScalarFigures
 from gaigs.report.spectrum import SpectrumFigures
-from gaigs.task import Task
-from gaigs.task.csi import Csi
-from gaigs.task.scalar import Scalar
-from gaigs.task.spectrum import Spectrum
 
 BUILT_IN = {Csi: CsiFigures, Scalar: ScalarFigures, Spectrum: SpectrumFigures}
 

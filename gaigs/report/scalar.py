@@ -16,12 +16,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 from numpy import ndarray
 
+from gaigs.core.radio_maps import RadioMap
+from gaigs.core.task.scalar import Scalar, with_unit
 from gaigs.data import Links
-from gaigs.radio_maps import RadioMap
 from gaigs.report.curves import cdf
 from gaigs.report.figures import TaskFigures, own_scores, scores_of_systems
 from gaigs.report.style import BLUE, GREY, ORANGE, PAGE, STYLE, round_step
-from gaigs.task.scalar import Scalar, with_unit
 
 PANELS, MOST = 6, 12
 """Largest numbers of panels of a figure, a panel a receiver, and of receivers in the figures of a run."""

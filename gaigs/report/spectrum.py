@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 from numpy import ndarray
 
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links
 from gaigs.report.curves import cdf
 from gaigs.report.figures import Examples, TaskFigures, own_scores, read_examples, scores_of_systems
 from gaigs.report.style import PAGE, STYLE
-from gaigs.task.spectrum import Spectrum
 
 AMPLITUDE = {"cmap": "viridis", "vmin": 0, "vmax": 1}
 

@@ -12,9 +12,9 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from gaigs.core.task import Metric, Task
 from gaigs.io import tables
 from gaigs.registry import registry
-from gaigs.task import Metric, Task
 
 ROWS = 20
 """Most receivers in the table of a run."""

@@ -10,17 +10,17 @@ from typing import Any
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from gaigs import checkpoint, data
+from gaigs import data
+from gaigs.core.radio_maps import radio_map
+from gaigs.core.stages import stage
 from gaigs.data import Links
 from gaigs.io.files import write_text
 from gaigs.kriging.links import check_known
-from gaigs.model import Model, call_optional
+from gaigs.model import Model, call_optional, checkpoint
 from gaigs.processes import is_first, limited_threads, only_run
-from gaigs.radio_maps import radio_map
 from gaigs.registry import check_type, only_recorded, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store, stored_software, warn_of_changes
-from gaigs.stages import stage
 
 log = logging.getLogger(__name__)
 

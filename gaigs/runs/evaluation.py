@@ -20,21 +20,21 @@ from rich.jupyter import JupyterMixin
 from rich.markup import escape
 from torch import Tensor
 
-from gaigs import stages
+from gaigs.calibration import Calibration, fewest, holds, interval_scores, nearest, summarise_intervals, thinned
 from gaigs.configuration import composed, files_of
+from gaigs.core import stages
+from gaigs.core.query import Batch, Query, evenly
+from gaigs.core.scene import Scene
+from gaigs.core.task import Task
 from gaigs.data import Links, with_places
 from gaigs.data.matching import check_fit
 from gaigs.io.files import atomic_write
-from gaigs.kriging.intervals import Calibration, fewest, holds, interval_scores, nearest, summarise_intervals, thinned
 from gaigs.kriging.links import folds_of, single_readings
 from gaigs.model import Model, call_optional
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging, predicted
-from gaigs.query import Batch, Query, evenly
 from gaigs.registry import name_of, registry
 from gaigs.report.table import metrics_table, verdict
-from gaigs.scene import Scene
-from gaigs.task import Task
 
 log = logging.getLogger(__name__)
 

@@ -21,19 +21,19 @@ from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from lightning.pytorch.utilities.seed import isolate_rng
 from torch import distributed
 
-from gaigs import checkpoint, stages
 from gaigs.configuration import composed, preset
+from gaigs.core import stages
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.kriging.links import check_known
-from gaigs.loss import Loss
-from gaigs.model import Model
+from gaigs.model import Model, checkpoint
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
 from gaigs.registry import call, configuration_of, digests, registry
 from gaigs.runs.evaluation import calibrated, is_trained
 from gaigs.runs.folder import ANOTHER, check_same_links, claim, fingerprint
+from gaigs.splatting.loss import Loss
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS, make_budget, watched
 from gaigs.training.checkpoints import Interrupted, KeepBest, KeepLast

@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gaigs.query import Query
-from gaigs.scene import Scene
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene
 
 PRECISION = {torch.float32: 1e-4, torch.float64: 1e-9}
 """Largest error of a result, relative to the largest true value."""

@@ -8,15 +8,15 @@ import torch
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Grid, Pose
+from gaigs.core.query import CARRIERS, Query
+from gaigs.core.scene import Scene
+from gaigs.core.task import Task
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.rssi import Rssi
+from gaigs.core.task.spectrum import MIN_MAX, Spectrum
 from gaigs.data import Links, Split
-from gaigs.geometry import Grid, Pose
-from gaigs.query import CARRIERS, Query
-from gaigs.scene import Scene
-from gaigs.task import Task
-from gaigs.task.csi import Csi
-from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import MIN_MAX, Spectrum
 from gaigs.testing.checks import flat, require, require_tensor
 
 POSES = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)), Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0))

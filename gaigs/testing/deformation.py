@@ -5,10 +5,10 @@ from collections.abc import Callable
 import torch
 from torch import nn
 
-from gaigs.deformation import Residuals
-from gaigs.gaussians import Placed, Tokens
-from gaigs.query import Query
-from gaigs.scene import Scene
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene
+from gaigs.splatting.deformation import Residuals
+from gaigs.splatting.gaussians import Placed, Tokens
 from gaigs.testing import checks
 from gaigs.testing.checks import PRECISION, require, require_tensor
 
@@ -16,7 +16,8 @@ from gaigs.testing.checks import PRECISION, require, require_tensor
 def check_deformation(build: Callable[..., nn.Module], scene: Scene, device: torch.device | str = "cpu") -> None:
     """Checks a deformation: residuals' shapes, dtype, gradients, attenuations in (0, 1], independence of the batch.
 
-    The contract is that of ``gaigs.deformation.Deformation``, made by ``build(scene=, channels=, tokenizer_widths=)``.
+    The contract is that of ``gaigs.splatting.deformation.Deformation``.
+    ``build(scene=, channels=, tokenizer_widths=)`` makes it.
     """
     generator = torch.Generator().manual_seed(0)
     cases = [(widths, 1) for widths in ((5, 4, 6), (5, 0, 0), (0, 4, 6), (0, 0, 0))] + [((5, 4, 6), 3)]

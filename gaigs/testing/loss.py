@@ -5,9 +5,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from gaigs.core.query import Batch
 from gaigs.data import Links
-from gaigs.loss import Loss
-from gaigs.query import Batch
+from gaigs.splatting.loss import Loss
 from gaigs.testing.checks import PRECISION, require, require_close, require_gradients, require_tensor
 
 
@@ -15,7 +15,7 @@ def check_loss(loss: Loss, links: Links, device: torch.device | str = "cpu") -> 
     """Checks a loss: least at the labels, a mean over the links, finite gradients everywhere, terms by name.
 
     It is made with the task of the links. Labels on a grid are also compared on every second row and column. The
-    contract is that of ``gaigs.loss.Loss``.
+    contract is that of ``gaigs.splatting.loss.Loss``.
     """
     batch = links.batch(links.split.train[:6])
     batches = [batch]

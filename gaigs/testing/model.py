@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import torch
 
+from gaigs.core.geometry import Directions, ExtrapolationWarning, Grid
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
+from gaigs.core.task.csi import Csi
 from gaigs.data import Links
-from gaigs.gaussians import Gaussians
-from gaigs.geometry import Directions, ExtrapolationWarning, Grid
 from gaigs.model import Model, Prediction, call_optional
-from gaigs.query import Batch, Query
 from gaigs.registry import registry
-from gaigs.scene import Scene
-from gaigs.task.csi import Csi
+from gaigs.splatting.gaussians import Gaussians
 from gaigs.testing import checks
 from gaigs.testing.checks import require, require_close, require_same, require_tensor
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 from torch import nn
 
-from gaigs.gaussians import Gaussians, Placed
-from gaigs.scene import Scene
+from gaigs.core.scene import Scene
+from gaigs.splatting.gaussians import Gaussians, Placed
 from gaigs.testing import checks
 from gaigs.testing.checks import PRECISION, require, require_close, require_same, require_tensor
 
@@ -17,7 +17,7 @@ def check_placement(placement: nn.Module, scene: Scene, device: torch.device | s
     """Checks a placement built for the scene and 2 channels: shapes, dtype, gradients, independence of the batch.
 
     A placement with Gaussians of its own is also called without free ones. The contract is that of
-    ``gaigs.placement.Placement``.
+    ``gaigs.splatting.placement.Placement``.
     """
     generator = torch.Generator().manual_seed(0)
     cases = [(n, 3, dtype) for n in ((40, 0) if placement.has_own else (40,)) for dtype in PRECISION]

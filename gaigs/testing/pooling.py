@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.antenna import Receiver
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Grid
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.geometry import Grid
-from gaigs.pooling import Pooling
-from gaigs.pooling.paths import PathPooling, ReceivedPaths
-from gaigs.query import Query
-from gaigs.scene import Scene
+from gaigs.splatting.pooling import Pooling
+from gaigs.splatting.pooling.paths import PathPooling, ReceivedPaths
 from gaigs.testing.checks import PRECISION, require, require_close, require_gradients, require_same, require_tensor
 
 
@@ -26,7 +26,7 @@ def check_pooling(build: Callable[[Scene], Pooling], links: Links, device: torch
     paths are among the inputs. A pooling of maps without a grid of its own is given maps over the label's directions
     and over a list of some of them. Any other is called with such a list. A pooling of maps whose label is one real
     number must also take maps that are constant, span 12 decades or are of half precision. The contract is that of
-    ``gaigs.pooling.Pooling``.
+    ``gaigs.splatting.pooling.Pooling``.
     """
     pooling, task = build(links.scene), links.task
     takes_paths, grid = isinstance(pooling, PathPooling), pooling.grid

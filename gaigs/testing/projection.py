@@ -3,15 +3,15 @@
 import torch
 from torch import Tensor
 
-from gaigs.geometry import Directions, Grid, Pose, Rays, from_spherical, quaternions_to_rotations
-from gaigs.projection import NEAR, Projection
+from gaigs.core.geometry import Directions, Grid, Pose, Rays, from_spherical, quaternions_to_rotations
+from gaigs.splatting.projection import NEAR, Projection
 from gaigs.testing.checks import require, require_close, require_gradients, require_tensor
 
 
 def check_projection(projection: Projection, device: torch.device | str = "cpu") -> None:
     """Checks a projection: ``jacobian`` and ``plane`` agree with ``coordinates``, at pole, horizon and seam too.
 
-    The contract is that of ``gaigs.projection.Projection``.
+    The contract is that of ``gaigs.splatting.projection.Projection``.
     """
     degrees = lambda *range_: torch.arange(*range_, dtype=torch.float64, device=device).deg2rad()
     azimuths, elevations = torch.cartesian_prod(degrees(-175, 180, 25), degrees(-55, 60, 10)).unbind(1)

@@ -8,15 +8,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gaigs.projection import Plane, Splats
-from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN, Rasterizer
+from gaigs.splatting.projection import Plane, Splats
+from gaigs.splatting.rasterizer import ALPHA_MAX, ALPHA_MIN, Rasterizer
 from gaigs.testing.checks import PRECISION, fixed_sum, require, require_close, require_tensor
 
 
 def check_rasterizer(rasterizer: Rasterizer, device: torch.device | str = "cpu") -> None:
     """Checks a rasterizer: map, transmittance and gradients against ``rasterize_densely``, on easy and hard scenes.
 
-    float64 may be refused by a ``TypeError``. The contract is that of ``gaigs.rasterizer.Rasterizer``.
+    float64 may be refused by a ``TypeError``. The contract is that of ``gaigs.splatting.rasterizer.Rasterizer``.
     """
     for title, arguments in _scenes():
         # Where A meets one of its bounds to within rounding, the two may rightly decide differently.
@@ -52,7 +52,7 @@ def rasterize_densely(
     attenuations: Float[Tensor, "b n"] | None,
     plane: Plane,
 ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
-    """The formula of ``gaigs.rasterizer.Rasterizer`` over all pairs of splat and pixel, in float64: slow, but plain."""
+    """The formula of ``Rasterizer`` over all pairs of splat and pixel, in float64: slow, but plain."""
     order, footprints = footprints_of(splats, plane)
     product = opacities[:, order, None, None].double() * footprints
     acts = product >= ALPHA_MIN

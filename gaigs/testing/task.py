@@ -8,17 +8,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaigs.geometry import Grid
-from gaigs.query import Batch, Query
+from gaigs.core.geometry import Grid
+from gaigs.core.query import Batch, Query
+from gaigs.core.task import Metric, Task
 from gaigs.registry import registry
-from gaigs.task import Metric, Task
 from gaigs.testing.checks import flat, require, require_close, require_refusal
 
 
 def check_task(task: Task, *thinnings: Mapping) -> None:
     """Checks a task: its state restores it, true values score best, broken ones are refused, thinning is consistent.
 
-    ``thinnings`` are further options of its ``thinning``. The contract is that of ``gaigs.task.Task``.
+    ``thinnings`` are further options of its ``thinning``. The contract is that of ``gaigs.core.task.Task``.
     """
     _check_facts(task)
     _check_state(task)
@@ -44,7 +44,7 @@ def _check_facts(task: Task) -> None:
         require(isinstance(task.directions, Grid), "directions must be a Grid")
         require(task.directions.shape == task.shape, f"directions must be of the label's shape {task.shape}")
     metrics = type(task).metrics().values()
-    require(all(isinstance(metric, Metric) for metric in metrics), "metrics must be gaigs.task.Metric")
+    require(all(isinstance(metric, Metric) for metric in metrics), "metrics must be gaigs.core.task.Metric")
     require(any(metric.is_brief for metric in metrics), "at least one metric must be brief")
 
 

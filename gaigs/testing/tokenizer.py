@@ -5,8 +5,8 @@ import copy
 import torch
 from torch import nn
 
-from gaigs.gaussians import Placed, Tokens
-from gaigs.scene import Scene
+from gaigs.core.scene import Scene
+from gaigs.splatting.gaussians import Placed, Tokens
 from gaigs.testing import checks
 from gaigs.testing.checks import PRECISION, require, require_tensor
 
@@ -15,7 +15,7 @@ def check_tokenizer(tokenizer: nn.Module, scene: Scene, device: torch.device | s
     """Checks a tokenizer built for the scene: widths, dtype, gradients, independence of the batch.
 
     The inputs include Gaussians that stand elsewhere for each query, and the scene's carriers. The contract is that of
-    ``gaigs.tokenizer.Tokens``.
+    ``gaigs.splatting.tokenizer.Tokens``.
     """
     generator = torch.Generator().manual_seed(0)
     cases = (40, 3, 1, torch.float32), (1, 1, 1, torch.float32), (40, 3, 1, torch.float64), (40, 3, 3, torch.float32)

@@ -13,11 +13,11 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from gaigs.checkpoint import KEY
+from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.model import Model
+from gaigs.model.checkpoint import KEY
 from gaigs.processes import stopping
-from gaigs.scene import Scene
 from gaigs.testing.checks import flat, require, require_close, require_refusal
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.checkpoints import KeepLast, save

@@ -2,8 +2,8 @@
 
 import torch
 
-from gaigs.query import Batch
-from gaigs.task import Task
+from gaigs.core.query import Batch
+from gaigs.core.task import Task
 
 
 def seeded(*numbers: int) -> torch.Generator:

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor, distributed
 
+from gaigs.core.query import Batch
 from gaigs.data import Links
-from gaigs.query import Batch
 from gaigs.training import seeded
 
 

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from gaigs import stages
+from gaigs.core import stages
 from gaigs.processes import is_first
 from gaigs.registry import check_type
 

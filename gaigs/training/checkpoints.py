@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 from lightning.pytorch.callbacks import Checkpoint
 
-from gaigs import checkpoint
 from gaigs.io.files import atomic_write
+from gaigs.model import checkpoint
 from gaigs.processes import STOPPING, hang_up
 from gaigs.training import MeanScores
 

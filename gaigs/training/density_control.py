@@ -3,7 +3,7 @@
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from gaigs import density
+from gaigs.splatting import density
 from gaigs.training import seeded
 
 

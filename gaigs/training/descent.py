@@ -7,11 +7,11 @@ import lightning
 import torch
 from torch import Tensor
 
-from gaigs.checkpoint import KEY
-from gaigs.loss import Loss
+from gaigs.core.query import Batch
 from gaigs.model import Model
-from gaigs.query import Batch
+from gaigs.model.checkpoint import KEY
 from gaigs.registry import call, register, suggest
+from gaigs.splatting.loss import Loss
 from gaigs.training import MeanScores, seeded
 from gaigs.training.budget import share_done
 from gaigs.training.finite import find_broken, is_finite

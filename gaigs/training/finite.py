@@ -6,8 +6,8 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
+from gaigs.core.query import Batch
 from gaigs.model import Model
-from gaigs.query import Batch
 
 
 @torch.no_grad()

@@ -4,7 +4,7 @@ import time
 
 from lightning.pytorch.callbacks import ProgressBar
 
-from gaigs import stages
+from gaigs.core import stages
 from gaigs.training.budget import share_done
 
 

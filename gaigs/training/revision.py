@@ -9,8 +9,8 @@ from jaxtyping import Int
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 
+from gaigs.core.query import Batch
 from gaigs.data import Links
-from gaigs.query import Batch
 from gaigs.training import seeded
 from gaigs.training.budget import is_time_up, time_share
 

@@ -17,7 +17,7 @@ def test_rows_of_tiny_scenes(tmp_path, monkeypatch):
     def no_driver(*_):
         raise RuntimeError("no driver")
 
-    monkeypatch.setattr("gaigs.rasterizer.opencl.open_queue", no_driver)
+    monkeypatch.setattr("gaigs.splatting.rasterizer.opencl.open_queue", no_driver)
     precisions = ["float64", "float32", "bfloat16"]
     own = ["--precisions", *precisions, "--rasterizers", "torch", "opencl", "--repeats", "2"]
     rasterizer.main([*TINY, *own, "--folder", str(tmp_path)])

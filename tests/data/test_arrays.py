@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.core.task.csi import Csi
 from gaigs.data.readings import gateway
-from gaigs.task.csi import Csi
 
 PLACES = np.random.default_rng(0).uniform(0, 4, (12, 3))
 GATEWAYS = [[0.0, 0.0, 2.0], [4.0, 4.0, 2.0]]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import gaigs
-from gaigs.geometry import ExtrapolationWarning
+from gaigs.core.geometry import ExtrapolationWarning
 from gaigs.testing import example_links
 
 OPTIONS = {"transmitters": 20, "subcarriers": 8, "order": 0}

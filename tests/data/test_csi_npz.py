@@ -11,9 +11,9 @@ import scipy.io
 import torch
 
 import gaigs
+from gaigs.core.task.csi import Csi
 from gaigs.data import csi_npz, load
 from gaigs.data.parts import check_parts
-from gaigs.task.csi import Csi
 from gaigs.testing import check_data
 
 RANDOM = {"name": "random", "validation": 0}

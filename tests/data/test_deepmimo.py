@@ -11,7 +11,7 @@ import scipy.io
 import torch
 from scipy.constants import speed_of_light
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
 from gaigs.data import deepmimo, deepmimo_rssi, synthetic
 from gaigs.data.__main__ import main
 from gaigs.testing import check_data

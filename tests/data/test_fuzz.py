@@ -10,7 +10,7 @@ from damages import BYTES, TEXTS
 
 from gaigs.data import csi_npz, deepmimo, nerf2_rssi, nerf2_spectrum, rssi_csv, rssi_wide
 from gaigs.data.readings import LOUDEST
-from gaigs.geometry import FAR
+from gaigs.io import FAR
 from gaigs.testing import check_data
 
 COUNT = 100

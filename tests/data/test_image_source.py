@@ -9,11 +9,11 @@ import torch
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Grid, Pose, from_spherical
+from gaigs.core.propagation import bartlett, fresnel
 from gaigs.data.synthetic import respond_in_parts
 from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, passes, permittivity, trace
-from gaigs.geometry import Grid, Pose, from_spherical
-from gaigs.propagation import bartlett, fresnel
 
 FREQUENCY = 3e9
 WAVELENGTH = speed_of_light / FREQUENCY

@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from skimage.io import imread
 from skimage.metrics import structural_similarity
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Grid, Pose
+from gaigs.core.query import Query
+from gaigs.core.task.rssi import Rssi
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, load, nerf2_spectrum
 from gaigs.data.nerf2_spectrum import write
-from gaigs.geometry import Grid, Pose
-from gaigs.query import Query
 from gaigs.split.random import random
-from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import Spectrum
 from gaigs.testing import check_data
 
 OFFICIAL = {"name": "official", "validation": 0}

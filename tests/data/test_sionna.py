@@ -7,11 +7,11 @@ import pytest
 import torch
 from scipy.constants import speed_of_light
 
+from gaigs.core.geometry import from_spherical
 from gaigs.data import load
 from gaigs.data.sionna import HEIGHTS, place
 from gaigs.data.sionna.meshes import FURNITURE_MARGIN
 from gaigs.data.sionna.rooms import ROOMS
-from gaigs.geometry import from_spherical
 
 CARRIER, BANDWIDTH = 6.4896e9, 499.2e6
 CLEAR = {"noise": 0.0, "sensitivity": -300.0}

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from gaigs.core.geometry import Grid
 from gaigs.data import load
 from gaigs.data.synthetic import REGION, ROOM, spectra, wavefront_obj
 from gaigs.data.synthetic.image_source import is_free
-from gaigs.geometry import Grid
 from gaigs.io.meshes import parse_obj
 from gaigs.testing import check_data
 

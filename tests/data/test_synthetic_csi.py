@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from scipy.constants import speed_of_light
 
+from gaigs.core.geometry import Grid
+from gaigs.core.propagation import bartlett, min_max
 from gaigs.data import load
-from gaigs.geometry import Grid
-from gaigs.propagation import bartlett, min_max
 from gaigs.testing import check_data
 
 OFFICIAL = {"name": "official", "validation": 0}

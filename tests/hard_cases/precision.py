@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from gaigs.query import Query
+from gaigs.core.query import Query
 from gaigs.registry import registry
 
 sys.path.append(str(Path(__file__).parents[1]))

@@ -6,9 +6,9 @@ import pytest
 import torch
 from precision import build_rasterizer
 
-from gaigs.projection import Plane, Splats
-from gaigs.rasterizer import ALPHA_MAX
 from gaigs.registry import registry
+from gaigs.splatting.projection import Plane, Splats
+from gaigs.splatting.rasterizer import ALPHA_MAX
 
 CROWD = 10_000
 PLANE = Plane(torch.linspace(-0.1, 0.1, 5)[None], torch.linspace(-0.1, 0.1, 4)[:, None], 2 * math.pi)

@@ -6,10 +6,10 @@ import pytest
 import torch
 from precision import DTYPES, require_same
 
-from gaigs.antenna import Array, Receiver
-from gaigs.geometry import Pose, magnitudes, polar
-from gaigs.pooling.path_rssi import PathRssi
-from gaigs.pooling.paths import ReceivedPaths, element_fields
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Pose, magnitudes, polar
+from gaigs.splatting.pooling.path_rssi import PathRssi
+from gaigs.splatting.pooling.paths import ReceivedPaths, element_fields
 from gaigs.testing import example_links
 
 FAINT = [0.0, 1e-45, 1e-42, 1e-39, 1.2e-38, 1e-30, 1.0, 1e30]

@@ -6,9 +6,9 @@ from precision import build, require_same, widen
 from test_contracts import composed
 from torch.nn import functional
 
-from gaigs.placement.mirrored.reflections import all_sequences, fold, images
-from gaigs.query import Query
+from gaigs.core.query import Query
 from gaigs.registry import registry
+from gaigs.splatting.placement.mirrored.reflections import all_sequences, fold, images
 from gaigs.testing import example_links
 from gaigs.testing.placement import example_gaussians
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 from precision import build_rasterizer
 
-from gaigs.geometry import Grid, Pose, from_spherical, semi_axes
-from gaigs.projection import NEAR, Plane
-from gaigs.rasterizer import ALPHA_MAX, ALPHA_MIN
+from gaigs.core.geometry import Grid, Pose, from_spherical, semi_axes
 from gaigs.registry import registry
+from gaigs.splatting.projection import NEAR, Plane
+from gaigs.splatting.rasterizer import ALPHA_MAX, ALPHA_MIN
 from gaigs.testing.rasterizer import distance_to_jumps, rasterize_densely
 
 VALUES, GRADIENTS = 1e-4, 5e-3

@@ -7,8 +7,8 @@ import torch
 from precision import DTYPES, TASKS, require_finite, widen
 from test_contracts import composed
 
-from gaigs.geometry import Pose
-from gaigs.query import Query
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query
 from gaigs.registry import registry
 from gaigs.testing import example_links
 

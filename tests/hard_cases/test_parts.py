@@ -8,11 +8,11 @@ import pytest
 import torch
 from precision import TASKS, build, require_same, widen
 
-from gaigs.gaussians import Placed, Tokens
-from gaigs.geometry import Pose
-from gaigs.pooling.paths import LagPooling, PathPooling
-from gaigs.query import Query
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query
 from gaigs.registry import registry
+from gaigs.splatting.gaussians import Placed, Tokens
+from gaigs.splatting.pooling.paths import LagPooling, PathPooling
 from gaigs.testing import example_links
 from gaigs.testing.placement import example_gaussians
 from gaigs.testing.pooling import example_paths

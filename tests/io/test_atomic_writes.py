@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from gaigs import checkpoint
 from gaigs.io.files import atomic_write, file_message
+from gaigs.model import checkpoint
 
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -11,15 +11,15 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
 from gaigs.data import Split
 from gaigs.kriging import fit
 from gaigs.kriging.fit import NUGGETS, HeldOut, hold_out, negative_log_likelihood
 from gaigs.kriging.kernel import kriging_weights
 from gaigs.model import Model, gaussian_process
 from gaigs.model.gaussian_process import GaussianProcess
-from gaigs.query import Query
 from gaigs.registry import registry
-from gaigs.task.csi import Csi
 from gaigs.testing import example_links
 
 TASKS = pytest.mark.parametrize("task", ["spectrum", "csi", "one channel"])
@@ -114,7 +114,7 @@ def test_many_links_are_predicted_from_the_nearest(task, monkeypatch):
     assert abs(expected - kriged(model, links, 1, asked)).max() > 1e-4
 
 
-@pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
+@pytest.mark.filterwarnings("ignore::gaigs.core.geometry.ExtrapolationWarning")
 @pytest.mark.parametrize(("task", "trend"), [("spectrum", "mean"), ("rssi", "path_loss"), ("csi", "friis")])
 def test_far_from_all_links_only_the_trend_is_predicted(task, trend):
     links = example_links(task)

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.core.query import Batch
 from gaigs.kriging import scalar
 from gaigs.kriging.links import without_gross_errors
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.path_loss import PathLoss
-from gaigs.query import Batch
 
 RECEIVERS = torch.tensor([[0.0, 0.0, 2.0], [12.0, 8.0, 2.0]])
 PLACES = torch.rand(80, 3, generator=torch.Generator().manual_seed(3)) * torch.tensor([12.0, 8.0, 1.0])

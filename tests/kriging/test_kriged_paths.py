@@ -9,13 +9,13 @@ import torch
 from scipy.linalg import block_diag
 from scipy.spatial.distance import cdist
 
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
 from gaigs.data import Split
 from gaigs.kriging.paths import Equations, PathField, PathProcess, conjugate_gradients
 from gaigs.model.kriging import Kriging
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.query import Query
 from gaigs.runs.evaluation import unseen
-from gaigs.task.csi import Csi
 from gaigs.testing import example_links
 
 PROCESS = PathProcess(2.0, 0.1, 0.4)

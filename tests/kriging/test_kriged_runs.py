@@ -8,9 +8,10 @@ import pytest
 import torch
 
 import gaigs
-from gaigs import checkpoint, runs
+from gaigs import runs
 from gaigs.data import load
 from gaigs.kriging import fit, scalar
+from gaigs.model import checkpoint
 from gaigs.runs import evaluation
 from gaigs.training.descent import Descent
 

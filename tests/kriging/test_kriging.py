@@ -9,6 +9,8 @@ import torch
 from scipy.spatial.distance import cdist
 from torch import nn
 
+from gaigs.commands.survey import posterior
+from gaigs.core.query import Batch, Query
 from gaigs.data import Split
 from gaigs.kriging import field, fit, scalar
 from gaigs.kriging.field import principal_components
@@ -18,9 +20,7 @@ from gaigs.kriging.scalar import Choice, ScalarProcess
 from gaigs.model import Model, Prediction, call_optional, kriging
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging
-from gaigs.query import Batch, Query
 from gaigs.registry import registry
-from gaigs.surveying import posterior
 from gaigs.testing import check_model, example_links
 
 TASKS = pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])

@@ -11,12 +11,12 @@ from scipy.integrate import quad
 from scipy.spatial.distance import cdist
 
 import gaigs
+from gaigs.core.query import Query
 from gaigs.data import Split
 from gaigs.kriging import scalar
 from gaigs.kriging.links import coordinates, folds_of
 from gaigs.kriging.scalar import Choice, ScalarProcess, conditional, covariances, log_density
 from gaigs.model.gaussian_process import GaussianProcess
-from gaigs.query import Query
 from gaigs.testing import example_links
 
 BOX = torch.tensor([6.0, 4.0, 2.0])

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 import gaigs
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
 from gaigs.data import divide
-from gaigs.loss.log_relative_error import LogRelativeError
-from gaigs.query import Query
 from gaigs.registry import registry
-from gaigs.task.csi import Csi
+from gaigs.splatting.loss.log_relative_error import LogRelativeError
 
 SPLIT = {"name": "random", "seed": 0}
 

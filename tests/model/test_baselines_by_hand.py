@@ -14,16 +14,16 @@ import torch
 import yaml
 from scipy.spatial.distance import cdist
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.rssi import Rssi
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Split
-from gaigs.geometry import Pose
 from gaigs.kriging.links import without_gross_errors
-from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.runs import evaluation
-from gaigs.task.csi import Csi
-from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import Spectrum
 
 FILES = Path(__file__).parents[2] / "conf" / "task"
 BASELINES = {

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import gaigs
-from gaigs import checkpoint
 from gaigs.kriging import scalar
+from gaigs.model import checkpoint
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.gaigs import GaussianSplatting
 

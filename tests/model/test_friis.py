@@ -6,14 +6,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
 from gaigs.data import Links, Split
 from gaigs.data.synthetic import respond_in_parts
 from gaigs.data.synthetic.image_source import Room
-from gaigs.geometry import Pose
 from gaigs.model.friis import Friis
-from gaigs.query import Query
-from gaigs.task.csi import Csi
 from gaigs.testing import example_links
 
 EMPTY = Room((7.0, 5.0, 3.0), ("concrete",) * 6)

@@ -7,13 +7,13 @@ import torch
 from pipeline import MEAN_POWER, NONE, PARTS, SOFTMAX, trained, two_branch, watch
 from torch import nn
 
+from gaigs.core.geometry import Grid, semi_axes
+from gaigs.core.query import Query
 from gaigs.data import Split
-from gaigs.gaussians import Placed, Tokens
-from gaigs.geometry import Grid, semi_axes
 from gaigs.model.gaigs import GaussianSplatting
-from gaigs.placement import Placement
-from gaigs.query import Query
 from gaigs.registry import registry
+from gaigs.splatting.gaussians import Placed, Tokens
+from gaigs.splatting.placement import Placement
 from gaigs.testing import check_model, example_links
 from gaigs.testing.rasterizer import rasterize_densely
 

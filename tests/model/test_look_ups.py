@@ -7,12 +7,12 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.core.geometry import ExtrapolationWarning, Grid, Rays
+from gaigs.core.query import Query
 from gaigs.data import Split
-from gaigs.geometry import ExtrapolationWarning, Grid, Rays
 from gaigs.kriging.links import distances
 from gaigs.model.knn import KNearestNeighbours
 from gaigs.model.mean import Mean
-from gaigs.query import Query
 from gaigs.registry import registry
 from gaigs.testing import example_links
 

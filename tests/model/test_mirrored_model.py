@@ -8,20 +8,20 @@ import torch
 from pipeline import NONE, PARTS
 from scipy.constants import speed_of_light
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Grid
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.rssi import Rssi
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Split
 from gaigs.data.simulation import patch_array, rss_dbm
 from gaigs.data.synthetic import POSE, ROOM, place, respond_in_parts, spectra
 from gaigs.data.synthetic.image_source import permittivity
-from gaigs.geometry import Grid
 from gaigs.model.friis import Friis
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.placement.mirrored import search
-from gaigs.query import Query
-from gaigs.task.csi import Csi
-from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import Spectrum
+from gaigs.planes import search
 from gaigs.testing import check_model, example_links
 
 CARRIER, BANDWIDTH = 6.4896e9, 499.2e6

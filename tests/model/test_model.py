@@ -6,8 +6,8 @@ import pytest
 import torch
 from pipeline import PARTS, watch
 
-from gaigs.geometry import ExtrapolationWarning, Rays
-from gaigs.query import Batch, Query
+from gaigs.core.geometry import ExtrapolationWarning, Rays
+from gaigs.core.query import Batch, Query
 
 
 def close(found, true):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.antenna import Receiver
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query
+from gaigs.core.task.rssi import Rssi
+from gaigs.core.task.scalar import Scalar
 from gaigs.data import Links, Split
-from gaigs.geometry import Pose
 from gaigs.model.path_loss import PathLoss, shrunk
-from gaigs.query import Query
-from gaigs.task.rssi import Rssi
-from gaigs.task.scalar import Scalar
 from gaigs.testing import example_links
 
 GATEWAYS = torch.tensor([[0.0, 0.0, 2.5], [6.0, 1.0, 1.0]])
@@ -54,7 +54,7 @@ def fitted(links):
     return model
 
 
-@pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
+@pytest.mark.filterwarnings("ignore::gaigs.core.geometry.ExtrapolationWarning")
 @pytest.mark.parametrize(("shift", "task"), [(0.0, Rssi()), (1e4, PathGain())])
 def test_level_and_exponent_of_the_law_are_recovered(places, shift, task, monkeypatch):
     monkeypatch.setattr(__name__ + ".GATEWAYS", GATEWAYS + shift)
@@ -68,7 +68,7 @@ def test_level_and_exponent_of_the_law_are_recovered(places, shift, task, monkey
         torch.testing.assert_close(predicted, law(asked, receiver, level, exponent).float(), rtol=0, atol=1e-2)
 
 
-@pytest.mark.filterwarnings("ignore::gaigs.geometry.ExtrapolationWarning")
+@pytest.mark.filterwarnings("ignore::gaigs.core.geometry.ExtrapolationWarning")
 @pytest.mark.parametrize("jitter", [0.0, 1e-3])
 def test_links_of_one_length_get_the_slope_of_other_receivers(places, jitter):
     angles = torch.linspace(0, 6, 30)

@@ -7,10 +7,10 @@ import pytest
 import torch
 from splatting import DATA, build, composed, links_of, run
 
-from gaigs.query import Query
-from gaigs.task.csi import Csi
-from gaigs.task.scalar import Scalar
-from gaigs.task.spectrum import Spectrum
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.scalar import Scalar
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.testing import check_model
 
 pytestmark = pytest.mark.usefixtures("files_read_once")

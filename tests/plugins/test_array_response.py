@@ -9,12 +9,12 @@ import pytest
 import torch
 from scipy.constants import speed_of_light
 
-from gaigs.antenna import Array
-from gaigs.geometry import Grid, Rays
-from gaigs.propagation import bartlett, min_max
-from gaigs.query import Batch, Query
+from gaigs.core.antenna import Array
+from gaigs.core.geometry import Grid, Rays
+from gaigs.core.propagation import bartlett, min_max
+from gaigs.core.query import Batch, Query
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.registry import registry
-from gaigs.task.spectrum import Spectrum
 from gaigs.testing import example_links
 
 ROOT = Path(__file__).parents[2]

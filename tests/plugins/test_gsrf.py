@@ -10,10 +10,10 @@ from scipy.constants import speed_of_light
 from scipy.special import factorial, lpmv, sph_harm_y
 from splatting import build, composed, repository
 
-from gaigs import density
-from gaigs.gaussians import Gaussians
-from gaigs.geometry import Rays, from_spherical, to_spherical
-from gaigs.query import Batch, Query
+from gaigs.core.geometry import Rays, from_spherical, to_spherical
+from gaigs.core.query import Batch, Query
+from gaigs.splatting import density
+from gaigs.splatting.gaussians import Gaussians
 from gaigs.testing import check_loss, check_pooling, example_links
 
 with repository():

@@ -13,8 +13,8 @@ import torch
 from splatting import build, composed
 from torch import nn
 
-from gaigs.geometry import Grid, Rays
-from gaigs.query import Batch
+from gaigs.core.geometry import Grid, Rays
+from gaigs.core.query import Batch
 from gaigs.testing import example_links
 
 SMALL = ("model=nerf2", "model.samples=4", "model.rays=[2,4]", "model.octaves=2", "model.width=8", "model.layers=3")

@@ -13,9 +13,9 @@ from scipy.interpolate import RegularGridInterpolator
 from splatting import build, composed
 from torch import nn
 
-from gaigs.geometry import Grid, Rays
-from gaigs.query import Batch
-from gaigs.task.spectrum import Spectrum
+from gaigs.core.geometry import Grid, Rays
+from gaigs.core.query import Batch
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.testing import example_links
 
 SMALL = ("model=nerf_apt", "model.samples=4", "model.rays=[3,8]", "model.octaves=2", "model.widths=[2,3,4]")

@@ -16,12 +16,12 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import CSVLogger
 from scipy.interpolate import BSpline
 
-from gaigs.loss.absolute import Absolute
+from gaigs.core.query import Batch, Query
+from gaigs.core.task.scalar import Scalar
 from gaigs.model import Model, Prediction
-from gaigs.query import Batch, Query
 from gaigs.registry import registry
 from gaigs.report.curves import read_curves
-from gaigs.task.scalar import Scalar
+from gaigs.splatting.loss.absolute import Absolute
 from gaigs.testing import check_training, example_links
 from gaigs.training.batches import Batches, InOrder
 

@@ -12,12 +12,12 @@ import pytest
 import torch
 from splatting import build, composed
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Batch, Query
+from gaigs.core.task.csi import Csi
 from gaigs.data.synthetic import respond_in_parts
 from gaigs.data.synthetic.image_source import Room
-from gaigs.geometry import Pose
-from gaigs.query import Batch, Query
-from gaigs.task.csi import Csi
 from gaigs.testing import example_links
 
 SMALL = ("model=newrf", "model.arrivals=3", "model.samples=4", "model.octaves=2", "model.width=8", "model.layers=5")

@@ -9,9 +9,9 @@ import pytest
 import torch
 from splatting import build, composed
 
-from gaigs.geometry import quaternions_to_rotations
-from gaigs.query import Batch, Query
-from gaigs.scene import direct_waves
+from gaigs.core.geometry import quaternions_to_rotations
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import direct_waves
 from gaigs.testing import example_links
 
 LIGHT = 299792458.0

@@ -18,13 +18,13 @@ from splatting import composed, repository
 
 import gaigs
 from gaigs import runs
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene
 from gaigs.data import load, synthetic
 from gaigs.data.sionna import ROOMS
 from gaigs.data.sionna.meshes import THICKNESS, Cuboid, edges, wavefront_obj
 from gaigs.data.synthetic.image_source import MATERIALS
-from gaigs.query import Batch
 from gaigs.registry import registry
-from gaigs.scene import Scene
 from gaigs.testing import check_model, example_links
 
 ROOT = Path(__file__).parents[2]

@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 from scipy.special import sph_harm_y
 from splatting import build, composed, repository, run
 
-from gaigs.gaussians import SH_DC
-from gaigs.geometry import semi_axes
+from gaigs.core.geometry import semi_axes
 from gaigs.registry import registry
+from gaigs.splatting.gaussians import SH_DC
 from gaigs.testing import check_model, example_links
 from gaigs.testing.rasterizer import rasterize_densely
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from splatting import build, composed
 
-from gaigs.geometry import Grid
-from gaigs.query import Batch, Query
+from gaigs.core.geometry import Grid
+from gaigs.core.query import Batch, Query
 from gaigs.testing import example_links
 
 LINKS = example_links()

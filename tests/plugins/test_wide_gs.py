@@ -6,10 +6,10 @@ import pytest
 import torch
 from splatting import build, composed, repository, run
 
+from gaigs.core.query import Query
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
-from gaigs.gaussians import Placed
-from gaigs.query import Query
+from gaigs.splatting.gaussians import Placed
 from gaigs.testing import example_links
 
 CARRIERS = torch.tensor([2.4e9, 5.0e9, 28e9])

@@ -8,10 +8,10 @@ import torch
 from splatting import build, composed
 from torch.nn.functional import normalize
 
-from gaigs.deformation.two_branch import INITIAL_ATTENUATION, LEAST_ATTENUATION
-from gaigs.gaussians import Placed
-from gaigs.geometry import semi_axes
-from gaigs.query import Query
+from gaigs.core.geometry import semi_axes
+from gaigs.core.query import Query
+from gaigs.splatting.deformation.two_branch import INITIAL_ATTENUATION, LEAST_ATTENUATION
+from gaigs.splatting.gaussians import Placed
 from gaigs.testing import check_deformation, check_pooling, check_tokenizer, example_links
 from gaigs.testing.rasterizer import rasterize_densely
 

@@ -8,8 +8,8 @@ import torch
 from splatting import build, composed
 from torch.nn.functional import normalize
 
-from gaigs.gaussians import Placed
-from gaigs.geometry import semi_axes
+from gaigs.core.geometry import semi_axes
+from gaigs.splatting.gaussians import Placed
 from gaigs.testing import check_deformation, check_tokenizer, example_links
 from gaigs.testing.rasterizer import rasterize_densely
 

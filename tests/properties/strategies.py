@@ -5,7 +5,7 @@ import math
 import torch
 from hypothesis import strategies as st
 
-from gaigs.geometry import from_spherical
+from gaigs.core.geometry import from_spherical
 
 coordinates = st.floats(-50, 50, width=32)
 seeds = st.integers(0, 2**31 - 1)

@@ -9,14 +9,14 @@ from strategies import coordinates, normals, points, quaternions, tensors
 
 from gaigs.algebra import PROJECTIVE
 from gaigs.algebra.embedding import embed_plane, embed_point, extract_point
-from gaigs.geometry import (
+from gaigs.core.geometry import (
     from_spherical,
     quaternions_to_rotations,
     semi_axes,
     to_spherical,
     unit_quaternions,
 )
-from gaigs.placement.mirrored.reflections import reflect
+from gaigs.splatting.placement.mirrored.reflections import reflect
 
 lengths = st.sampled_from([1e-30, 1e-6, 1.0, 1e6, 1e30])
 dtypes = st.sampled_from([torch.float32, torch.float64])

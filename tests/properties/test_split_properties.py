@@ -6,12 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import seeds
 
-from gaigs.antenna import Receiver
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links
-from gaigs.geometry import Pose
-from gaigs.query import Query
 from gaigs.registry import registry
-from gaigs.task.rssi import Rssi
 
 OPTIONS = {"blocks": {"edge": st.floats(1e-3, 1e3)}, "runs": {"length": st.integers(1, 2**62)}}
 OPTIONS |= {"sparse": {"train": st.integers(1, 300)}, "official": {"length": st.integers(1, 9)}}

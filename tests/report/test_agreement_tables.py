@@ -2,8 +2,8 @@
 
 import math
 
+from gaigs.core.task.rssi import Rssi
 from gaigs.report.agreement import Cell, figure, write
-from gaigs.task.rssi import Rssi
 
 CELLS = [
     Cell((0.0, 0.0), (0, 3), 1, 1, (5.0, 5.0, 5.0)),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import ecdf
 
+from gaigs.core.task import Metric
 from gaigs.registry import registry
 from gaigs.report.curves import cdf, learning_curves, loss_curves, read_curves, speed_against_error
 from gaigs.report.style import looks
-from gaigs.task import Metric
 
 
 @pytest.fixture

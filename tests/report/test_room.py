@@ -7,14 +7,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from scipy.integrate import quad
 
-from gaigs.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links, Split
-from gaigs.gaussians import SH_DC, Gaussians
-from gaigs.geometry import Pose
-from gaigs.placement.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
-from gaigs.query import Query
+from gaigs.planes.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
 from gaigs.report.room import paths, room
-from gaigs.task.rssi import Rssi
+from gaigs.splatting.gaussians import SH_DC, Gaussians
 from gaigs.testing import example_links
 
 

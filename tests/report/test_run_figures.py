@@ -7,20 +7,20 @@ import pytest
 import torch
 from matplotlib import image
 
-from gaigs import stages
-from gaigs.antenna import Array, Receiver
+from gaigs.core import stages
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Grid, Pose
+from gaigs.core.query import Query
+from gaigs.core.radio_maps import RadioMap
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.rssi import Rssi
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Split
-from gaigs.gaussians import Gaussians
-from gaigs.geometry import Grid, Pose
 from gaigs.model import Model
-from gaigs.placement.learnt_room import LearntPath, LearntRoom
-from gaigs.query import Query
-from gaigs.radio_maps import RadioMap
+from gaigs.planes.learnt_room import LearntPath, LearntRoom
 from gaigs.report import csi, figures, run_figures, scalar, spectrum
 from gaigs.report.run_figures import figures_of, write_figures
-from gaigs.task.csi import Csi
-from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import Spectrum
+from gaigs.splatting.gaussians import Gaussians
 
 GRID = Grid.degrees(range(10, 91, 10), range(0, 360, 15))
 

@@ -8,12 +8,12 @@ import torch
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.contour import QuadContourSet
 
+from gaigs.core.radio_maps import RadioMap
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Split
-from gaigs.radio_maps import RadioMap
 from gaigs.report import scalar
 from gaigs.report.scalar import PANELS, predicted_against_measured, radio_maps
 from gaigs.report.style import round_step
-from gaigs.task.rssi import Rssi
 from gaigs.testing import example_links
 
 

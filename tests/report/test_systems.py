@@ -8,6 +8,8 @@ import yaml
 from folders import read, write_run
 from matplotlib.figure import Figure
 
+from gaigs.core.task import Metric
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.registry import registry
 from gaigs.report import systems
 from gaigs.report.curves import learning_curves
@@ -17,8 +19,6 @@ from gaigs.report.run_figures import figures_of
 from gaigs.report.runs import read_runs
 from gaigs.report.spectrum import SpectrumFigures, side_by_side
 from gaigs.report.systems import read_published
-from gaigs.task import Metric
-from gaigs.task.spectrum import Spectrum
 
 SCORES = ("ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae")
 GRID = np.deg2rad(np.arange(1, 12)), np.deg2rad(np.arange(14))

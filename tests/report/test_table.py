@@ -5,9 +5,9 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
+from gaigs.core.task.csi import Csi
 from gaigs.registry import registry
 from gaigs.report.table import metrics_table, verdict, written
-from gaigs.task.csi import Csi
 
 
 def run(task, **models):

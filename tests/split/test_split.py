@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from gaigs.antenna import Receiver
 from gaigs.configuration import conf_dir
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links
-from gaigs.geometry import Pose
-from gaigs.query import Query
 from gaigs.registry import registry
-from gaigs.task.rssi import Rssi
 
 N = 400
 

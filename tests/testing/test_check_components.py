@@ -7,22 +7,23 @@ import torch
 from faults import broken, fed, field, having
 from torch import nn
 
-from gaigs.deformation import Deformation, Residuals
-from gaigs.deformation.two_branch import TwoBranch
-from gaigs.gaussians import Placed, Tokens
-from gaigs.loss.absolute import Absolute
-from gaigs.loss.l1_ssim import L1Ssim
-from gaigs.loss.relative_error import RelativeError
-from gaigs.loss.squared import Squared
-from gaigs.placement import Placement
-from gaigs.pooling import Pooling, sphere
-from gaigs.pooling.path_rssi import PathRssi
-from gaigs.pooling.spectrum import SpectrumPooling
-from gaigs.projection import Plane
-from gaigs.projection.direction_cosine import DirectionCosine
-from gaigs.projection.equirectangular import Equirectangular
-from gaigs.projection.mercator import Mercator
-from gaigs.rasterizer.torch import TorchRasterizer
+from gaigs.splatting.deformation import Deformation, Residuals
+from gaigs.splatting.deformation.two_branch import TwoBranch
+from gaigs.splatting.gaussians import Placed, Tokens
+from gaigs.splatting.loss.absolute import Absolute
+from gaigs.splatting.loss.l1_ssim import L1Ssim
+from gaigs.splatting.loss.relative_error import RelativeError
+from gaigs.splatting.loss.squared import Squared
+from gaigs.splatting.placement import Placement
+from gaigs.splatting.pooling import Pooling, sphere
+from gaigs.splatting.pooling.path_rssi import PathRssi
+from gaigs.splatting.pooling.spectrum import SpectrumPooling
+from gaigs.splatting.projection import Plane
+from gaigs.splatting.projection.direction_cosine import DirectionCosine
+from gaigs.splatting.projection.equirectangular import Equirectangular
+from gaigs.splatting.projection.mercator import Mercator
+from gaigs.splatting.rasterizer.torch import TorchRasterizer
+from gaigs.splatting.tokenizer.euclidean import EuclideanTokenizer
 from gaigs.testing import (
     check_deformation,
     check_loss,
@@ -33,7 +34,6 @@ from gaigs.testing import (
     check_tokenizer,
     example_links,
 )
-from gaigs.tokenizer.euclidean import EuclideanTokenizer
 
 LINKS = {task: example_links(task) for task in ("spectrum", "rssi", "csi")}
 SCENE = LINKS["rssi"].scene

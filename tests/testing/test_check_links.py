@@ -7,15 +7,15 @@ import torch
 from faults import broken, having
 from torch import nn
 
+from gaigs.core.geometry import Rays
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.rssi import Rssi
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Split
-from gaigs.geometry import Rays
 from gaigs.io.images import GreyImages
 from gaigs.model import Model, Prediction
-from gaigs.query import Query
 from gaigs.registry import registry
-from gaigs.task.csi import Csi
-from gaigs.task.rssi import Rssi
-from gaigs.task.spectrum import Spectrum
 from gaigs.testing import check_data, check_model, check_split, check_task, example_links
 
 LINKS, RSSI = example_links(), example_links("rssi")

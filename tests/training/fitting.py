@@ -10,14 +10,14 @@ from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.loggers import CSVLogger
 from torch import nn
 
-from gaigs.antenna import Receiver
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Grid, Pose
+from gaigs.core.query import Query
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Split
-from gaigs.geometry import Grid, Pose
-from gaigs.loss.absolute import Absolute
-from gaigs.loss.l1_ssim import L1Ssim
 from gaigs.model import Model, Prediction
-from gaigs.query import Query
-from gaigs.task.spectrum import Spectrum
+from gaigs.splatting.loss.absolute import Absolute
+from gaigs.splatting.loss.l1_ssim import L1Ssim
 from gaigs.training.batches import Batches, InOrder
 from gaigs.training.budget import ENDLESS
 from gaigs.training.descent import Descent

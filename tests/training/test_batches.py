@@ -3,11 +3,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gaigs.antenna import Receiver
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Grid, Pose
+from gaigs.core.query import Query
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Split
-from gaigs.geometry import Grid, Pose
-from gaigs.query import Query
-from gaigs.task.spectrum import Spectrum
 from gaigs.training import batches as module
 from gaigs.training.batches import Batches, InOrder, process
 

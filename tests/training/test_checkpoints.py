@@ -13,11 +13,10 @@ import torch
 from fitting import Plane, Watch, fit, make_links, make_module
 from torch import nn
 
-from gaigs import checkpoint
-from gaigs.loss.absolute import Absolute
-from gaigs.model import Model, Prediction
+from gaigs.core.task.rssi import Rssi
+from gaigs.model import Model, Prediction, checkpoint
 from gaigs.processes import STOPPING
-from gaigs.task.rssi import Rssi
+from gaigs.splatting.loss.absolute import Absolute
 from gaigs.training.checkpoints import Interrupted, KeepBest, KeepLast, save
 
 SPECTRA, RSSI = make_links().task, Rssi()

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from gaigs.antenna import Receiver
-from gaigs.gaussians import Gaussians
-from gaigs.geometry import Pose
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Pose
+from gaigs.splatting.gaussians import Gaussians
 from gaigs.training.density_control import DensityControl
 
 MIDDLE = (1.0, 2.0, 0.5)

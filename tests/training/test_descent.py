@@ -9,14 +9,14 @@ from lightning.pytorch.callbacks import Callback
 from skimage.metrics import structural_similarity
 from torch import nn
 
-from gaigs.geometry import Rays
-from gaigs.loss.absolute import Absolute
-from gaigs.loss.relative_error import RelativeError
+from gaigs.core.geometry import Rays
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
+from gaigs.core.task.rssi import Rssi
 from gaigs.model import Model, Prediction
-from gaigs.query import Query
 from gaigs.report.curves import read_curves
-from gaigs.task.csi import Csi
-from gaigs.task.rssi import Rssi
+from gaigs.splatting.loss.absolute import Absolute
+from gaigs.splatting.loss.relative_error import RelativeError
 
 
 @pytest.fixture

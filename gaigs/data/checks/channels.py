@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from gaigs.core.phases import MANY, phase_sign, strange_parts, unknown_phase
+from gaigs.core.query import evenly
+from gaigs.core.scene import Scene, direct_waves
 from gaigs.data.checks.conventions import conventions
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.hypotheses import Sample, sample_at
 from gaigs.data.checks.subcarriers import check_constant_subcarriers, check_powers, order_of_subcarriers
 from gaigs.data.checks.waves import aligned_likeness, coherence, has_extent, level_share, likeness, without_geometry
-from gaigs.phases import MANY, phase_sign, strange_parts, unknown_phase
-from gaigs.query import evenly
-from gaigs.scene import Scene, direct_waves
 
 
 class Measure(NamedTuple):

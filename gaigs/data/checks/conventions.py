@@ -12,9 +12,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from gaigs.core.geometry import from_spherical, to_spherical
 from gaigs.data.checks.hypotheses import Hypothesis, Sample
 from gaigs.data.checks.waves import direct_distances
-from gaigs.geometry import from_spherical, to_spherical
 
 Move = Callable[[Tensor], Tensor]
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gaigs.query import evenly
+from gaigs.core.query import evenly
 
 
 @dataclass(frozen=True)

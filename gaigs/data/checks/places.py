@@ -10,8 +10,8 @@ from jaxtyping import Float
 from scipy.constants import speed_of_light
 from torch import Tensor
 
+from gaigs.core.query import Query, evenly
 from gaigs.data.checks.finding import Finding
-from gaigs.query import Query, evenly
 
 
 def check_places(links: Any) -> Iterator[Finding]:

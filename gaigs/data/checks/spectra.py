@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gaigs.core.geometry import Grid, from_spherical, to_spherical
+from gaigs.core.task.spectrum import SSIM_WINDOW
 from gaigs.data.checks.conventions import changing, of_axes, of_frames, of_orientations, of_receivers, of_units
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.hypotheses import Hypothesis, Sample, sample_of
 from gaigs.data.checks.places import scale_of
-from gaigs.geometry import Grid, from_spherical, to_spherical
-from gaigs.task.spectrum import SSIM_WINDOW
 
 
 def check_spectra(links: Any) -> Iterator[Finding]:

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gaigs.antenna import lacking
+from gaigs.core.antenna import lacking
+from gaigs.core.query import evenly
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.hypotheses import Sample
 from gaigs.io.tables import shortened
-from gaigs.query import evenly
 
 
 def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:

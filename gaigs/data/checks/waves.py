@@ -10,10 +10,10 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from gaigs.core.phases import alignment
+from gaigs.core.query import evenly
 from gaigs.data.checks.distance import explained
 from gaigs.data.checks.hypotheses import Sample
-from gaigs.phases import alignment
-from gaigs.query import evenly
 
 
 class Turned(NamedTuple):

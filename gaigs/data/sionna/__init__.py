@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.antenna import Receiver
+from gaigs.core.antenna import Receiver
 from gaigs.data import Links
 from gaigs.data.readings import gateway
 from gaigs.data.simulation import PART, SimulatedRoom, draw_places, simulate_spectra

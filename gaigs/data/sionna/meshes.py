@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gaigs.geometry import Pose
+from gaigs.core.geometry import Pose
 from gaigs.io.meshes import triangles
 
 THICKNESS = {

@@ -16,10 +16,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from gaigs.core.query import as_positions
 from gaigs.data.simulation import draw_places
 from gaigs.data.sionna import tracing
 from gaigs.data.sionna.meshes import Mesh, edges
-from gaigs.query import as_positions
 
 MARGIN = 0.1
 """Smallest distance of transmitters from surfaces, in 26 directions [m]."""

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from gaigs.antenna import Receiver
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Grid, Pose
 from gaigs.data import Links
 from gaigs.data.readings import gateway
 from gaigs.data.simulation import PART, SimulatedRoom, draw_places, simulate_spectra, spectrum_offsets, to_spectra
 from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond, trace
-from gaigs.geometry import Grid, Pose
 from gaigs.registry import register
 
 ROOM = Room(

@@ -9,9 +9,9 @@ from jaxtyping import Complex, Float, Int
 from scipy.constants import epsilon_0
 from torch import Tensor
 
-from gaigs.antenna import Receiver
+from gaigs.core.antenna import Receiver
+from gaigs.core.propagation import free_space, fresnel
 from gaigs.data.simulation import sample_band
-from gaigs.propagation import free_space, fresnel
 
 MATERIALS = {
     "concrete": (5.24, 0.0462, 0.7822),

@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs import geometry
-from gaigs.geometry import Directions
+from gaigs.core import geometry
+from gaigs.core.geometry import Directions
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene
 from gaigs.model import Model, Prediction
-from gaigs.query import Batch
-from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import fourier_features, learnable_octaves
-from gaigs.tokenizer.euclidean import octaves as angular_frequencies
+from gaigs.splatting.tokenizer.euclidean import fourier_features, learnable_octaves
+from gaigs.splatting.tokenizer.euclidean import octaves as angular_frequencies
 
 
 class ArrayResponse(Model):

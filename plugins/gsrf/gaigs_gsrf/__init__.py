@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.gaussians import write_ply
 from gaigs.model import Model, Prediction
-from gaigs.query import Batch, Query
 from gaigs.registry import registry
-from gaigs.scene import Scene
+from gaigs.splatting.gaussians import write_ply
 from gaigs_gsrf.gaussians import ComplexGaussians
 from gaigs_gsrf.rendering import render
 

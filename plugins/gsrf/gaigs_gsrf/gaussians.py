@@ -8,10 +8,10 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor, nn
 
-from gaigs.gaussians import Gaussians
-from gaigs.geometry import spherical_harmonics, to_spherical
-from gaigs.projection import NEAR
-from gaigs.scene import Scene
+from gaigs.core.geometry import spherical_harmonics, to_spherical
+from gaigs.core.scene import Scene
+from gaigs.splatting.gaussians import Gaussians
+from gaigs.splatting.projection import NEAR
 
 
 class ComplexGaussians(Gaussians):

@@ -2,9 +2,9 @@
 
 from torch import Tensor
 
-from gaigs.loss.l1_ssim import find_window, structural_similarity
-from gaigs.query import Batch
-from gaigs.task import Task
+from gaigs.core.query import Batch
+from gaigs.core.task import Task
+from gaigs.splatting.loss.l1_ssim import find_window, structural_similarity
 from gaigs_gsrf.mean_amplitude import RANGE
 
 WINDOW = 11
@@ -36,7 +36,7 @@ class GsrfLoss:
         self.directions = task.directions
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss, and its terms; see ``gaigs.loss.Loss``.
+        """The loss, and its terms; see ``gaigs.splatting.loss.Loss``.
 
         Raises:
             ValueError: The batch asks for a list of directions, which has no windows, or for fewer than 3 x 3.

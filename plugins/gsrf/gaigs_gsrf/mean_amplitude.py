@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gaigs.core.geometry import Directions, magnitudes
+from gaigs.core.query import Query
 from gaigs.data import Links
-from gaigs.geometry import Directions, magnitudes
-from gaigs.pooling import Pooling, sphere
-from gaigs.query import Query
+from gaigs.splatting.pooling import Pooling, sphere
 
 RANGE = 100.0
 """An amplitude of 0 is -100 dBm, one of 1 is 0 dBm, as NeRF² scales its readings [dB]."""

@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
-from gaigs.geometry import Pose, polar, quaternions_to_rotations
-from gaigs.projection import NEAR
-from gaigs.rasterizer import ALPHA_MAX
+from gaigs.core.geometry import Pose, polar, quaternions_to_rotations
+from gaigs.splatting.projection import NEAR
+from gaigs.splatting.rasterizer import ALPHA_MAX
 from gaigs_gsrf.gaussians import ComplexGaussians
 
 CHUNK = 2**21

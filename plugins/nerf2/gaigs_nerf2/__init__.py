@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, linear, relu
 
-from gaigs.query import Query
-from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import fourier_features
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene
+from gaigs.splatting.tokenizer.euclidean import fourier_features
 from gaigs_nerf2.marching import RayMarching, Samples, check_octaves, render
 
 __all__ = ["Nerf2", "RayMarching", "Samples", "amplitudes_and_phases", "render"]

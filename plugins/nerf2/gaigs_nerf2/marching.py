@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from gaigs.core.geometry import Rays
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.geometry import Rays
 from gaigs.model import Model, Prediction
-from gaigs.query import Batch, Query
-from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import MAX_OCTAVE
+from gaigs.splatting.tokenizer.euclidean import MAX_OCTAVE
 from gaigs_nerf2.readings import make_reading
 
 CALIBRATION = 16, 200

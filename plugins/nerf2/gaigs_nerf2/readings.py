@@ -7,11 +7,11 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor, nn
 
+from gaigs.core.geometry import Directions, Grid, magnitudes
+from gaigs.core.phases import array_sign
+from gaigs.core.query import Query, check_carrier
+from gaigs.core.scene import Scene, check_elements, direct_waves
 from gaigs.data import Links
-from gaigs.geometry import Directions, Grid, magnitudes
-from gaigs.phases import array_sign
-from gaigs.query import Query, check_carrier
-from gaigs.scene import Scene, check_elements, direct_waves
 
 REACH = 0.025
 """A sample's part of a spectrum falls with the distance as 0.025 m / t, as published: lambda / (4 pi) at about

@@ -10,11 +10,11 @@ from gaigs_nerf2.marching import check_octaves
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
-from gaigs.geometry import Directions, Grid, Rays
+from gaigs.core.geometry import Directions, Grid, Rays
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
 from gaigs.model import Prediction
-from gaigs.query import Batch, Query
-from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import fourier_features
+from gaigs.splatting.tokenizer.euclidean import fourier_features
 from gaigs_nerf_apt.unet import DIVISOR, UNet
 
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
-from gaigs.query import Batch
+from gaigs.core.query import Batch
 from gaigs.registry import call
 from gaigs.training.budget import share_done
 from gaigs.training.descent import Descent

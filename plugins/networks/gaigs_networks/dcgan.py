@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs.query import Batch
-from gaigs.scene import Scene
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene
 from gaigs_networks.network import BatchNorm, Network, check_widths
 
 LAYERS = 4

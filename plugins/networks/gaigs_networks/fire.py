@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene
 from gaigs.model import Prediction
-from gaigs.query import Batch
-from gaigs.scene import Scene
 from gaigs_networks.network import Network, check_widths, linear_layers
 
 

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from gaigs.core.geometry import Directions, Grid
+from gaigs.core.propagation import strength
+from gaigs.core.scene import Scene, direct_waves
 from gaigs.data import Links
-from gaigs.geometry import Directions, Grid
-from gaigs.propagation import strength
-from gaigs.scene import Scene, direct_waves
 
 LARGEST = 90.0
 """No pixel is larger [deg]: at least two rows are left of the sphere's upper half."""

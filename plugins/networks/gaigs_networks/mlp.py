@@ -7,7 +7,7 @@ from itertools import pairwise
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gaigs.scene import Scene
+from gaigs.core.scene import Scene
 from gaigs_networks.network import BatchNorm, Network, check_widths
 
 

@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import batch_norm
 
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.model import Model, Prediction
-from gaigs.query import Batch
-from gaigs.scene import Scene
 from gaigs_networks.label import LabelImage
 from gaigs_networks.question import Question
 

@@ -5,10 +5,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
-from gaigs.query import Query
-from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import BAND_FREQUENCIES, fourier_features, learnable_octaves
-from gaigs.tokenizer.euclidean import octaves as angular_frequencies
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene
+from gaigs.splatting.tokenizer.euclidean import BAND_FREQUENCIES, fourier_features, learnable_octaves
+from gaigs.splatting.tokenizer.euclidean import octaves as angular_frequencies
 
 
 class Question(nn.Module):

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import linear, silu
 
-from gaigs.scene import Scene
+from gaigs.core.scene import Scene
 from gaigs_networks.network import Network, check_widths
 
 DEGREE = 3

@@ -7,13 +7,13 @@ from jaxtyping import Complex, Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize, pad, softplus
 
+from gaigs.core.phases import array_sign
+from gaigs.core.propagation import free_space
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene, check_elements, direct_waves
 from gaigs.data import Links
 from gaigs.model import Model, Prediction
-from gaigs.phases import array_sign
-from gaigs.propagation import free_space
-from gaigs.query import Batch
-from gaigs.scene import Scene, check_elements, direct_waves
-from gaigs.tokenizer.euclidean import MAX_OCTAVE, fourier_features
+from gaigs.splatting.tokenizer.euclidean import MAX_OCTAVE, fourier_features
 from gaigs_newrf.arrivals import find_origins
 
 MARGIN = 0.5

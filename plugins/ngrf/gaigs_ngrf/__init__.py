@@ -9,14 +9,14 @@ from jaxtyping import Complex, Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from gaigs.core.geometry import polar, quaternions_to_rotations
+from gaigs.core.phases import array_sign
+from gaigs.core.propagation import fit_gain, free_space
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene, check_elements, direct_waves
 from gaigs.data import Links
-from gaigs.geometry import polar, quaternions_to_rotations
 from gaigs.model import Model, Prediction
-from gaigs.phases import array_sign
-from gaigs.propagation import fit_gain, free_space
-from gaigs.query import Batch
-from gaigs.scene import Scene, check_elements, direct_waves
-from gaigs.tokenizer.euclidean import fourier_features, learnable_octaves, octaves
+from gaigs.splatting.tokenizer.euclidean import fourier_features, learnable_octaves, octaves
 
 ATTENUATION = -5.0
 """Start of the attenuation before its softplus: 0.007 /m."""

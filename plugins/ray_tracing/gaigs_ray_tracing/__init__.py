@@ -8,15 +8,15 @@ from jaxtyping import Float
 from scipy.constants import epsilon_0
 from torch import Tensor, nn
 
+from gaigs.core.propagation import fit_gain, free_space
+from gaigs.core.query import Batch, Query, check_carrier
+from gaigs.core.scene import Scene, carriers, check_elements, direct_waves
 from gaigs.data import Links
 from gaigs.data.sionna.meshes import THICKNESS, wavefront_obj
 from gaigs.data.sionna.tracing import frequency_offsets
 from gaigs.data.synthetic.image_source import MATERIALS, Paths, respond
 from gaigs.model import Model, Prediction
-from gaigs.pooling.beamformer import Beamformer
-from gaigs.propagation import fit_gain, free_space
-from gaigs.query import Batch, Query, check_carrier
-from gaigs.scene import Scene, carriers, check_elements, direct_waves
+from gaigs.splatting.pooling.beamformer import Beamformer
 
 from .fields import Slabs, gains, padded
 from .rooms import check_room, find_meshes, known_materials, read_obj

@@ -10,7 +10,7 @@ from scipy.constants import speed_of_light
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from gaigs.propagation import fresnel
+from gaigs.core.propagation import fresnel
 
 REFLECTED, PASSED = 1, 2
 """Kinds of interactions of a path; 0 is none."""

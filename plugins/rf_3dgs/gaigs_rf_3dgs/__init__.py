@@ -6,13 +6,13 @@ from pathlib import Path
 import torch
 from torch import distributed, nn
 
+from gaigs.core.query import Batch
+from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.gaussians import SH_DC
 from gaigs.model import Prediction
 from gaigs.model.gaigs import GaussianSplatting
-from gaigs.query import Batch
 from gaigs.registry import call
-from gaigs.scene import Scene
+from gaigs.splatting.gaussians import SH_DC
 from gaigs_rf_3dgs.geometry import read_geometry
 
 GREY = 0.5

@@ -29,7 +29,7 @@ SPLATS = {
 
 
 class Geometry(NamedTuple):
-    """Gaussians as a file has them, raw as those of ``gaigs.gaussians.Gaussians``.
+    """Gaussians as a file has them, raw as those of ``gaigs.splatting.gaussians.Gaussians``.
 
     Attributes:
         means: Centres, world frame (n, 3) [m].

@@ -7,14 +7,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot, relu
 
-from gaigs.deformation.two_branch import TokenLinear
-from gaigs.gaussians import Tokens, fibonacci_lattice
-from gaigs.geometry import to_spherical
+from gaigs.core.geometry import to_spherical
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
 from gaigs.model import Model, Prediction
-from gaigs.query import Batch, Query
-from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import BAND_FREQUENCIES, fourier_features, learnable_octaves
-from gaigs.tokenizer.euclidean import octaves as angular_frequencies
+from gaigs.splatting.deformation.two_branch import TokenLinear
+from gaigs.splatting.gaussians import Tokens, fibonacci_lattice
+from gaigs.splatting.tokenizer.euclidean import BAND_FREQUENCIES, fourier_features, learnable_octaves
+from gaigs.splatting.tokenizer.euclidean import octaves as angular_frequencies
 from gaigs_swift_wrf.plane import PlaneGaussians, add_up
 
 PLANE_FREQUENCIES = 2.0 ** torch.arange(5)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.geometry import Directions, Grid
+from gaigs.core.geometry import Directions, Grid
 
 
 class PlaneGaussians(NamedTuple):

@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.geometry import Directions
-from gaigs.pooling.spectrum import SpectrumPooling
-from gaigs.query import Query
+from gaigs.core.geometry import Directions
+from gaigs.core.query import Query
+from gaigs.splatting.pooling.spectrum import SpectrumPooling
 
 
 class _Clamp(torch.autograd.Function):

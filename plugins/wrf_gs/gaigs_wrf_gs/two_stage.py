@@ -7,13 +7,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
-from gaigs.deformation import Deformation, Residuals
-from gaigs.deformation.two_branch import INITIAL_ATTENUATION, LEAST_ATTENUATION, TokenLinear
-from gaigs.gaussians import Placed, Tokens
-from gaigs.projection import NEAR
-from gaigs.query import Query
-from gaigs.scene import Scene
-from gaigs.tokenizer.euclidean import MAX_OCTAVE, fourier_features
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene
+from gaigs.splatting.deformation import Deformation, Residuals
+from gaigs.splatting.deformation.two_branch import INITIAL_ATTENUATION, LEAST_ATTENUATION, TokenLinear
+from gaigs.splatting.gaussians import Placed, Tokens
+from gaigs.splatting.projection import NEAR
+from gaigs.splatting.tokenizer.euclidean import MAX_OCTAVE, fourier_features
 
 
 class TwoStage(Deformation):

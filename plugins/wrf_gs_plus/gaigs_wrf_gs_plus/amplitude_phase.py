@@ -4,10 +4,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import relu
 
-from gaigs.deformation import Deformation, Residuals
-from gaigs.deformation.two_branch import TokenLinear
-from gaigs.gaussians import Placed, Tokens
-from gaigs.query import Query
+from gaigs.core.query import Query
+from gaigs.splatting.deformation import Deformation, Residuals
+from gaigs.splatting.deformation.two_branch import TokenLinear
+from gaigs.splatting.gaussians import Placed, Tokens
 
 
 class AmplitudePhase(Deformation):

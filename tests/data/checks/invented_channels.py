@@ -9,9 +9,9 @@ from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
 import gaigs
-from gaigs.antenna import Array, Receiver
-from gaigs.geometry import Pose
-from gaigs.task.csi import Csi
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.task.csi import Csi
 
 SIZE = np.array([9.0, 6.0, 3.0])
 CARRIER = 3.5e9

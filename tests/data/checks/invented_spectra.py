@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import gaigs
-from gaigs.antenna import Receiver
-from gaigs.geometry import Grid, Pose
-from gaigs.task.spectrum import Spectrum
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Grid, Pose
+from gaigs.core.task.spectrum import Spectrum
 
 SIZE = np.array([8.0, 6.0, 3.0])
 QUATERNION = np.array([-0.15403, 0.87354, 0.23087, 0.39989])  # x, y, z, w: from a corner down into the room

@@ -10,8 +10,8 @@ from invented_channels import WAVELENGTH, channels, room
 from scipy.spatial.transform import Rotation
 
 import gaigs
+from gaigs.core.task.csi import Csi
 from gaigs.data import divide
-from gaigs.task.csi import Csi
 from gaigs.testing import example_links
 
 SIZES = [(1, 1, 1), (1, 16, 3), (4, 1, 3), (4, 16, 1), (16, 1, 1), (16, 64, 3)]

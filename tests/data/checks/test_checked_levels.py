@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.core.query import Query
+from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links
 from gaigs.data.checks import check
 from gaigs.data.readings import gateway
-from gaigs.query import Query
-from gaigs.task.rssi import Rssi
 
 RANDOM = np.random.default_rng(0)
 PLACES = RANDOM.uniform([0, 0, 1], [18, 11, 1.5], (120, 3))

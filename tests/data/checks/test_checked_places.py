@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import gaigs
-from gaigs.antenna import Array
+from gaigs.core.antenna import Array
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import divide
-from gaigs.task.spectrum import Spectrum
 from gaigs.testing import example_links
 
 SPLIT = {"name": "random", "validation": 0.1, "test": 0.2, "seed": 0}

@@ -9,10 +9,10 @@ import torch
 from invented_spectra import SIZE, room
 
 import gaigs
-from gaigs.antenna import Receiver
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Grid, Pose
+from gaigs.core.task.spectrum import Spectrum
 from gaigs.data.checks.spectra import column_changes
-from gaigs.geometry import Grid, Pose
-from gaigs.task.spectrum import Spectrum
 
 
 @functools.cache

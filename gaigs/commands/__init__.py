@@ -1,0 +1,86 @@
+"""The commands of ``python -m gaigs``: options, tables, files and figures of each."""
+
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
+
+from gaigs import processes
+from gaigs.configuration import check
+from gaigs.core import stages
+from gaigs.registry import call, suggest
+from gaigs.registry.modes import usual_modes
+from gaigs.report.formats import figure_formats
+
+COMMANDS = ("agreement", "describe", "survey", "locate", "export", "view")
+"""Commands beside the training, each a module of its name."""
+
+SCRIPTS = {
+    "report": "python -m gaigs.report FOLDER makes its tables",
+    "benchmark": "python benchmarks/step.py and others measure, in a clone",
+}
+"""What does the work of a command that others call by this name."""
+
+
+@usual_modes()
+def run(configuration: Mapping, folder: str | Path) -> dict | None:
+    """Executes the command of a configuration, as ``python -m gaigs`` does; resumes a run that was stopped.
+
+    Args:
+        configuration: The result of ``gaigs.compose``.
+        folder: Gets the results; with ``command=train`` the run folder of docs/start.md.
+
+    Returns:
+        With ``command=train`` the contents of ``metrics.json``, or None in all but the first of several processes.
+        None with the other commands.
+
+    Raises:
+        TypeError, ValueError: The configuration does not fit the data, or the folder holds another run.
+        ImportError: A component needs a package that is not installed.
+        OSError: A file cannot be read or written; no partial file is left.
+        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it, SIGTERM and SIGHUP within a training.
+
+    Example:
+        >>> configuration = gaigs.compose("model=knn", "data.transmitters=40", "data.order=0", baselines=["mean"])
+        >>> metrics = gaigs.run(configuration, "runs/room")
+        Test scores
+        ...
+        results: runs/room
+        >>> list(metrics["models"])
+        ['knn', 'mean']
+    """
+    if not isinstance(configuration, Mapping):
+        raise TypeError(f"configuration must be the result of gaigs.compose, got {configuration!r:.80}")
+    config, folder = dict(configuration), Path(folder)
+    if config.get("command") == "devices":  # works with any other keys
+        from gaigs.splatting.rasterizer.devices import default_device, devices
+
+        names, default = devices(), default_device()
+        for number, name in enumerate(names):
+            print(f"{name}  <- rasterizer=opencl takes this one" if number == names.index(default) else name)
+        return None
+    check(config)
+    with call("figures", figure_formats, config["figures"]):
+        return _execute(config, folder)
+
+
+def _execute(config: dict, folder: Path) -> dict | None:
+    """Executes the command of a checked configuration."""
+    command = config["command"]
+    if command == "train":
+        from gaigs import runs
+
+        return runs.run(config, folder)
+    if command not in COMMANDS:
+        if command in SCRIPTS:
+            raise ValueError(f"there is no command {command!r}; {SCRIPTS[command]}")
+        known = ("train", *COMMANDS, "devices")
+        raise ValueError(f"command must be one of {', '.join(known)}, got {suggest(command, known)}")
+    module = importlib.import_module(f"gaigs.commands.{command}")
+    with processes.limited_threads(config["threads"]):
+        if command == "view":
+            module.run(config)
+            return None
+        shows = config["trainer"].get("enable_progress_bar", True)
+        with stages.watched(shown=shows):
+            module.run(config, folder)
+    return None

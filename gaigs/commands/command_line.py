@@ -1,0 +1,172 @@
+"""The command line of ``python -m gaigs``: Hydra's jobs, signals, and one message for each error."""
+
+import contextlib
+import logging
+import os
+import shutil
+import signal
+import sys
+import traceback
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import CompactHydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from gaigs import commands, configuration, processes
+from gaigs.report import at_end
+
+log = logging.getLogger("gaigs")
+
+
+def run(config: DictConfig) -> float | None:
+    """One job: ``gaigs.run`` in Hydra's run folder; returns the validation score for sweepers.
+
+    An error that a user can mend becomes one message; ``hydra.verbose=true`` prints the traceback first. A signal ends
+    the process with 128 and the signal's number, as in shells. Without a result there is no folder.
+    """
+    settings = HydraConfig.get()
+    is_sweep, launcher = (
+        settings.mode is RunMode.MULTIRUN,
+        settings.launcher["_target_"].rpartition(".")[2],
+    )
+    folder, mode, command = (
+        Path(settings.runtime.output_dir),
+        "sweep" if is_sweep else "run",
+        config.get("command"),
+    )
+    goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
+    if command in ("agreement", "describe", "survey", "locate", "export", "view"):
+        goes_on = "the same command starts anew"
+    words = OmegaConf.to_container(settings.overrides.task)
+    jobs = settings.launcher.get("n_jobs", 1) if is_sweep else 1
+    processes.keep_memory()
+    try:
+        # A process of joblib runs several jobs.
+        with processes.stopping(waits=is_sweep and launcher == "JoblibLauncher"):
+            plain = {"command": command} if command == "devices" else configuration.resolve(config)
+            note_task(words, plain)
+            with processes.limited_threads(None, jobs):
+                metrics = commands.run(plain, folder)
+    except KeyboardInterrupt as stop:
+        message = f"gaigs: {str(stop) or 'stopped'}; {goes_on}"
+        number = getattr(stop, "number", signal.SIGINT)
+        if is_sweep and launcher != "BasicLauncher":
+            # Only this job ends: a launcher that sees a process exit kills its other jobs before they have saved.
+            processes.received.append(number)
+            raise CompactHydraException(message) from None
+        if not processes.is_first():  # exits with 0: at a failure Lightning would kill the first process
+            raise SystemExit(0) from None
+        print(message, file=sys.stderr)
+        raise SystemExit(128 + number) from None
+    except Exception as error:
+        message = processes.advice(error, folder, goes_on)
+        if settings.verbose or (message is None and not is_sweep):
+            traceback.print_exc()
+        if not is_sweep:  # exits here, as Hydra would print a line of its own first
+            if isinstance(error, BrokenPipeError):
+                raise SystemExit(141) from None
+            if message is not None:
+                print(f"gaigs: {message}", file=sys.stderr)
+            raise SystemExit(1) from None
+        # Hydra prints the first failure only: each job writes its own, in one line of its log.
+        log.error("gaigs: %s", " ".join((message or str(error) or repr(error)).split()))
+        if message is None:
+            raise
+        raise CompactHydraException(f"gaigs: {message}") from error
+    finally:
+        if not is_sweep:
+            remove_without_result(folder)
+    return None if metrics is None else metrics["validation_score"]
+
+
+def note_task(words: list[str], config: dict) -> None:
+    """A line of the log if the experiment is for another task than the data, which decide."""
+    parts = [config.get(key) for key in ("task", "data")]
+    if not all(isinstance(part, dict) and "name" in part for part in parts):
+        return  # the check of the configuration says what is wrong
+    task, data = (part["name"] for part in parts)
+    for word in words:
+        key, _, name = word.partition("=")
+        others = {*name.split("_")} & {"spectrum", "rssi", "csi"} - {task}
+        if key == "+experiment" and others:
+            log.warning(
+                "+experiment=%s is for task %s; labels of data=%s are of %s",
+                name,
+                min(others),
+                data,
+                task,
+            )
+
+
+def remove_without_result(folder: Path) -> None:
+    """Removes a run folder with nothing but what Hydra and the start of a run write, unless a run is at work there."""
+    begun = {".hydra", "gaigs.log", "config.yaml", "software.json"}
+    with contextlib.suppress(OSError, ValueError), processes.only_run(folder):
+        names = {path.name for path in folder.iterdir()}
+        is_ours = "config.yaml" not in names or "software.json" in names  # a run writes both
+        if names <= begun and is_ours and not Path.cwd().is_relative_to(folder):
+            shutil.rmtree(folder)
+
+
+def compose_and_run() -> None:
+    """Lets Hydra read the command line and run its jobs; exits with 1 after the message of an error."""
+    if message := configuration.wrong_flag():
+        print(f"gaigs: {message}", file=sys.stderr)
+        raise SystemExit(2)
+    full_error = os.environ.get("HYDRA_FULL_ERROR", "")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
+    try:
+        hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
+    except Exception as error:
+        if full_error == "1":
+            raise
+        if isinstance(error, BrokenPipeError) and not configuration.is_multirun():  # launchers have other pipes
+            raise SystemExit(141) from None
+        message = configuration.explain(error) or processes.advice(error, Path.cwd(), "the same command goes on")
+        if message is None:
+            traceback.print_exc()
+        else:
+            print(f"gaigs: {message}", file=sys.stderr)
+        raise SystemExit(1) from None
+    finally:
+        os.environ["HYDRA_FULL_ERROR"] = full_error
+
+
+def main() -> None:
+    """The console script ``gaigs``."""
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it reports the making of its font cache
+    logging.raiseExceptions = False  # on a full disk the log stays silent; the run's own files report it
+    signals = []
+
+    def stop(number: int, _) -> None:
+        """Jobs in other processes save and end; this one waits for them."""
+        signals.append(number)
+        processes.hang_up(number)
+        processes.forward_to_children(number)
+        if not configuration.is_multirun():
+            raise processes.Stopped("stopped", number)
+
+    handlers = {number: signal.signal(number, stop) for number in processes.STOPPING[1:]}
+    try:
+        compose_and_run()
+        at_end.write()
+    except SystemExit as end:
+        if end.code == 1 and not signals:  # a job has failed, and the others have ended
+            at_end.write()
+        raise
+    except KeyboardInterrupt as stop:
+        print("gaigs: stopped", file=sys.stderr)
+        raise SystemExit(128 + getattr(stop, "number", signal.SIGINT)) from None
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:  # nobody reads it any more, as behind | head
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            signals.append(13)  # SIGPIPE
+        if signals:
+            sys.exit(128 + signals[0])

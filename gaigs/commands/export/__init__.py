@@ -1,0 +1,105 @@
+"""Export for other programs: radio maps, predictions, the learnt room and its paths, by the suffix of the file."""
+
+from pathlib import Path
+
+from gaigs.commands.export import maps, predictions, rooms, scenarios
+from gaigs.core.radio_maps import radio_map
+from gaigs.io.tables import read_points
+from gaigs.model import Model
+from gaigs.registry import call, check_instance, check_type
+from gaigs.runs import links_of, load
+
+MAPS = {
+    ".tif": maps.write_geotiff,
+    ".tiff": maps.write_geotiff,
+    ".geojson": maps.write_geojson,
+    ".nc": maps.write_map_netcdf,
+    ".png": maps.write_figures,
+    ".pdf": maps.write_figures,
+}
+PREDICTIONS = ".csv", ".nc"
+ROOMS = ".glb", ".gltf", ".obj", ".xml"
+SCENARIO = ".deepmimo"
+SUFFIXES = (*dict.fromkeys((*MAPS, *PREDICTIONS, *ROOMS, SCENARIO)),)
+
+
+def export(
+    model: Model,
+    file: str | Path,
+    places: object = None,
+    pitch: float | None = None,
+    height: float | None = None,
+    frequency: float | None = None,
+    interval: float = 0.9,
+) -> list[Path]:
+    """Writes what a model knows into a file for other programs; the suffix chooses what, and how.
+
+    Args:
+        model: A fitted or loaded model.
+        file: ``.tif``, ``.geojson``, ``.nc``, ``.png`` or ``.pdf`` for the radio map, with deviations where the model
+            states them; ``.csv`` or ``.nc`` for predictions at places; ``.glb``, ``.gltf``, ``.obj`` or ``.xml`` (a
+            scene of Mitsuba for Sionna RT) for the learnt room; ``.deepmimo`` for the paths of mirrored channels, a
+            folder with a scenario of DeepMIMO v4.
+        places: Of predictions and scenarios: positions (n, 3) [m], from which each receiver hears; a query; or links,
+            whose test is predicted and written beside its labels.
+        pitch, height: Of a radio map [m], as for ``gaigs.radio_map``.
+        frequency: Carrier of radio map, places and materials of the room [Hz]; None: that of the training links.
+        interval: Probability with which the intervals of predictions hold the label.
+
+    Returns:
+        The files: the figures of many receivers, and a scene with its meshes, are several.
+
+    Raises:
+        TypeError: The model is not a ``gaigs.Model``.
+        ValueError: The suffix is unknown, the model has no radio map or room, or an option is out of range.
+        ImportError: A package is not installed.
+        OSError: A file cannot be written.
+
+    Example:
+        >>> model = gaigs.train("path_loss", gaigs.links("synthetic_rssi", transmitters=50))
+        >>> [path.name for path in gaigs.export(model, "floor.tif", pitch=0.5)]
+        ['floor.tif']
+        >>> gaigs.export(model, "places.csv", [[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]])[0].read_text().splitlines()[0]
+        'x,y,z,receiver,frequency,value,deviation,lower,upper'
+    """
+    check_instance("model", model, Model)
+    check_type("file", file, str | Path)
+    file = Path(file)
+    suffix = check_suffix(file)
+    if suffix in ROOMS:
+        return rooms.write_room(model, file, frequency)
+    if suffix == SCENARIO:
+        return scenarios.write_scenario(model, file, places, frequency)
+    if suffix in PREDICTIONS and (places is not None or suffix not in MAPS):
+        return predictions.write_predictions(model, file, places, frequency, interval)
+    return MAPS[suffix](file, radio_map(model, pitch, height, frequency=frequency), model.scene)
+
+
+def check_suffix(file: Path) -> str:
+    """The suffix of a file to be written; a ``ValueError`` for an unknown one."""
+    if (suffix := file.suffix.lower()) not in SUFFIXES:
+        raise ValueError(f"an exported file must end with one of {', '.join(SUFFIXES)}, got {file.name!r}")
+    return suffix
+
+
+def run(config: dict, folder: Path) -> None:
+    """Exports from a finished run into a folder."""
+    if config["folder"] is None:
+        raise ValueError("command=export needs the folder of a finished run; add folder=runs/...")
+    options = dict(config["export"])
+    form, places = options.pop("format"), options.pop("places")
+    if form is None:
+        raise ValueError(f"command=export needs export.format, one of {', '.join(one[1:] for one in SUFFIXES)}")
+    suffix = check_suffix(Path(f"export.{form}"))
+    model = load(config["folder"], config["trust"])
+    takes_places = suffix in (*PREDICTIONS, SCENARIO)
+    if places is None and takes_places and (suffix not in MAPS or not model.scene.task.is_scalar):
+        places = "test"
+    name = "predictions" if suffix in PREDICTIONS and places else "radio_map" if suffix in MAPS else "room"
+    if places == "test":
+        places = links_of(config["folder"], config["trust"])
+    elif isinstance(places, str):
+        places = read_points(Path(places), "xyz", "x,y,z [m] of one place a line")
+    folder.mkdir(parents=True, exist_ok=True)
+    call("export", export, options, model=model, file=folder / f"{name}{suffix}", places=places)
+    print(f"results: {folder}")

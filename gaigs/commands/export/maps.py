@@ -1,0 +1,164 @@
+"""Files of radio maps: GeoTIFF, GeoJSON, NetCDF, PNG and PDF."""
+
+import json
+import logging
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.sax.saxutils import escape
+
+import numpy as np
+import tifffile
+from jaxtyping import Float
+from matplotlib import rc_context
+from matplotlib.backends.backend_pdf import PdfPages
+from numpy import ndarray
+
+from gaigs.core.geometry import Frame
+from gaigs.core.radio_maps import RadioMap
+from gaigs.core.scene import Scene
+from gaigs.core.task.scalar import with_unit
+from gaigs.data.maps import find_pyproj
+from gaigs.io.files import atomic_write, write_text
+from gaigs.io.netcdf import Variable, write_netcdf
+from gaigs.report import style
+from gaigs.report.scalar import map_pages
+
+log = logging.getLogger(__name__)
+
+
+class Layer(NamedTuple):
+    """Values, or deviations, of a radio map, with their quantity and unit."""
+
+    quantity: str
+    unit: str
+    values: Float[ndarray, "receivers rows columns"]
+
+
+def layers(floor: RadioMap, scene: Scene) -> dict[str, Layer]:
+    """``value`` and, if the model states deviations, ``deviation``."""
+    found = {"value": Layer(floor.quantity, floor.unit, floor.values)}
+    if floor.deviations is not None:
+        unit = getattr(scene.task, "error_unit", floor.unit)
+        found["deviation"] = Layer(f"standard deviation of {floor.quantity}", unit, floor.deviations)
+    return found
+
+
+def title(floor: RadioMap) -> str:
+    carrier = "" if floor.frequency is None else f" at {floor.frequency / 1e9:.6g} GHz"
+    return f"{with_unit(floor.quantity, floor.unit)} of a transmitter at z = {floor.height:.2f} m{carrier}, by gaigs"
+
+
+def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
+    """Bands of value and deviation, one receiver after the other, north up, in the projected system of the frame.
+
+    Source: OGC GeoTIFF Standard 1.1; names of bands as GDAL stores them.
+    """
+    x, y = axes_on_map(file, floor, scene.frame)
+    width, height = np.diff(x[:2])[0], np.diff(y[:2])[0]
+    kinds = layers(floor, scene).values()
+    bands = np.stack([kind.values[:, ::-1] for kind in kinds], 1).reshape(-1, len(y), len(x)).astype(np.float32)
+    words = [f"{name}: {with_unit(kind.quantity, kind.unit)}" for name in floor.receivers for kind in kinds]
+    items = "".join(
+        f'<Item name="DESCRIPTION" sample="{band}" role="description">{escape(word)}</Item>'
+        for band, word in enumerate(words)
+    )
+    tags: list[tuple] = [
+        (33550, "d", 3, (width, height, 0.0), True),  # ModelPixelScale
+        (33922, "d", 6, (0.0, 0.0, 0.0, x[0] - width / 2, y[-1] + height / 2, 0.0), True),  # ModelTiepoint
+        (42112, "s", 0, f"<GDALMetadata>{items}</GDALMetadata>".encode(), True),
+    ]
+    if scene.frame is not None:  # GeoKeyDirectory: projected, pixels are areas, EPSG code
+        keys = (1, 1, 1, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, scene.frame.epsg)
+        tags.append((34735, "H", len(keys), keys, True))
+    options: dict[str, Any] = {"photometric": "minisblack", "planarconfig": "separate", "metadata": None}
+    with atomic_write(file) as part:
+        tifffile.imwrite(part, bands, description=title(floor).encode(), extratags=tags, **options)
+    return [file]
+
+
+def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
+    """A point for each place, with value and deviation at each receiver, ``ap`` and ``ap deviation``.
+
+    If a receiver has such a name, the keys are ``ap value`` and ``ap deviation``.
+
+    Source: RFC 7946: longitudes and latitudes of WGS 84. Without a frame, coordinates are metres.
+    """
+    x, y = np.meshgrid(*axes_on_map(file, floor, scene.frame))
+    if scene.frame is not None:
+        transformer = find_pyproj().Transformer.from_crs(scene.frame.epsg, 4326, always_xy=True)
+        x, y = transformer.transform(x, y)
+    kinds = layers(floor, scene)
+    # Names that are also another's with "deviation": every key then ends with its kind.
+    collide = {f"{name} {key}" for name in floor.receivers for key in kinds} & {*floor.receivers}
+    columns = {}
+    for receiver, name in enumerate(floor.receivers):
+        for key, kind in kinds.items():
+            full = name if key == "value" and not collide else f"{name} {key}"
+            columns[full] = kind.values[receiver].ravel().tolist()
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [round(east, 8), round(north, 8)]},  # of degrees: 1 mm
+            "properties": {name: round(column[row], 4) for name, column in columns.items()},
+        }
+        for row, (east, north) in enumerate(zip(x.ravel().tolist(), y.ravel().tolist(), strict=True))
+    ]
+    content = {"type": "FeatureCollection", "title": title(floor), "features": features}
+    write_text(file, json.dumps(content, ensure_ascii=False) + "\n")
+    return [file]
+
+
+def write_map_netcdf(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
+    """``value`` and ``deviation`` by receiver, y and x.
+
+    Source: NetCDF Climate and Forecast Metadata Conventions 1.11.
+    """
+    x, y = axes_on_map(file, floor, scene.frame)
+    variables = {"receiver": Variable(("receiver",), np.array(floor.receivers))}
+    standard: dict[str, dict[str, str]] = {"x": {}, "y": {}}
+    shared = {"coordinates": "z"}
+    if scene.frame is not None:
+        system = find_pyproj().CRS.from_epsg(scene.frame.epsg).to_cf()
+        variables["crs"] = Variable((), np.array(0, np.int32), system)
+        standard = {axis: {"standard_name": f"projection_{axis}_coordinate"} for axis in "xy"}
+        shared["grid_mapping"] = "crs"
+    for axis, values in (("x", x), ("y", y)):
+        variables[axis] = Variable((axis,), values, {"units": "m", "axis": axis.upper(), **standard[axis]})
+    variables["z"] = Variable((), np.array(floor.height), {"units": "m", "long_name": "height of the transmitter"})
+    if floor.frequency is not None:
+        carrier = {"units": "Hz", "standard_name": "radiation_frequency"}
+        variables["frequency"] = Variable((), np.array(floor.frequency), carrier)
+        shared["coordinates"] += " frequency"
+    for name, kind in layers(floor, scene).items():
+        own = {"long_name": kind.quantity, "units": kind.unit or "1", **shared}
+        variables[name] = Variable(("receiver", "y", "x"), kind.values.astype(np.float32), own)
+    write_netcdf(file, variables, {"title": title(floor)})
+    return [file]
+
+
+def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
+    """The maps as figures: pages of one PDF, or a PNG each; gives the files."""
+    gateways = {one.name: one.pose.position.numpy() for one in scene.receivers}
+    none = {name: np.zeros((0, 3), np.float32) for name in gateways}
+    task: Any = scene.task
+    pages = map_pages(floor, gateways, none, np.zeros((0, 2, 3), np.float32), task)
+    if file.suffix.lower() == ".pdf":
+        with atomic_write(file) as part, rc_context(style.STYLE), PdfPages(part) as document:
+            for page in pages.values():
+                document.savefig(page)
+        return [file]
+    files = []
+    for name, page in pages.items():
+        ending = name.removeprefix("radio_map").replace("deviation_map", "_deviation")
+        files.append(file.with_stem(f"{file.stem}{ending}"))
+        with atomic_write(files[-1]) as part, rc_context(style.STYLE):
+            page.savefig(part, dpi=style.DPI)
+    return files
+
+
+def axes_on_map(file: Path, floor: RadioMap, frame: Frame | None) -> tuple[ndarray, ndarray]:
+    """Coordinates x and y of the map's places in the system of the frame, or without one in the data's own [m]."""
+    if frame is None:
+        log.warning("%s has no coordinate system: x and y are metres in the data's own frame", file)
+        return floor.x, floor.y
+    return frame.x + floor.x, frame.y + floor.y

@@ -1,0 +1,60 @@
+"""The viewer's server on this machine: a page, and a model's answers to it."""
+
+import json
+import logging
+import re
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qsl, urlsplit
+
+from gaigs.commands.view.contents import Contents
+
+log = logging.getLogger(__name__)
+
+
+def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServer:
+    """A server of the page at ``/`` and of answers at ``/answer``, ``/slice`` and ``/comparison``; not started.
+
+    It answers to names of this machine alone: a page of a foreign name that is made to lead here reads nothing.
+    """
+
+    def respond(path: str, asked: dict[str, Any]) -> str:
+        own = contents[int(asked["run"])]
+        match path:
+            case "/answer":
+                place = [float(x) for x in asked["place"].split(",")]
+                return json.dumps(own.answer(place, int(asked["receiver"])))
+            case "/slice":
+                return json.dumps(own.slice(float(asked["height"]), int(asked["receiver"])))
+            case "/comparison":
+                return json.dumps(own.comparison(int(asked["number"])))
+        raise ValueError(f"no answer at {path}")
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"  # one connection for all answers
+
+        def do_GET(self) -> None:
+            url = urlsplit(self.path)
+            kind, status = "application/json", HTTPStatus.OK
+            if not re.fullmatch(r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", self.headers.get("Host", "").lower()):
+                kind, status = "text/plain; charset=utf-8", HTTPStatus.FORBIDDEN
+                text = "this server answers to the names localhost and 127.0.0.1 alone\n"
+            elif url.path == "/":
+                kind, text = "text/html; charset=utf-8", page
+            else:
+                try:
+                    text = respond(url.path, dict(parse_qsl(url.query)))
+                except Exception as error:  # the page shows it, and the server goes on
+                    status, text = HTTPStatus.BAD_REQUEST, json.dumps({"error": str(error) or repr(error)})
+            data = text.encode()
+            self.send_response(status)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data)
+
+        def log_message(self, *_: Any) -> None:
+            """Requests are not logged: a drag makes many."""
+
+    return ThreadingHTTPServer(("127.0.0.1", port), Handler)

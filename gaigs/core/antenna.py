@@ -1,0 +1,124 @@
+"""Receivers and the elements of their antennas."""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Complex, Float, Int
+from torch import Tensor
+
+from gaigs.core.geometry import Pose
+
+PATTERNS = ("isotropic", "cosine")
+"""Field patterns of an element; as of a patch, the cosine of the angle to the array's normal, and 0 behind it."""
+
+
+def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"]]:
+    """The distinct vectors between places, rounded to nine decimals, and the index of each pair's vector."""
+    apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)
+    return torch.unique(apart, dim=0, return_inverse=True)
+
+
+@dataclass(frozen=True)
+class Array:
+    """A receiver's antenna: one or several separately fed elements.
+
+    Attributes:
+        elements: Positions in the array's own frame (e, 3) [m].
+        pattern: Field pattern of each element, one of ``PATTERNS``.
+
+    Example:
+        >>> len(gaigs.Array.planar(4, 4, pitch=0.16)), len(gaigs.Array.single())
+        (16, 1)
+    """
+
+    elements: Tensor
+    pattern: str = "isotropic"
+
+    def __post_init__(self) -> None:
+        if self.pattern not in PATTERNS:
+            raise ValueError(f"an array's pattern must be one of {', '.join(PATTERNS)}, got {self.pattern!r}")
+        if self.elements.ndim != 2 or self.elements.shape[1] != 3 or not len(self.elements):
+            raise ValueError(f"an array's elements must be (e, 3) positions [m], got {tuple(self.elements.shape)}")
+
+    @classmethod
+    def single(cls) -> "Array":
+        return cls(torch.zeros(1, 3, dtype=torch.float32))
+
+    @classmethod
+    def planar(cls, rows: int, columns: int, pitch: float, pattern: str = "isotropic") -> "Array":
+        """Elements in the array's x-y plane, centred, column by column: y varies fastest.
+
+        Args:
+            rows, columns: Numbers of elements along y and along x.
+            pitch: Distance of neighbouring elements [m].
+            pattern: One of ``PATTERNS``.
+        """
+        if rows < 1 or columns < 1 or not 0 < pitch < math.inf:
+            raise ValueError(
+                f"an array must have at least 1 x 1 elements at a positive pitch, got {rows} x {columns} at {pitch} m"
+            )
+        steps = lambda count: (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * pitch
+        x, y = torch.meshgrid(steps(columns), steps(rows), indexing="ij")
+        return cls(torch.stack((x, y, 0 * x), -1).flatten(0, 1), pattern)
+
+    def __len__(self) -> int:
+        return len(self.elements)
+
+    @functools.cached_property
+    def is_point(self) -> bool:
+        """True for one isotropic element in the middle, which hears alike in any orientation."""
+        return len(self) == 1 and self.pattern == "isotropic" and not self.elements.any()
+
+    @functools.cached_property
+    def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
+        """The distinct vectors between elements [m], the index of each pair's vector, and the pairs of each; float64.
+
+        The covariance of a field depends on them only: 49 for a 4 x 4 array.
+        """
+        # Cached tensors of inference mode could not be saved for a later backward pass.
+        with torch.inference_mode(False):
+            steps, pairs = differences(self.elements.clone().double())
+            return steps, pairs, torch.bincount(pairs).double()
+
+    def by_lag(self, covariances: Complex[Tensor, "b e e"]) -> Complex[Tensor, "b l"]:
+        """Mean covariance of the pairs of elements at each of ``lags``."""
+        pairs, counts = (part.to(covariances.device) for part in self.lags[1:])
+        summed = covariances.new_zeros(len(covariances), len(counts)).index_add(1, pairs, covariances.flatten(1))
+        return summed / counts.to(covariances.real)
+
+    def gain(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Field gain of an element towards unit vectors in the array's frame."""
+        if self.pattern == "cosine":
+            return directions[..., 2].clamp(min=0)
+        return torch.ones_like(directions[..., 2])
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """An antenna array or gateway: its name in files and tables, its pose in the room, its antenna.
+
+    Example:
+        >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])
+        >>> len(gaigs.Receiver("door", pose, gaigs.Array.planar(4, 4, pitch=0.16)).array)
+        16
+    """
+
+    name: str
+    pose: Pose
+    array: Array = field(default_factory=Array.single)
+
+    def __post_init__(self) -> None:
+        axes = self.pose.rotation.double()
+        # NaN is no rotation either, nor a mirror, whose determinant is -1.
+        if not ((axes.mT @ axes - torch.eye(3).to(axes)).abs().max() <= 1e-3 and torch.linalg.det(axes) > 0):
+            wanted = "a rotation, whose orthonormal columns are the array's axes"
+            raise ValueError(f"the pose of receiver {self.name!r} must have {wanted}, got {axes.tolist()}")
+
+
+def lacking(receivers: Sequence[Receiver], index: Int[Tensor, " b"], count: int) -> Bool[Tensor, "b e"]:
+    """True for each of ``count`` elements that the array of a link's receiver lacks; ``index`` numbers receivers."""
+    sizes = torch.tensor([len(receiver.array) for receiver in receivers], device=index.device)
+    return torch.arange(count, device=index.device) >= sizes[index.long()][:, None]

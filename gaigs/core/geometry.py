@@ -1,0 +1,355 @@
+"""Poses, quaternions, coordinates, harmonics, and grids of directions; conventions: docs/conventions.md."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from numbers import Integral, Real
+
+import numpy as np
+import torch
+from jaxtyping import Complex, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+FAINTEST = torch.finfo(torch.float32).tiny
+"""Smaller amplitudes and powers count as 0: dividing by such a float32 number overflows."""
+
+
+class ExtrapolationWarning(UserWarning):
+    """A prediction is far from all measurements."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The place of the world frame on a map: its origin (x, y) in the projected system of an EPSG code [m].
+
+    Raises:
+        ValueError: There is no such system, it has other units than metres, or the origin is not within it. Without
+            pyproj systems other than UTM are not checked.
+
+    Example:
+        >>> places, levels = [[10.0, 20.0, 1.5], [30.0, 5.0, 1.5], [0.0, 9.0, 1.5]], [-50.0, -60.0, -55.0]
+        >>> frame = gaigs.Frame(32632, 450000.0, 5400000.0)  # UTM less this easting and northing
+        >>> links = gaigs.links(task="rssi", transmitters=places, receivers=[0, 0, 9], labels=levels, frame=frame)
+        >>> links.frame.epsg
+        32632
+    """
+
+    epsg: int
+    x: float
+    y: float
+
+    def __post_init__(self) -> None:
+        remedy = "gaigs.data.maps.to_utm converts degrees and feet into metres of UTM, and gives its code"
+        is_number = isinstance(self.epsg, Integral) and isinstance(self.x, Real) and isinstance(self.y, Real)
+        if not is_number or not math.isfinite(self.x + self.y) or self._is_elsewhere():
+            raise ValueError(f"a frame must be an EPSG code with an easting and a northing [m], got {self}\n{remedy}")
+        if is_utm(self.epsg) or find_spec("pyproj") is None:
+            return
+        import pyproj
+
+        try:
+            system = pyproj.CRS.from_epsg(self.epsg)
+        except pyproj.exceptions.CRSError:
+            raise ValueError(f"there is no coordinate system EPSG:{self.epsg}\n{remedy}") from None
+        units = [axis.unit_name for axis in system.axis_info[:2]]
+        if not system.is_projected or units != ["metre", "metre"]:
+            found = f"EPSG:{self.epsg}, {system.name} in {units[0]}"
+            raise ValueError(f"a frame must be a projected system in metres, got {found}\n{remedy}")
+
+    def _is_elsewhere(self) -> bool:
+        """True if the origin is in degrees, or beyond all of UTM: Norway has eastings of -80 to 1120 km in zone 33."""
+        is_small = abs(self.x) <= 180 and abs(self.y) <= 90
+        if is_utm(self.epsg):
+            return is_small or not (-2e5 <= self.x <= 1.3e6 and -1e5 <= self.y <= 1.01e7)
+        return is_small and (self.x, self.y) != (0, 0)
+
+
+def is_utm(epsg: int) -> bool:
+    """True for the codes of UTM on WGS 84."""
+    return 1 <= epsg % 100 <= 60 and epsg // 100 in (326, 327)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Position and orientation of an antenna array.
+
+    Attributes:
+        position: Centre of the array, world frame (3,) [m].
+        rotation: The array's axes in the world frame as columns (3, 3).
+
+    Example:
+        >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])  # scipy's order: looks along the axes
+        >>> pose.local(torch.tensor([3.0, 0.0, 2.0]))
+        tensor([2., 0., 0.])
+    """
+
+    position: Float[Tensor, "3"]
+    rotation: Float[Tensor, "3 3"]
+
+    @classmethod
+    def from_xyzw(cls, position, quaternion) -> "Pose":
+        """A pose from a scalar-last quaternion of unit length (to 1e-3), as in scipy and the NeRF² files."""
+        plain = lambda values: values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, float))
+        position, quaternion = plain(position).double(), plain(quaternion).double()
+        if position.shape != (3,) or quaternion.shape != (4,) or not position.isfinite().all():
+            raise ValueError(
+                "a pose needs 3 finite coordinates [m] and a quaternion (x, y, z, w), got "
+                f"{position.tolist()} and {quaternion.tolist()}"
+            )
+        norm = float(quaternion.norm())
+        if not abs(norm - 1) <= 1e-3:
+            raise ValueError(f"a rotation quaternion must have length 1, got {norm:.6g}; normalise it")
+        rotation = quaternions_to_rotations(quaternion.roll(1))
+        return cls(position.float(), rotation.float())
+
+    def to(self, like: Tensor) -> "Pose":
+        return Pose(self.position.to(like), self.rotation.to(like))
+
+    def local(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """World points in the array's frame [m]."""
+        pose = self.to(points)
+        return (points - pose.position) @ pose.rotation
+
+    def world(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Points of the array's frame in the world frame [m]."""
+        pose = self.to(points)
+        return points @ pose.rotation.mT + pose.position
+
+
+def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices of quaternions (w, x, y, z) of any length; length zero means no rotation."""
+    quats = _of_moderate_length(quats)
+    w, x, y, z = quats.unbind(-1)
+    squares = (quats * quats).sum(-1)
+    s = 2 / torch.where(squares == 0, 1, squares)
+    rows = (
+        1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
+        s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x),
+        s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Quaternions scaled to length 1; a quaternion of length zero stays zero."""
+    return normalize(_of_moderate_length(quats), dim=-1)
+
+
+def _of_moderate_length(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Quaternions scaled to a largest component of 1, so that squares neither overflow nor vanish."""
+    largest = quats.detach().abs().amax(-1, keepdim=True)
+    return quats / torch.where(largest == 0, 1, largest)
+
+
+def semi_axes(quats: Float[Tensor, "*#batch 4"], scales: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Semi-axes R diag(scales) of Gaussians as columns, from quaternions (w, x, y, z) and standard deviations [m]."""
+    return quaternions_to_rotations(quats) * scales[..., None, :]
+
+
+def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Azimuth in [-pi, pi] [rad], elevation in [-pi/2, pi/2] [rad] and distance [m] of points in the array's frame.
+
+    At the zenith, where azimuth is undefined, it is 0. Gradients are finite everywhere but at the origin.
+    """
+    x, y, z = points.unbind(-1)
+    distances = points.norm(dim=-1)
+    # Within rounding of the axis no azimuth is resolved: such a point counts as one just beside it, at azimuth 0.
+    least = torch.finfo(points.dtype).eps * distances.detach()
+    axial = torch.hypot(x, y) <= least
+    x, y = torch.where(axial, least, x), torch.where(axial, 0.0, y)
+    return torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y)), distances
+
+
+def from_spherical(azimuths: Float[Tensor, "*batch"], elevations: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
+    """Unit vectors towards azimuths and elevations [rad]."""
+    horizontal = torch.cos(elevations)
+    return torch.stack((horizontal * torch.cos(azimuths), horizontal * torch.sin(azimuths), torch.sin(elevations)), -1)
+
+
+def polar(amplitudes: Float[Tensor, "*batch"], phases: Float[Tensor, "*batch"]) -> Complex[Tensor, "*batch"]:
+    """``torch.polar`` with value and gradient 0 below ``FAINTEST``, where its own gradient is NaN."""
+    return torch.polar(amplitudes.masked_fill(amplitudes < FAINTEST, 0), phases)
+
+
+def magnitudes(waves: Complex[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Magnitudes of complex waves; value and gradient are 0 where both parts are below ``FAINTEST``."""
+    largest = torch.maximum(waves.real.detach().abs(), waves.imag.detach().abs())
+    return waves.masked_fill(largest < FAINTEST, 0).abs()
+
+
+class _Sinc(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values):
+        # Added to 0 so that 0 / 0 is 1; to all other numbers it adds nothing.
+        angles = torch.add(values.new_tensor(FAINTEST), values, alpha=math.pi)
+        found = angles.sin().div_(angles)
+        ctx.save_for_backward(angles, found)
+        return found
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        angles, found = ctx.saved_tensors
+        return angles.cos().sub_(found).div_(angles).mul_(gradient).mul_(math.pi)
+
+
+def sinc(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """``torch.sinc`` in a quarter of the time: sin(pi x) / (pi x), and 1 at 0."""
+    return _Sinc.apply(values)
+
+
+def spherical_harmonics(vectors: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch k"]:
+    """The k = (degree + 1)² real spherical harmonics of degree n up to ``degree`` in given directions.
+
+    Number n² + n + m is sqrt(2) N P_n^|m|(z) times cos(m az) for m > 0, sin(|m| az) for m < 0, and N P_n(z) for m = 0.
+    P has the factor (-1)^m, and N makes the mean square over the sphere 1 / 4 pi, as in .ply viewers. The recurrence
+    over n runs on N P_n^m / sin^m, a polynomial in z, so values and gradients are finite at the poles.
+
+    Source: Holmes and Featherstone, A unified approach to the Clenshaw summation, 2002, section 3.
+    """
+    x, y, z = vectors.unbind(-1)
+    cosines, sines = torch.ones_like(z), torch.zeros_like(z)  # of m az, times sin^m of the polar angle
+    harmonics = [z] * (degree + 1) ** 2
+    first = 0.5 / math.sqrt(math.pi)
+    for m in range(degree + 1):
+        if m:
+            first *= -math.sqrt((2 * m + 1) / (2 * m))
+            cosines, sines = x * cosines - y * sines, x * sines + y * cosines
+        last, legendre = torch.zeros_like(z), torch.full_like(z, first)
+        for n in range(m, degree + 1):
+            if n > m:
+                step = math.sqrt((4 * n**2 - 1) / (n**2 - m**2))
+                back = math.sqrt(((n - 1) ** 2 - m**2) / (4 * (n - 1) ** 2 - 1))
+                last, legendre = legendre, step * (z * legendre - back * last)
+            middle = n**2 + n
+            if m:
+                harmonics[middle + m] = math.sqrt(2) * legendre * cosines
+                harmonics[middle - m] = math.sqrt(2) * legendre * sines
+            else:
+                harmonics[middle] = legendre
+    return torch.stack(harmonics, -1)
+
+
+@dataclass
+class Rays:
+    """A list of directions in the array's frame [rad].
+
+    Example:
+        >>> gaigs.Rays(elevations=torch.tensor([0.0, 0.5]), azimuths=torch.tensor([0.0, 3.0])).vectors().shape
+        torch.Size([2, 3])
+    """
+
+    elevations: Float[Tensor, " k"]
+    azimuths: Float[Tensor, " k"]
+
+    @property
+    def shape(self) -> tuple[int]:
+        return (len(self.elevations),)
+
+    def flatten(self) -> "Rays":
+        return self
+
+    def vectors(self) -> Float[Tensor, "k 3"]:
+        """Unit vectors in the array's frame."""
+        return from_spherical(self.azimuths, self.elevations)
+
+    def __getitem__(self, index: slice | Int[Tensor, " j"]) -> "Rays":
+        return Rays(self.elevations[index], self.azimuths[index])
+
+    def to(self, where: torch.device | str | torch.dtype | Tensor) -> "Rays":
+        return Rays(self.elevations.to(where), self.azimuths.to(where))
+
+
+@dataclass
+class Grid:
+    """Directions of a spectrum's pixel centres in the array's frame, an elevation a row and an azimuth a column [rad].
+
+    Example:
+        >>> gaigs.Grid.degrees().shape, gaigs.Grid.degrees(elevations=range(-30, 31, 10), azimuths=range(8)).shape
+        ((90, 360), (7, 8))
+    """
+
+    elevations: Float[Tensor, " rows"]
+    azimuths: Float[Tensor, " columns"]
+
+    @classmethod
+    def degrees(cls, elevations=range(1, 91), azimuths=range(360)) -> "Grid":
+        """A grid of whole degrees; the default is that of the NeRF² spectra, 90 x 360."""
+        as_radians = lambda values: torch.tensor([float(v) for v in values], dtype=torch.float32).deg2rad()
+        return cls(as_radians(elevations), as_radians(azimuths))
+
+    @classmethod
+    def sphere(cls, rows: int, columns: int) -> "Grid":
+        """The full sphere in at least 2 x 3 pixels of equal solid angle: the rows' sines are evenly spaced."""
+        if rows < 2 or columns < 3:
+            raise ValueError(f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x {columns}")
+        sines = (2 * torch.arange(rows, dtype=torch.float64) + 1 - rows) / rows
+        azimuths = 2 * math.pi / columns * (torch.arange(columns, dtype=torch.float64) + 0.5)
+        return cls(sines.asin().float(), azimuths.float())
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.elevations), len(self.azimuths)
+
+    @property
+    def pitch(self) -> float:
+        """Mean distance between neighbouring rows [rad]."""
+        return ((self.elevations[-1] - self.elevations[0]) / max(len(self.elevations) - 1, 1)).abs().item()
+
+    @property
+    def solid_angles(self) -> Float[Tensor, "rows columns"]:
+        """Shares of the pixels in the grid's; rows meet where the sine of the elevation is halfway between theirs."""
+        if len(self.elevations) < 2:
+            raise ValueError(f"solid angles take at least 2 rows, got {len(self.elevations)}; use a finer grid")
+        sines = self.elevations.double().sin()
+        first, last = (3 * sines[:1] - sines[1:2]) / 2, (3 * sines[-1:] - sines[-2:-1]) / 2
+        bounds = torch.cat((first, (sines[1:] + sines[:-1]) / 2, last)).clamp(-1, 1)
+        shares = bounds.diff().abs()[:, None].expand(self.shape)
+        return (shares / shares.sum()).float()
+
+    def thin(self, rows: slice, columns: slice) -> "Grid":
+        """The grid of some of the rows and columns."""
+        return Grid(self.elevations[rows], self.azimuths[columns])
+
+    def matches(self, other: "Directions") -> bool:
+        """True for a grid of the same angles."""
+        pairs = (self.elevations, other.elevations), (self.azimuths, other.azimuths)
+        return self.shape == other.shape and all(torch.equal(a, b.to(a)) for a, b in pairs)
+
+    def flatten(self) -> Rays:
+        """The pixels, row by row."""
+        elevations, azimuths = torch.meshgrid(self.elevations, self.azimuths, indexing="ij")
+        return Rays(elevations.flatten(), azimuths.flatten())
+
+    def vectors(self) -> Float[Tensor, "rows columns 3"]:
+        """Unit vectors in the array's frame."""
+        return self.flatten().vectors().unflatten(0, self.shape)
+
+    def to(self, where: torch.device | str | torch.dtype | Tensor) -> "Grid":
+        return Grid(self.elevations.to(where), self.azimuths.to(where))
+
+
+Directions = Grid | Rays
+"""Directions of the values of a label or a map."""
+
+
+def even_places(
+    lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], count: int, floors: Sequence[float] | Tensor = ()
+) -> Float[Tensor, "g 3"]:
+    """About so many evenly spaced places in a box; an edge shorter than their distance has one. With the heights of
+    ``floors`` they are on these."""
+    if len(floors):
+        at = lambda end, floor: torch.cat((end[:2], end.new_tensor([floor])))
+        each = max(1, count // len(floors))
+        return torch.cat([even_places(at(lower, floor), at(upper, floor), each) for floor in floors])
+    lower, edges = torch.minimum(lower, upper), (upper - lower).abs()
+    longest, pitch = edges.double().sort(descending=True).values, 0.0
+    for dimensions in (3, 2, 1):  # an edge below the pitch has no part in it
+        pitch = float(longest[:dimensions].prod() / count) ** (1 / dimensions)
+        if 0 < pitch <= longest[dimensions - 1]:
+            break
+    counts = [max(1, round(edge / (pitch or 1.0))) for edge in edges.tolist()]
+    axes = [low + edge * (torch.arange(n) + 0.5) / n for low, edge, n in zip(lower, edges, counts, strict=True)]
+    return torch.cartesian_prod(*axes)

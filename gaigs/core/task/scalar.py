@@ -1,0 +1,66 @@
+"""The base of tasks whose label is one real number a link."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaigs.core.task import Metric, Task, check_values, need_samples
+
+
+class Scalar(Task):
+    """One real number a link, with a unit; a subclass gives ``name``, ``quantity``, ``unit`` and ``error_unit``.
+
+    ``error_unit`` is the unit of a difference of labels; its lower case ends the names of scores and metrics.
+    """
+
+    error_unit: str
+    higher_is_better = False
+    is_noisy = True
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return ()
+
+    @property
+    def monitor(self) -> str:
+        return f"mae_{self.error_unit.lower()}"
+
+    @classmethod
+    def metrics(cls) -> dict[str, Metric]:
+        suffix = cls.error_unit.lower()
+        return {
+            f"mae_{suffix}": Metric(f"MAE [{cls.error_unit}]", False),
+            f"median_ae_{suffix}": Metric(f"median AE [{cls.error_unit}]", False, is_brief=False),
+            f"rmse_{suffix}": Metric(f"RMSE [{cls.error_unit}]", False, is_brief=False),
+        }
+
+    def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
+        """The absolute error of each prediction."""
+        check_values(labels, values, (), "readings")
+        return {self.monitor: (values.detach().cpu().double() - labels.detach().cpu().double()).abs()}
+
+    @property
+    def pair_score(self) -> str:
+        return with_unit("|difference|", self.error_unit)
+
+    def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Errors divided by the root of 2."""
+        return {name: score / math.sqrt(2) for name, score in scores.items()}
+
+    def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
+        """Mean, median and root of the mean square of the absolute error."""
+        errors = scores[self.monitor]
+        need_samples(errors)
+        numbers = errors.mean(), torch.quantile(errors, 0.5), errors.square().mean().sqrt()
+        return dict(zip(self.metrics(), (number.item() for number in numbers), strict=True))
+
+    def stored(self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        """``error``: prediction minus label."""
+        return {"error": (values - labels).numpy()}
+
+
+def with_unit(quantity: str, unit: str) -> str:
+    """A quantity with its unit in brackets; a ratio has none."""
+    return f"{quantity} [{unit}]" if unit else quantity

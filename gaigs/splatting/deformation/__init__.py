@@ -1,0 +1,45 @@
+"""Deformations predict the change of each Gaussian for a query from the tokens."""
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.core.query import Query
+from gaigs.splatting.gaussians import Placed, Tokens
+
+
+class Residuals(NamedTuple):
+    """Changes of the Gaussians for a query; None: no change.
+
+    Source: GAI-GS, "Scene Mapping Network": d_rotation, d_scaling, d_signal, d_attn and the attenuation delta.
+    """
+
+    delta_quats: Float[Tensor, "b n 4"] | None = None
+    delta_scales: Float[Tensor, "b n 3"] | None = None
+    delta_signal: Float[Tensor, "b n c k"] | None = None
+    delta_opacities: Float[Tensor, "b n"] | None = None
+    attenuations: Float[Tensor, "b n"] | None = None
+
+
+class Deformation(nn.Module, ABC):
+    """The contract of kind ``deformation``; a constructor may take ``scene``, ``channels`` and ``tokenizer_widths``.
+
+    Attributes:
+        reads_tokens: True if it needs tokens; if False, no tokenizer is built.
+        sees_receivers: True if the change depends on the receiver.
+    """
+
+    reads_tokens: bool = True
+    sees_receivers: bool = False
+
+    @abstractmethod
+    def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
+        """Changes for each query.
+
+        Args:
+            tokens: Tokens of the queries and Gaussians; None if ``reads_tokens`` is False.
+            placed: Placed Gaussians, without a gradient.
+            query: The links.
+        """

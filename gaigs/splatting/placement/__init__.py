@@ -1,0 +1,49 @@
+"""Placements: positions and strengths of the Gaussians for each query."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.core.query import Query
+from gaigs.data import Links
+from gaigs.splatting.gaussians import Gaussians, Placed
+
+
+class Placement(nn.Module, ABC):
+    """The contract of kind ``placement``; a constructor is offered ``scene`` and ``channels``.
+
+    Attributes:
+        sees_receivers: True if the Gaussians of a transmitter depend on the receiver.
+        model: Name of the model of its results; None: any. Numbers under the name GAI-GS are the paper's.
+        has_own: True if it brings Gaussians of its own and needs no free ones.
+        learning_rates: Default learning rate of each parameter group; ``training.learning_rates`` overrides it.
+        penalty_weights: Default weight of each penalty; ``training.penalties`` overrides it.
+    """
+
+    sees_receivers: bool = False
+    model: str | None = None
+    has_own: bool = False
+    learning_rates: Mapping[str, float] = {"network": 1.6e-2}
+    penalty_weights: Mapping[str, float] = {}
+
+    @abstractmethod
+    def forward(self, gaussians: Gaussians, query: Query) -> Placed:
+        """The Gaussians of each query.
+
+        Args:
+            gaussians: The free Gaussians; where ``has_own`` is True, None if there are no free ones.
+            query: The links.
+        """
+
+    def fit(self, links: Links) -> None:
+        """Computes its state from the links before the training; by default nothing."""
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by the names in ``learning_rates``."""
+        return {"network": list(self.parameters())}
+
+    def penalties(self) -> dict[str, Float[Tensor, ""]]:
+        """Terms added to the loss, by the names in ``penalty_weights``."""
+        return {}

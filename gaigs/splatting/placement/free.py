@@ -1,0 +1,17 @@
+"""The paper's placement: Gaussians at their learnt positions, for every transmitter."""
+
+from gaigs.core.query import Query
+from gaigs.registry import register
+from gaigs.splatting.gaussians import Gaussians, Placed
+from gaigs.splatting.placement import Placement
+
+
+@register("placement", "free")
+class Free(Placement):
+    """The Gaussians' own means.
+
+    Source: GAI-GS, section "Framework".
+    """
+
+    def forward(self, gaussians: Gaussians, query: Query) -> Placed:
+        return Placed(gaussians.means[None])

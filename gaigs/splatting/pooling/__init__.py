@@ -1,0 +1,45 @@
+"""Poolings turn a map over directions, or propagation paths, into the label of a receiver."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+from gaigs.core.geometry import Directions, Grid
+from gaigs.core.query import Query
+from gaigs.data import Links
+
+
+class Pooling(nn.Module, ABC):
+    """The contract of kind ``pooling``. A pooling reads maps; a ``PathPooling`` reads paths.
+
+    Attributes:
+        channels: Real numbers that a Gaussian sends: channels of the map, or real and imaginary part of a path.
+        grid: Directions of the map that it sums over. None: the map is rendered in the label's directions.
+        zone: Lowest and highest elevation from which the receiver hears anything [rad]; read where ``grid`` is set.
+    """
+
+    channels: int = 2
+    grid: Grid | None = None
+    zone: tuple[float, float] = (-math.pi / 2, math.pi / 2)
+
+    def fit(self, links: Links) -> None:
+        """Computes its state from the training links before the training; by default nothing."""
+
+    @abstractmethod
+    def forward(self, received, query: Query, directions: Directions | None = None) -> Tensor:
+        """The label of each query (b, ...).
+
+        Args:
+            received: Maps (b, c, rows, columns), or ``ReceivedPaths``.
+            query: The link of each map or set of paths; all to one receiver.
+            directions: Wanted directions, where the label has any and they are not the map's; None: the task's.
+        """
+
+
+def sphere(option: str, shape: Sequence[int]) -> Grid:
+    """A pooling's own grid from its option [rows, columns]."""
+    if len(shape) != 2:
+        raise ValueError(f"{option} must be [rows, columns], got {list(shape)}")
+    return Grid.sphere(*shape)

@@ -1,0 +1,62 @@
+"""Base of poolings that give complex channels: their strength and the signs of their phases."""
+
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from gaigs.core.phases import array_sign
+from gaigs.core.propagation import strength
+from gaigs.core.scene import Scene, check_elements, direct_waves
+from gaigs.data import Links
+from gaigs.splatting.pooling import Pooling
+
+
+class ChannelPooling(Pooling):
+    """Fits the level and the phase convention of the training channels.
+
+    Args:
+        scene: Its task has the subcarriers, its receivers the elements.
+        name: Registered name, for errors.
+
+    Attributes:
+        strength: Amplitude of the channels relative to free space.
+        sign: Sign with which phases follow the direct distance, -1 for the time dependence exp(+j omega t) or 1; 0 for
+            neither, as without a common clock that the data do not declare.
+        array_sign: Sign between the elements and subcarriers of a link, -1 or 1.
+    """
+
+    strength: Tensor
+    sign: Tensor
+    array_sign: Tensor
+
+    def __init__(self, scene: Scene, name: str):
+        super().__init__()
+        self.task = check_elements(f"pooling {name!r}", scene, pads=True)
+        self.scene = scene
+        if all(receiver.array.pattern == "cosine" for receiver in scene.receivers):
+            self.zone = (0.0, math.pi / 2)
+        self.register_buffer("strength", torch.ones(()))
+        self.register_buffer("sign", torch.tensor(-1))
+        self.register_buffer("array_sign", torch.tensor(-1))
+
+    @property
+    def frequencies(self) -> Float[Tensor, " s"]:
+        """The subcarriers [Hz]; ``Model.at_frequencies`` exchanges the scene."""
+        task: Any = self.scene.task
+        return task.frequencies
+
+    def pad(self, channels: Complex[Tensor, "b e s"]) -> Complex[Tensor, "b most s"]:
+        """Channels with zeros at the elements that other receivers' arrays have alone."""
+        return torch.nn.functional.pad(channels, (0, 0, 0, self.task.elements - channels.shape[1]))
+
+    @torch.no_grad()
+    def fit(self, links: Links) -> None:
+        train = links.split.train
+        labels, query = links.labels[train].to(torch.complex128), links.query[train]
+        waves = direct_waves(self.scene, query, self.frequencies)
+        self.strength.fill_(strength(labels, waves, query.receivers))
+        self.sign.fill_(self.task.phase_sign(labels, waves, query.receivers))
+        self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))

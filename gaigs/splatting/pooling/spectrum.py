@@ -1,0 +1,31 @@
+"""The spatial spectrum: the map's magnitude."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.core.geometry import Directions, magnitudes
+from gaigs.core.query import Query
+from gaigs.registry import register
+from gaigs.splatting.pooling import Pooling
+
+
+@register("pooling", "spectrum")
+class SpectrumPooling(Pooling):
+    """|C_0|, or |C_0 + j C_1|: channels are signed, so that paths can cancel.
+
+    Args:
+        channels: 1 (real) or 2 (complex).
+    """
+
+    def __init__(self, channels: int = 2):
+        super().__init__()
+        if channels not in (1, 2):
+            raise ValueError(f"pooling 'spectrum' renders 1 real or 2 complex channels, got channels={channels}")
+        self.channels = channels
+
+    def forward(
+        self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
+    ) -> Float[Tensor, "b rows columns"]:
+        """The predicted spectrum; where the map is 0, so is its gradient."""
+        return image[:, 0].abs() if self.channels == 1 else magnitudes(torch.complex(*image.unbind(1)))

@@ -1,0 +1,55 @@
+"""Base of projections whose u is the azimuth."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.core.geometry import Directions, Grid, to_spherical
+from gaigs.splatting.projection import Plane, Projection
+
+
+class Cylindrical(Projection):
+    """u = azimuth, with period 2 pi, and v = f(elevation).
+
+    Args:
+        pixel: As of ``Projection`` [rad].
+        limit_deg: Elevations are clamped to this absolute value [deg], in (0, 90): towards the pole the azimuth of a
+            small step diverges as 1 / cos(elevation).
+    """
+
+    period = 2 * math.pi
+
+    def __init__(self, pixel: float, limit_deg: float):
+        super().__init__(pixel)
+        if not 0 < limit_deg < 90:
+            raise ValueError(f"limit_deg must lie between 0 and 90 degrees, got {limit_deg}")
+        self.limit = math.radians(limit_deg)
+
+    def stretch(self, elevations: Tensor) -> tuple[Tensor, Tensor]:
+        """v and dv/d(elevation) at elevations [rad] within the limit."""
+        raise NotImplementedError
+
+    def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
+        azimuths, elevations, _ = to_spherical(points)
+        v, _ = self.stretch(elevations.clamp(-self.limit, self.limit))
+        return torch.stack((azimuths, v), -1)
+
+    def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
+        azimuths, elevations, distances = to_spherical(points)
+        clamped = elevations.clamp(-self.limit, self.limit)
+        _, slope = self.stretch(clamped)
+        sin, cos = torch.sin(azimuths), torch.cos(azimuths)
+        # Unit vectors of growing azimuth and of growing elevation, and their rates per metre.
+        east = torch.stack((-sin, cos, torch.zeros_like(sin)), -1)
+        height, horizontal = torch.sin(elevations), torch.cos(elevations)
+        north = torch.stack((-height * cos, -height * sin, horizontal), -1)
+        rates = torch.stack((1 / torch.cos(clamped), slope), -1) / distances[..., None]
+        return rates[..., None] * torch.stack((east, north), -2)
+
+    def plane(self, directions: Directions) -> Plane:
+        """Plane coordinates; u and v of a grid are separable."""
+        v, _ = self.stretch(directions.elevations.clamp(-self.limit, self.limit))
+        rows = v[:, None] if isinstance(directions, Grid) else v[None]
+        return Plane(directions.azimuths[None], rows, self.period)

@@ -1,0 +1,31 @@
+"""The plane of direction cosines."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.registry import register
+from gaigs.splatting.projection import Projection
+
+
+@register("projection", "direction_cosine")
+class DirectionCosine(Projection):
+    """(u, v) = (l, m) = (cos(el) cos(az), cos(el) sin(az)), in which a planar array's response is shift-invariant.
+
+    No seam and no pole: smooth on the whole hemisphere. As with a planar array, a direction below the array's plane
+    and its mirror image above are one. Rows and columns of a spectrum mix, so ``plane`` gives full grids.
+
+    Source: Van Trees, Optimum Array Processing, 2002, chapter 4.
+    """
+
+    sees_below = False
+    period = None
+
+    def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
+        return (points / points.norm(dim=-1, keepdim=True))[..., :2]
+
+    def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
+        distances = points.norm(dim=-1)[..., None, None]
+        unit = points[..., None, :] / distances
+        identity = torch.eye(3, dtype=points.dtype, device=points.device)
+        return (identity - unit.mT @ unit)[..., :2, :] / distances

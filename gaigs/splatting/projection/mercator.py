@@ -1,0 +1,30 @@
+"""The Mercator plane of the paper."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gaigs.registry import register
+from gaigs.splatting.projection.cylindrical import Cylindrical
+
+
+@register("projection", "mercator")
+class Mercator(Cylindrical):
+    """u = azimuth, v = alpha asinh(tan(elevation)), which equals the paper's alpha log tan(pi/4 + elevation/2).
+
+    alpha maps the elevation limit to the plane's edge v = pi, so that the plane is as high as it is wide. At the
+    default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection conformal: a small round Gaussian
+    stays round wherever it lies.
+
+    Options are those of ``Cylindrical``.
+
+    Source: GAI-GS, "Projection and Render Module".
+    """
+
+    def __init__(self, pixel: float, limit_deg: float = 85.0511287798066):
+        super().__init__(pixel, limit_deg)
+        self.alpha = math.pi / math.asinh(math.tan(self.limit))
+
+    def stretch(self, elevations: Tensor) -> tuple[Tensor, Tensor]:
+        return self.alpha * torch.asinh(torch.tan(elevations)), self.alpha / torch.cos(elevations)

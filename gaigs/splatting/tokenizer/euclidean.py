@@ -1,0 +1,110 @@
+"""Fourier features of positions: metric structure, no scene token."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene
+from gaigs.registry import register
+from gaigs.splatting.gaussians import Placed, Tokens
+
+MAX_OCTAVE = 30
+"""Bound of octaves: float32 resolves no positions in waves of a nanometre or a million km."""
+
+BAND_FREQUENCIES = math.pi * 2.0 ** torch.arange(-1, 3)
+"""Of features of the carrier's position in the band, -1 to 1: periods from twice the band to a quarter."""
+
+
+@register("tokenizer", "euclidean")
+class EuclideanTokenizer(nn.Module):
+    """Fourier features of the Gaussians, and of the transmitter through a two-layer network.
+
+    For data with several carriers the network's input also has the carrier's position in the band.
+
+    Args:
+        scene: The middles of the transmitters' box and of the receivers are the origins of positions.
+        gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a metre.
+        transmitter_octaves: The same for the transmitter; None: see ``learnable_octaves``.
+        hidden: Width of the transmitter network's hidden layer.
+        width: Width of E(P_TX). With None for both there is no network, and E(P_TX) are the features themselves.
+
+    Source: GAI-GS, "Multi-view Tokenizer"; Tancik et al., Fourier Features, 2020.
+    """
+
+    scene_width = 0
+    receivers_middle: Tensor
+    transmitters_middle: Tensor
+    gaussian_frequencies: Tensor
+    transmitter_frequencies: Tensor
+
+    def __init__(
+        self,
+        scene: Scene,
+        gaussian_octaves: Sequence[int] = (-3, 2),
+        transmitter_octaves: Sequence[int] | None = None,
+        hidden: int | None = 256,
+        width: int | None = 64,
+    ):
+        super().__init__()
+        given = [count for count in (hidden, width) if count is not None]
+        if len(given) == 1 or min(given, default=1) < 1:
+            raise ValueError(
+                f"tokenizer options hidden and width must both be given, at least 1, or be null, got {hidden}, {width}"
+            )
+        self.scene = scene
+        self.register_buffer("receivers_middle", scene.positions(scene.lower).mean(0))
+        self.register_buffer("transmitters_middle", (scene.lower + scene.upper) / 2)
+        transmitter_octaves = transmitter_octaves or learnable_octaves(scene)
+        for name, limits in (("gaussian", gaussian_octaves), ("transmitter", transmitter_octaves)):
+            self.register_buffer(f"{name}_frequencies", octaves(f"tokenizer option {name}_octaves", *limits))
+        self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
+        features = 3 * (1 + 2 * len(self.transmitter_frequencies))
+        if scene.has_band:
+            features += 1 + 2 * len(BAND_FREQUENCIES)
+        self.transmitter_width = features if width is None else width
+        self.network: nn.Module = nn.Identity()
+        if hidden is not None and width is not None:
+            self.network = nn.Sequential(nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, width))
+
+    def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
+        means = placed.means[0] if len(placed.means) == 1 else placed.means
+        gaussians = fourier_features(means - self.receivers_middle, self.gaussian_frequencies)
+        features = fourier_features(query.transmitters - self.transmitters_middle, self.transmitter_frequencies)
+        if self.scene.has_band:
+            band = fourier_features(self.scene.band_positions(query)[:, None], BAND_FREQUENCIES.to(features))
+            features = torch.cat((features, band), 1)
+        return Tokens(features.new_zeros(len(query), 0), gaussians, self.network(features))
+
+
+def learnable_octaves(scene: Scene) -> tuple[int, int]:
+    """Lowest and highest octave of the transmitter's features that suit the training transmitters.
+
+    Periods range from twice the box's longest edge down to 16 distances between neighbouring transmitters: the network
+    multiplies frequencies, so its input must be well below their sampling limit. For noisy labels they are at least
+    16 m: an RSSI scatters by decibels at any distance, and the network finds how sharp a wall's shadow is.
+    """
+    edge = (scene.upper - scene.lower).max().item()
+    # 16 distances: chosen on validation parts of rfid-s23-200 and the built-in room.
+    highest = min(round(-math.log2(16 * scene.spacing)), MAX_OCTAVE)
+    if scene.task.is_noisy:
+        highest = min(highest, -4)  # 16 m: chosen by leaving out one of the robot's training runs in ble-flat
+    return min(highest, math.floor(-math.log2(2 * edge))), highest
+
+
+def octaves(option: str, *limits: int) -> Float[Tensor, " octaves"]:
+    """Angular frequencies 2 pi 2^k [rad/m] for k from the lowest to the highest limit."""
+    if len(limits) != 2 or not -MAX_OCTAVE <= limits[0] <= limits[1] <= MAX_OCTAVE:
+        raise ValueError(f"{option} must be [lowest, highest] within {-MAX_OCTAVE}..{MAX_OCTAVE}, got {list(limits)}")
+    return 2 * math.pi * 2.0 ** torch.arange(limits[0], limits[1] + 1)
+
+
+def fourier_features(
+    points: Float[Tensor, "*batch d"], frequencies: Float[Tensor, " octaves"]
+) -> Float[Tensor, "*batch features"]:
+    """[x, sin(w x), cos(w x)] for every coordinate x and angular frequency w: d (1 + 2 octaves) numbers."""
+    phases = (points[..., None] * frequencies).flatten(-2)
+    return torch.cat((points, phases.sin(), phases.cos()), -1)

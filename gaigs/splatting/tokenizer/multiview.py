@@ -1,0 +1,37 @@
+"""The paper's tokenizer: geometric algebra and Euclidean embeddings together."""
+
+from collections.abc import Mapping
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene
+from gaigs.registry import register, registry
+from gaigs.splatting.gaussians import Placed, Tokens
+
+
+@register("tokenizer", "multiview")
+class MultiviewTokenizer(nn.Module):
+    """The scene token of ``ga`` beside the position embeddings of ``euclidean``.
+
+    Args:
+        ga: Tokenizer of the scene token: its name, configuration or the object.
+        euclidean: Tokenizer of the position embeddings, likewise.
+
+    Source: GAI-GS, "Multi-view Tokenizer".
+    """
+
+    def __init__(
+        self, scene: Scene, ga: str | Mapping | nn.Module = "ga", euclidean: str | Mapping | nn.Module = "euclidean"
+    ):
+        super().__init__()
+        self.ga = registry("tokenizer").build(ga, scene=scene)
+        self.euclidean = registry("tokenizer").build(euclidean, scene=scene)
+        self.scene_width = self.ga.scene_width
+        self.gaussian_width = self.euclidean.gaussian_width
+        self.transmitter_width = self.euclidean.transmitter_width
+
+    def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
+        _, gaussians, transmitters = self.euclidean(placed, opacities, query)
+        return Tokens(self.ga(placed, opacities, query).scene, gaussians, transmitters)
